@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .runs.api import Run, evaluate_run, open_run, predict_to_file, resume, train
     from .runs.compare import compare
     from .runs.figures import spectrum_table
+    from .runs.other_models import score_predictions
     from .runs.scene_view import scene_view
     from .scene.edit import edit_scene
     from .scene.make import make_scene
@@ -58,6 +59,7 @@ _HOME = {
     "resume": "runs.api",
     "run_reliability": "maps.coverage",
     "scene_view": "runs.scene_view",
+    "score_predictions": "runs.other_models",
     "spectrum_table": "runs.figures",
     "train": "runs.api",
     "view": "viewer.view",

@@ -93,7 +93,7 @@ def add_tracing(parser: argparse.ArgumentParser) -> None:
     add("--tx-polarization", choices=POLARIZATIONS, help="polarisation of the transmitter's antenna")
 
 
-def add_n_train(parser: argparse.ArgumentParser) -> None:
+def add_n_train(parser: argparse._ActionsContainer) -> None:
     """Add ``--n-train``."""
     parser.add_argument("--n-train", type=_number, metavar="N", help="number or fraction of the training rows to use")
 

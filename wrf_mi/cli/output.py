@@ -59,10 +59,11 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     if "inside_90" in metrics:
         share = f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals"
         print(f"{share}, CRPS {metrics['crps']:.3g}")
-    print(
-        f"split {metrics['split']}, {metrics['n_train']} training rows, trained {metrics['train_seconds']:.0f} s, "
-        f"{metrics['ms_per_sample']:.3g} ms per sample, peak memory {metrics['peak_memory_mb']:.0f} MB"
-    )
+    costs = {"train_seconds": "trained {:.0f} s", "ms_per_sample": "{:.3g} ms per sample"}
+    costs |= {"peak_memory_mb": "peak memory {:.0f} MB"}
+    # Models of other programs need not state theirs.
+    known = [form.format(metrics[key]) for key, form in costs.items() if math.isfinite(metrics[key])]
+    print(", ".join([f"split {metrics['split']}", f"{metrics['n_train']} training rows", *known]))
     if folds := metrics.get("cross_validated"):
         print(
             f"scores are cross-validated: each row is predicted by a fit to the other {folds['folds'] - 1} of "

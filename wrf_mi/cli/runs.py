@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core import InputError
-from .options import Arguments, add_command, add_operator, add_scheduler, check_operator
+from .options import Arguments, add_command, add_n_train, add_operator, add_scheduler, check_operator
 from .output import Watch, show, show_metrics
 
 
@@ -17,10 +17,19 @@ def add_parser(commands: Any) -> None:
 
 
 def _add_evaluate(commands: Any) -> None:
-    parser = add_command(commands, "evaluate", evaluate_command, "score a run on its held-out rows")
-    parser.add_argument("run", metavar="RUN", help="run folder")
+    text = "score a run on its held-out rows, or predictions that another program made"
+    parser = add_command(commands, "evaluate", evaluate_command, text)
+    parser.add_argument("run", nargs="?", metavar="RUN", help="run folder; omit it with --predictions")
     text = "score on the test rows of another split that the run was not trained on; nothing is written"
-    parser.add_argument("--split", help=text)
+    parser.add_argument("--split", help=f"{text}. With --predictions: the split (default: official)")
+    other = parser.add_argument_group("predictions of another model")
+    text = "row or tx_pos, prediction, and optionally std, as predictions.npz; signal strengths also as .csv"
+    other.add_argument("--predictions", metavar="FILE", help=text)
+    other.add_argument("--dataset", metavar="DATASET", help="data set that they are of: a name or a folder")
+    other.add_argument("--name", metavar="NAME", help="name of the model, for tables")
+    other.add_argument("--out", metavar="DIR", help="run folder to make, for compare")
+    add_n_train(other)
+    other.add_argument("--seed", type=int, metavar="N", help="seed of the split (default: 0)")
     text = "draw how reliable probabilities of coverage are on test rows, P(level > threshold) against observed share"
     parser.add_argument("--reliability", metavar="FILE.png", help=text)
     add_operator(parser)
@@ -28,6 +37,13 @@ def _add_evaluate(commands: Any) -> None:
 
 def evaluate_command(a: Arguments) -> int:
     """Score a run again."""
+    if a.predictions is not None:
+        return _score_predictions(a)
+    own = ("dataset", "name", "out", "n_train", "seed")
+    if idle := [name for name in own if getattr(a, name) is not None]:
+        raise InputError(f"evaluate: --{idle[0].replace('_', '-')} belongs to --predictions; omit it")
+    if a.run is None:
+        raise InputError("evaluate: nothing to score; give a run folder, or --predictions FILE and --dataset")
     from ..runs.api import evaluate_run
 
     if a.reliability is not None and a.split is not None:
@@ -49,6 +65,19 @@ def evaluate_command(a: Arguments) -> int:
         text = f"off by {result.error:.3f} on average, Brier score {result.brier:.3f}"
         print(f"coverage: observed share {text}: {a.reliability}")
     return 0
+
+
+def _score_predictions(a: Arguments) -> int:
+    """Score predictions of another model."""
+    from ..runs.other_models import score_predictions
+
+    if a.run is not None or a.reliability is not None or a.no_operator:
+        raise InputError("evaluate: --predictions makes a run folder; omit RUN, --reliability and --no-operator")
+    if lacking := [name for name in ("dataset", "name", "out") if getattr(a, name) is None]:
+        raise InputError(f"evaluate: --predictions needs --{lacking[0]}")
+    options = {"n_train": a.n_train, "seed": a.seed or 0, "split": a.split or "official"}
+    run = score_predictions(a.dataset, a.predictions, a.out, a.name, **options)
+    return show_metrics(run.metrics, run.folder, a.json)
 
 
 def _add_predict(commands: Any) -> None:
