@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .maps.coverage import run_reliability
     from .maps.dataset import write_map
     from .maps.locate import locate
+    from .maps.plan import plan
     from .runs.api import Run, evaluate_run, open_run, predict_to_file, resume, train
     from .runs.compare import compare
     from .runs.figures import spectrum_table
@@ -54,6 +55,7 @@ _HOME = {
     "make_scene": "scene.make",
     "make_splits": "datasets",
     "open_run": "runs.api",
+    "plan": "maps.plan:plan",
     "predict_to_file": "runs.api",
     "radio_map": "maps.api",
     "resume": "runs.api",

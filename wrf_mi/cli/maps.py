@@ -1,4 +1,4 @@
-"""``wrf-mi map``, ``locate`` and ``view``: maps, positions and views of runs."""
+"""``wrf-mi map``, ``plan``, ``locate`` and ``view``: maps, further measurements, positions and views of runs."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from .output import Watch, show, summary_table
 
 
 def add_parser(commands: Any) -> None:
-    """Add ``map``, ``locate`` and ``view`` to the commands."""
-    for add in (_add_map, _add_locate, _add_view):
+    """Add ``map``, ``plan``, ``locate`` and ``view`` to the commands."""
+    for add in (_add_map, _add_plan, _add_locate, _add_view):
         add(commands)
 
 
@@ -65,6 +65,55 @@ def map_command(a: Arguments) -> int:
     shape = " x ".join(str(count) for name, count in sizes.items() if name != "receiver")
     text = f"{shape} positions, {sizes['receiver']} receivers: {out}\npicture: {picture}"
     return show(a.json, {"out": str(out), "picture": str(picture), "sizes": sizes, "variables": names}, text)
+
+
+def _add_plan(commands: Any) -> None:
+    text = "positions whose measurement lowers the expected error of a run's map most"
+    parser = add_command(commands, "plan", plan_command, text)
+    add = parser.add_argument
+    add("run", metavar="RUN", help="run folder")
+    text = "file to write: order, x, y, z, expected error after each, distance walked; FILE.png beside it"
+    add("--out", required=True, metavar="FILE.csv", help=text)
+    add("--count", type=int, default=10, metavar="N", help="number of positions (default: 10)")
+    text = "positions that can be measured, x, y, z in metres, with a header (default: all of the map)"
+    add("--candidates", metavar="FILE.csv", help=text)
+    text = "corners of the area whose errors count, metres (default: the scene, or all rows of the data)"
+    add("--area", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help=text)
+    text = "what is to become small: the error over the map, or that of coverage about a threshold (default: error)"
+    add("--criterion", choices=("error", "coverage"), default="error", help=text)
+    add("--threshold", type=float, metavar="DBM", help="threshold of coverage (default: -90 dBm)")
+    text = "distance that is worth half of a reduction, for plans that are short to walk (default: distances are free)"
+    add("--walk", type=float, metavar="M", help=text)
+    text = "name of a receiver whose errors count, repeatable (default: all)"
+    add("--receiver", action="append", metavar="NAME", help=text)
+    add("--step", type=float, metavar="M", help="spacing of the map (default: 0.25 m, more for large areas)")
+    add("--height", type=float, metavar="M", help="height of the transmitter (default: the median of the data's)")
+
+
+def plan_command(a: Arguments) -> int:
+    """Write planned positions to a file, and a picture beside it."""
+    from ..core.files import write_figure
+    from ..maps.plan import plan
+    from ..maps.plan_picture import plan_figure
+    from ..runs.prediction_file import read_inputs
+    from ..runs.run import open_run
+
+    out = Path(a.out)
+    if out.suffix.lower() != ".csv":
+        raise InputError(f"{out}: positions are written as .csv; give such a name")
+    run = open_run(a.run)
+    candidates_m = None if a.candidates is None else read_inputs(a.candidates, None).tx_pos_m
+    options = {"criterion": a.criterion, "threshold_dbm": a.threshold, "walk_m": a.walk, "receivers": a.receiver}
+    options |= {"step_m": a.step, "height_m": a.height}
+    options["area_m"] = None if a.area is None else (a.area[:2], a.area[2:])
+    with Watch() as watch:
+        planned = plan(run, a.count, candidates_m=candidates_m, **options, on_progress=watch.on_progress)
+    planned.write(out)
+    picture = write_figure(out.with_suffix(".png"), plan_figure(planned, run))
+    first, last = planned.expected_error[[0, -1]]
+    text = f"expected error {first:.3g} now, {last:.3g} after {a.count} more measurements\n"
+    figures = {"out": str(out), "picture": str(picture), "expected_error": planned.expected_error.tolist()}
+    return show(a.json, figures, f"{text}positions: {out}\npicture: {picture}")
 
 
 def _add_locate(commands: Any) -> None:

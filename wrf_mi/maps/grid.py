@@ -215,15 +215,22 @@ class Candidates:
         return np.argmin(cdist(positions_m[:, :2], self.positions_m[:, :2]), axis=1)
 
 
-def candidates_of(run: Run, step_m: float | None = None, height_m: float | None = None) -> Candidates:
+def candidates_of(
+    run: Run,
+    step_m: float | None = None,
+    height_m: float | None = None,
+    area_m: tuple[FloatArray, FloatArray] | None = None,
+) -> Candidates:
     """Candidates of a run: over a floor of its scene and outside of solids, else in the rectangle of its training rows.
+
+    ``area_m`` are lower and upper corners [2 or more] in place of those of the scene or the rows, metres.
 
     By default their step is `CANDIDATE_STEP_M`, more for large areas, and their height the training rows' median.
     `InputError`: a step that is not positive or too small, no candidate, or neither scene nor known positions.
     """
     scene, record = run.problem.opened_scene, run.problem.record
     known = record.tx_pos_m[load_rows(run.folder, record).all_train]
-    low, high = area_of(run, known)
+    low, high = area_of(run, known) if area_m is None else area_m
     if step_m is None:
         step_m = max(CANDIDATE_STEP_M, float(np.sqrt(np.prod(high[:2] - low[:2]) / USUAL_CANDIDATES)))
     height = usual_height(run, known) if height_m is None else height_m

@@ -17,6 +17,7 @@ from ..core.types import IntArray
 from ..tasks import task_of
 from ..training.by_distance import GAPS, Intervals, expected_size, fit_intervals
 from ..training.selection import HeldOut, RowDistance, hold_out
+from .error_prior import ErrorPrior
 from .held_out import held_out_predictions
 from .model import (
     Arrays,
@@ -59,6 +60,10 @@ class FittedWithIntervals(Fitted):
         """Decomposition of the model's prediction, with calibrated standard deviations."""
         decomposed = self.fitted.decompose(inputs, receiver, std)
         return replace(decomposed, prediction=self._stated(decomposed.prediction, inputs.tx_pos_m, receiver))
+
+    def error_prior(self, receiver: int) -> ErrorPrior | None:
+        """As of the model: intervals change the size of errors, not where they are large."""
+        return self.fitted.error_prior(receiver)
 
     @property
     def depends_on_heading(self) -> bool:

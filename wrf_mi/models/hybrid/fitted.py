@@ -17,6 +17,7 @@ from ...core.types import IntArray
 from ...tasks import task_of
 from ...training.by_distance import LEAST, Intervals, Mixture, expected_size
 from ...training.selection import RowDistance, rows_at_receiver
+from ..error_prior import ErrorPrior
 from ..held_out import predicted_rows
 from ..interpolation.kriging import Kriged, Kriging
 from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays
@@ -204,6 +205,14 @@ class FittedHybrid(Fitted):
             factor = self.intervals(mean, np.ones(mean.shape), distance_m).stated_std
             return Prediction(mean, np.maximum(size * factor, LEAST))
         return self.intervals(mean, expected_size(task_of(self.problem.record), Prediction(mean)), distance_m)
+
+    def error_prior(self, receiver: int) -> ErrorPrior | None:
+        """That of what the scene's side leaves, or else of the first part that states one."""
+        kriged = None if self.residuals is None else self.residuals.by_receiver.get(receiver)
+        if kriged is not None:
+            return kriged.error_prior()
+        priors = (part.error_prior(receiver) for part in self.parts.values())
+        return next((prior for prior in priors if prior is not None), None)
 
     def arrays(self) -> Arrays:
         """Weights, residuals, intervals, training rows, and the arrays of the parts."""

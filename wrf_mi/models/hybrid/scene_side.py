@@ -30,6 +30,7 @@ from ...tracing.tracer import RayTracer, fit_offsets
 from ...training.config import TrainConfig, calibration_config, task_settings
 from ...training.selection import HeldOut, hold_out_groups
 from .. import model
+from ..error_prior import ErrorPrior
 from ..gaussian.model import WRF_GS_PLUS, FittedField
 from ..held_out import as_unseen, labelled
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, PredictAll, Problem, Session
@@ -75,6 +76,10 @@ class SceneSide(Fitted):
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Observations, and the paths' and the Gaussians' share of them where there are both."""
         return self.fitted.decompose(inputs, receiver, std)
+
+    def error_prior(self, receiver: int) -> ErrorPrior | None:
+        """As of the fitted model."""
+        return self.fitted.error_prior(receiver)
 
     def arrays(self) -> Arrays:
         """Arrays of the fitted model."""

@@ -21,6 +21,7 @@ from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS
 from ...tasks import require
 from ...training.session import OnProgress, quiet
+from ..error_prior import ErrorPrior, with_columns
 from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
 from .by_receiver import finite_positions
 from .kriging import KrigingSettings
@@ -122,6 +123,30 @@ class Strengths(Fitted):
             (rows, [Poses(position_m[rows], None if turn is None else np.asarray(turn, float)[rows]) for turn in turns])
             for rows in parts
         ]
+
+    def error_prior(self, receiver: int) -> ErrorPrior:
+        """Shadowing and the uncertain terms of the mean, about the stops of the training rows."""
+        field, widen = self.field, self.widen[receiver] ** 2
+        h, received = field.hyperparameters, np.isfinite(field.stops.value_dbm[receiver])
+        # Headings of a plan are not known: the part of the field that depends on them is noise there.
+        turned = h.body_db**2 if field.headings else 0.0
+
+        def covariance(a_m: FloatArray, b_m: FloatArray) -> FloatArray:
+            return np.asarray(widen * h.covariance(Poses(a_m), Poses(b_m)))
+
+        def columns(position_m: FloatArray) -> FloatArray:
+            turns = np.zeros(len(position_m)) if field.headings else None
+            return field.prior.columns(Poses(position_m, turns), receiver)[1]
+
+        deviation = field.prior.columns(field.stops.poses.take(np.zeros(0, np.int64)), receiver)[2]
+        noise = h.drift_db**2 + h.noise_db**2 / field.stops.count[receiver, received]
+        scale = widen * field.ratio[receiver] ** 2
+        return ErrorPrior(
+            with_columns(covariance, columns, deviation),
+            field.stops.poses.position_m[received],
+            scale * noise + widen * turned,
+            float(scale * (h.drift_db**2 + h.noise_db**2) + widen * turned),
+        )
 
     def arrays(self) -> Arrays:
         """Arrays for `from_arrays`."""

@@ -1,0 +1,50 @@
+"""Picture of planned measurements over the expected error before and after them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from ..runs.folder import load_rows
+from ..runs.run import Run
+from ..tasks import task_of
+from .picture import scene_cuts
+from .plan import Plan
+
+MARGIN_M = 0.3
+PANEL_IN = 4.2
+
+
+def plan_figure(plan: Plan, run: Run) -> Figure:
+    """Standard deviations over the map before and after, planned positions in their order, rows measured so far."""
+    record = run.problem.record
+    rows = load_rows(run.folder, record).all_train
+    measured_m, walls = record.tx_pos_m[rows], scene_cuts(run, float(np.median(plan.targets_m[:, 2])))
+    low, high = plan.targets_m.min(axis=0) - MARGIN_M, plan.targets_m.max(axis=0) + MARGIN_M
+    aspect = float(np.clip((high - low)[1] / max((high - low)[0], 1e-6), 0.3, 1.8))
+    figure = Figure(figsize=(2 * PANEL_IN + 1, PANEL_IN * aspect + 1.2), layout="constrained", facecolor="white")
+    shade: dict[str, Any] = {"cmap": "viridis", "vmin": float(plan.std.min()), "vmax": float(plan.std.max())}
+    panels = figure.subplots(1, 2, squeeze=False).ravel()
+    titles = "expected error now", f"after {len(plan.tx_pos_m)} more measurements"
+    for axes, title, std in zip(panels, titles, plan.std, strict=True):
+        drawn = axes.scatter(*plan.targets_m[:, :2].T, c=std, s=26, marker="s", linewidths=0, **shade)
+        for lines in walls:
+            axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2))
+        axes.plot(*measured_m[:, :2].T, ".", color="white", markersize=5, markeredgecolor="0.3", markeredgewidth=0.5)
+        place = np.stack([receiver.position_m[:2] for receiver in run.receivers])
+        axes.plot(*place.T, "^", color="#c1121f", markersize=6, markeredgecolor="white")
+        axes.set(title=title, xlabel="x (m)", xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        axes.title.set_fontsize(9)
+    panels[0].set_ylabel("y (m)")
+    for number, position_m in enumerate(plan.tx_pos_m, start=1):
+        box = {"boxstyle": "circle,pad=0.15", "facecolor": "#c1121f", "edgecolor": "white", "linewidth": 0.6}
+        panels[0].text(*position_m[:2], str(number), color="white", fontsize=7, ha="center", va="center", bbox=box)
+    unit = "dB" if task_of(record).in_decibel else "unit of an observation"
+    figure.colorbar(drawn, ax=list(panels), shrink=0.85).set_label(f"standard deviation ({unit})", fontsize=8)
+    first, last = plan.expected_error[[0, -1]]
+    text = "dots: measured; numbers: measure next, in this order; triangles: receivers"
+    figure.suptitle(f"{text}\nexpected error {first:.3g} before, {last:.3g} after", fontsize=8)
+    return figure
