@@ -1,8 +1,9 @@
 """Where to measure next: errors of maps by number of rows, of planned rows and of rows chosen otherwise.
 
-From ten random training rows, rows are added ten at a time by each rule, a model is fitted to them, and its error on the
-official test rows is stored. Rules are random rows, those that fill space (each the farthest from all before), those of
-the greatest variance, and `wrf_mi.plan`. Where a scene is known the model is the hybrid's mean in it with interpolation.
+From ten random training rows, rows are added ten at a time by each rule, a model is fitted to them, and its error on
+the official test rows is stored. Rules are random rows, those that fill space (each the farthest from all before),
+those of the greatest variance, and `wrf_mi.plan`. Where a scene is known the model is the hybrid's mean in it with
+interpolation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -104,7 +105,7 @@ def measure(name: str, rule: str, start: int, folder: Path) -> list[float]:
     rows, scores = np.sort(rng.permutation(able)[: SIZES[0]]), list[float]()
     model, settings = ("kriging", ()) if place.scene is None else ("hybrid", IN_SCENE)
     for size in SIZES:
-        split = Split("chosen", rows, rows[:0], official.test)
+        split = Split("chosen", start, rows, rows[:0], official.test)
         run = wrf_mi.train(record, folder / f"{size}", model, scene=place.scene, split=split, settings=settings)
         scores.append(run.metrics[TASKS[record.task].block]["median"])
         if size < SIZES[-1]:
@@ -121,11 +122,8 @@ def main() -> dict[str, Any]:
         errors: dict[str, list[list[float]]] = {}
         for rule in RULES:
             say("plan", f"{name}, {rule}")
-            parts = (
-                kept_work(place, f"{name}-{rule}-{k}".replace(" ", "-"), partial(measure, name, rule, k))
-                for k in STARTS
-            )
-            errors[rule] = list(parts)
+            parts = {k: f"{name}-{rule}-{k}".replace(" ", "-") for k in STARTS}
+            errors[rule] = [kept_work(place, part, partial(measure, name, rule, k)) for k, part in parts.items()]
         rows.append({**line(name, summary(errors, name), ""), "errors": errors})
     return {"rows": rows}
 
