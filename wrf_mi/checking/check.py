@@ -13,7 +13,6 @@ from ..datasets.faults import collect_faults
 from ..datasets.registry import find, known, locate
 from ..models.checks import check_parts
 from ..synthetic import load_record
-from .building import at_vertices, building_file, inside_solids, plan_against_walls, read_building
 from .directions import spectrum_axes
 from .plans import distance_law
 from .rows import constant_observations, few_rows, not_heard, repeated_observations, repeated_rows, single_position
@@ -209,6 +208,9 @@ def _path(dataset: str | Path) -> Path | None:
 
 
 def _of_building(record: Record) -> Found:
+    # Meshes and plans need packages that take as long to import as a short fit.
+    from .building import at_vertices, building_file, inside_solids, plan_against_walls, read_building
+
     file = building_file(record.source) if record.source else None
     if file is None:
         return

@@ -90,8 +90,6 @@ def training_request(a: Arguments) -> RunRequest:
 
 def _stages(a: Arguments, model: str) -> list[str]:
     """Setting of ``--stages`` or ``--fast``, neither of which trace has."""
-    from ..models.hybrid.scene_side import FAST
-
     stages, fast = getattr(a, "stages", None), getattr(a, "fast", False)
     if stages is None and not fast:
         return []
@@ -99,6 +97,8 @@ def _stages(a: Arguments, model: str) -> list[str]:
         raise InputError(f"--stages and --fast belong to --model {HYBRID}, not to {model}")
     if stages is not None and fast:
         raise InputError("--fast limits the stages, too: give one of --stages and --fast")
+    from ..models.hybrid.scene_side import FAST
+
     return [f"stages={stages or ','.join(FAST)}"]
 
 

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import ClusterError, kmeans2
 
 from ..core import InputError, Record, Split
 from ..core.array_files import stored_arrays, write_arrays
@@ -213,6 +212,8 @@ def position_folds(record: Record) -> IntArray:
     distinct = len(np.unique(record.tx_pos_m, axis=0))
     if distinct < FOLDS:
         raise InputError(f"{record.name}: {distinct} distinct positions for {FOLDS} blocks; use another split")
+    from scipy.cluster.vq import ClusterError, kmeans2
+
     # k-means ends in a local optimum that depends on its start, and may leave a cluster empty ("raise").
     best, folds = np.inf, None
     for attempt in range(CLUSTER_STARTS):

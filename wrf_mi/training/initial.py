@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 
@@ -71,6 +70,8 @@ def gaussians_from_paths(
     # Centres are found on a sample, as paths may be millions; every path then joins the nearest.
     drawn = rng.choice(len(paths), min(len(paths), 40 * count), replace=False)
     few = min(count, len(np.unique(np.round(features[drawn], 6), axis=0)))
+    from scipy.cluster.vq import kmeans2
+
     centres, _ = kmeans2(features[drawn], few, iter=20, minit="++", rng=rng)
     label = cKDTree(centres).query(features)[1].astype(np.int64)
     used = np.unique(label)

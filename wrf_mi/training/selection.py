@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
@@ -80,6 +79,8 @@ def last_gain(
 
 def clusters(positions_m: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
     """Number of the k-means cluster of each position [n, 3]; clusters may be empty."""
+    from scipy.cluster.vq import kmeans2
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of an empty cluster, which holds nothing out
         return np.asarray(kmeans2(positions_m, count, iter=50, minit="++", missing="warn", rng=rng)[1], np.int64)
