@@ -1,7 +1,5 @@
 """What must not change, or must change in a known way, whatever the field."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -112,10 +110,7 @@ def test_optical_depth_of_coincident_gaussians_adds(field: Field, share: float) 
     parts = [1 - (1 - opaque) ** share, 1 - (1 - opaque) ** (1 - share)]
     twice = {name: np.concatenate([values] * 2) for name, values in field.items()}
     np.testing.assert_allclose(
-        _depth(twice | {"opacity": np.concatenate(parts)}),
-        _depth(field | {"opacity": opaque}),
-        rtol=1e-6,
-        atol=1e-9,
+        _depth(twice | {"opacity": np.concatenate(parts)}), _depth(field | {"opacity": opaque}), rtol=1e-6, atol=1e-9
     )
 
 

@@ -1,12 +1,10 @@
 """Meanings of columns, with the headers of public data sets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
+from changed_folders import refusal
 
-from wrf_mi.core import InputError
 from wrf_mi.datasets.tables.columns import Columns, find_columns, parsed_columns, unit_of
 from wrf_mi.datasets.tables.files import read_table
 
@@ -88,11 +86,9 @@ def test_units_stand_at_the_end_of_names() -> None:
     ],
 )
 def test_missing_columns_are_refused(stated: str, receivers: tuple[str, ...], message: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=message):
-        columns_of(tmp_path, "x,y,p", "0,1,55", stated, receivers)
+    refusal(columns_of, tmp_path, "x,y,p", "0,1,55", stated, receivers, message)
 
 
 @pytest.mark.parametrize("text", ["place=x", "x", "x="])
 def test_meanings_that_are_unknown_are_refused(text: str) -> None:
-    with pytest.raises(InputError, match=r"--columns: .* give MEANING=COLUMN"):
-        parsed_columns(text)
+    refusal(parsed_columns, text, r"--columns: .* give MEANING=COLUMN")

@@ -1,13 +1,11 @@
 """Positions in metres of a local frame, headings, and rows of one place."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+from changed_folders import refusal
 
-from wrf_mi.core import InputError
 from wrf_mi.datasets.tables.places import find_frame, headings_rad, place_numbers, unit_scale
 
 pyproj = pytest.importorskip("pyproj")
@@ -80,10 +78,8 @@ def test_room_in_metres_is_not_taken_for_degrees() -> None:
 
 
 def test_unknown_units_and_systems_are_refused() -> None:
-    with pytest.raises(InputError, match="--units 'yard' is unknown; give one of m, mm"):
-        unit_scale("yard", "--units")
-    with pytest.raises(InputError, match="--crs: 'EPSG:0' is no coordinate reference system"):
-        find_frame(PLACE, False, "", 1.0, "EPSG:0")
+    refusal(unit_scale, "yard", "--units", "--units 'yard' is unknown; give one of m, mm")
+    refusal(find_frame, PLACE, False, "", 1.0, "EPSG:0", "--crs: 'EPSG:0' is no coordinate reference system")
 
 
 @pytest.mark.parametrize(

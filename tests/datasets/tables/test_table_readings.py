@@ -1,7 +1,5 @@
 """Means of readings and their noise, numbers for "not heard", and networks of one radio."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
