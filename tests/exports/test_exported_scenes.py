@@ -34,7 +34,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A shoebox with a thickness of its own, a material of its own with a law, and a perfect conductor."""
     parts = [Surface(name, "other", np.asarray(mesh.vertices), mesh.faces) for name, (_, mesh) in SHOEBOX.items()]
     surfaces = {name: material for name, (material, _) in SHOEBOX.items()} | {"east": "panel", "west": "perfect"}
-    materials = Materials(surfaces, thickness_m={"itu_concrete": 0.37}, constants={"panel": OWN | LAW})
+    materials = Materials(surfaces=surfaces, thickness_m={"itu_concrete": 0.37}, constants={"panel": OWN | LAW})
     return write_scene(tmp_path_factory.mktemp("scene") / "s", parts, frame="made", source="test", materials=materials)
 
 
