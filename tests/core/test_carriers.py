@@ -104,21 +104,18 @@ def test_carriers_are_interpolated_separately(name: str, flat: Record, tmp_path:
     np.testing.assert_array_equal(found.astype(np.float32), read.prediction[1])
 
 
-def test_predictions_of_several_carriers_need_carriers(flat: Record, flat_folder: Path, tmp_path: Path) -> None:
+def test_predictions_of_several_carriers(flat: Record, flat_folder: Path, tmp_path: Path) -> None:
     run, place = train(flat, tmp_path / "run", "idw"), flat.tx_pos_m[:2]
     refusal(run.predict, place, r"its data have rows at 2 carriers, .* Hz; give frequency_hz for each position")
     message = r"2 positions and carriers \(1,\); give one positive frequency_hz for each"
     refusal(run.predict, place, message, carriers_hz=LOW)
-    one = train(flat_folder, tmp_path / "one", "idw")
-    refusal(one.predict, place, "its data have one carrier; omit frequency_hz", carriers_hz=[LOW, LOW])
-
-
-def test_between_carriers_methods_are_linear_in_the_logarithm_of_the_frequency(flat: Record, tmp_path: Path) -> None:
-    run, place = train(flat, tmp_path / "run", "idw"), flat.tx_pos_m[:2]
+    # Between carriers the prediction is linear in the logarithm of the frequency, beyond them constant.
     low, high = (run.predict(place, carriers_hz=[carrier] * 2).mean for carrier in (LOW, HIGH))
     between = run.predict(place, carriers_hz=[np.sqrt(LOW * HIGH)] * 2).mean
     np.testing.assert_allclose(between, (low + high) / 2, rtol=1e-6)
     np.testing.assert_array_equal(run.predict(place, carriers_hz=[0.1 * LOW, 10 * HIGH]).mean, [low[0], high[1]])
+    one = train(flat_folder, tmp_path / "one", "idw")
+    refusal(one.predict, place, "its data have one carrier; omit frequency_hz", carriers_hz=[LOW, LOW])
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -229,14 +226,12 @@ def test_stored_paths_keep_the_carriers(flat: Record, room: Path, tmp_path: Path
     assert read.prediction[0] == pytest.approx(anew, abs=FLOAT32_DB)
 
 
-def test_target_error_refuses_carriers(flat: Record, room: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"rows at 2 carriers, .* target_error_db serves one carrier"):
-        train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=["target_error_db=1"])
-
-
-def test_unknown_material_at_a_carrier_is_refused(flat: Record, room: Path, tmp_path: Path) -> None:
-    far = flat.at_carriers(np.where(np.arange(len(flat)) % 2, LOW, 1e8))
-    refusal(train, far, tmp_path / "run", "ray-tracing", r"not known at 0\.1 GHz", scene=room)
+def test_one_target_error_and_unknown_materials_are_refused(flat: Record, room: Path, tmp_path: Path) -> None:
+    message = r"rows at 2 carriers, .* target_error_db serves one carrier"
+    options = {"scene": room, "settings": ["target_error_db=1"]}
+    refusal(train, flat, tmp_path / "run", "ray-tracing", message, **options)
+    unknown = flat.at_carriers(np.where(np.arange(len(flat)) % 2, LOW, 1e8))
+    refusal(train, unknown, tmp_path / "run", "ray-tracing", r"not known at 0\.1 GHz", scene=room)
     assert not (tmp_path / "run").exists()
 
 
@@ -261,14 +256,12 @@ def test_data_command_shows_carriers_readings_and_noise(
     own = replace(own, runs=np.where(np.isin(np.arange(len(own)), own.official[1]), "early", "late"))
     folder = write_ble_folder(tmp_path / "flat", own)
     status, out, _ = call(["data", "info", folder, "--json"], capsys)
-    found = json.loads(out)
-    assert status == 0
-    assert found["carriers_hz"] == {str(LOW): 10, str(HIGH): 20}
-    assert list(found["runs"].items()) == [("late", 24), ("early", 6)]
-    assert (found["n_readings"], found["std_db"]) == ([1, 3, 5], pytest.approx([1, 2, 3]))
-    assert (found["receivers"], found["official"]) == ({"anchor1": 30, "anchor2": 30}, [24, 6])
-    status, out, _ = call(["data", "info", folder], capsys)
-    assert status == 0
+    shown = json.loads(out)
+    assert (status, shown["carriers_hz"]) == (0, {str(LOW): 10, str(HIGH): 20})
+    assert list(shown["runs"].items()) == [("late", 24), ("early", 6)]
+    assert (shown["n_readings"], shown["std_db"]) == ([1, 3, 5], pytest.approx([1, 2, 3]))
+    assert (shown["receivers"], shown["official"]) == ({"anchor1": 30, "anchor2": 30}, [24, 6])
+    _, out, _ = call(["data", "info", folder], capsys)
     assert "carrier:          1100000000 Hz in 10 rows, 5100000000 Hz in 20 rows\n" in out
     assert "runs:             late 24, early 6\n" in out
     assert "readings per row: 1 to 5, median 3\nnoise:            1 to 3 dB, median 2 dB\n" in out

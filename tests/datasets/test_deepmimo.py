@@ -230,6 +230,5 @@ def test_command_summarises_and_trains_on_a_scenario(tmp_path: Path, capsys: pyt
     assert (metrics["task"], metrics["n_test"]) == ("csi", 12)
     assert set(metrics["receivers"]) == {"bs0", "bs1"}
     assert np.isfinite(metrics["cea_db"]["median"])
-    status, out, err = call(["evaluate", tmp_path / "run", "--json"], capsys)
-    assert (status, err) == (0, "")
-    assert json.loads(out)["cea_db"] == metrics["cea_db"]
+    status, out, _ = call(["evaluate", tmp_path / "run", "--json"], capsys)
+    assert (status, json.loads(out)["cea_db"]) == (0, metrics["cea_db"])

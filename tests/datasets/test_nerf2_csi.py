@@ -142,13 +142,11 @@ WRONG: dict[str, tuple[Change, str, str]] = {  # each is refused, see test_fault
         YML, f"base_station:\n- [0, 0, {'9' * 400}]\n", "no int .*too large to convert.*line 2, column 10"
     ),
     "station too far": (station(base_station=[[0, 1, 1e39]] * 3), YML, "base_station is .*give x, y, z in metres"),
-    "date that is none": rewritten(YML, "base_station: 2021-99-99\n", "month must be in 1..12.*line 1, column 15"),
     "station in the plane": (station(base_station=[[0, 1]]), YML, "base_station is"),
     "station fewer": (station(base_station=PLACES[:2]), YML, "2 positions in base_station, but csidata.npy has 3 ante"),
     "station not finite": (station(base_station=[[0, 1, float("nan")]] * 3), YML, "base_station is"),
     "orientation": (station(orientation=[1.0, 1, 0, 0]), YML, "quaternion of norm 1.414"),
     "frequency of words": (station(frequencies_hz=["high"] * 8), YML, "frequencies_hz is"),
-    "frequency of 400 digits": (station(frequencies_hz=[10**400] * 8), YML, "no int .*too large to convert"),
     "frequency too high": (station(frequencies_hz=[1e39] * 8), YML, "frequencies_hz is"),
     "frequencies differ": (station(frequencies_hz=[1e9] * 7), YML, "7 frequencies_hz, but csidata.npy has 8 subcarri"),
     "frequency negative": (station(frequencies_hz=[-1e9] * 8), YML, "frequencies_hz is"),

@@ -39,28 +39,23 @@ def test_neutral_and_historic_names_give_equal_records(tmp_path: Path):
     assert load(tmp_path / "a").task == "rssi"
 
 
-def test_one_file_with_the_official_split(tmp_path: Path):
-    rows = with_split("train", " Test", "train")
-    record = read_ble_folder(folder_of(tmp_path, receivers=RECEIVERS, measurements=rows))
-    assert [part.tolist() for part in record.official] == [[0, 2], [1]]
-    assert record.folds is None
+@pytest.mark.parametrize(
+    ("words", "official", "folds"),
+    [(("train", " Test", "train"), [[0, 2], [1]], None), (("2", "7", "2"), None, [0, 1, 0]), ((), None, None)],
+)
+def test_one_file_with_the_official_split_with_folds_and_without(
+    words: tuple[str, ...], official: list | None, folds: list | None, tmp_path: Path
+):
+    files = {"receivers": RECEIVERS, "measurements": with_split(*words) if words else ROWS}
+    record = read_ble_folder(folder_of(tmp_path, **files))
     np.testing.assert_array_equal(record.observation, [[-50, -51, np.nan], [-40, -41, -42]])
-
-
-def test_one_file_with_numbers_of_folds(tmp_path: Path):
-    record = read_ble_folder(folder_of(tmp_path, receivers=RECEIVERS, measurements=with_split("2", "7", "2")))
-    assert record.official is None
-    np.testing.assert_array_equal(record.folds, [0, 1, 0])
-    assert [split.test.tolist() for split in make_splits(record, "blocked")] == [[0, 2], [1]]
-    assert_same(read_ble_folder(write_ble_folder(tmp_path / "again", record)), record, "name")
-
-
-def test_one_file_without_a_split(tmp_path: Path):
-    record = read_ble_folder(folder_of(tmp_path, anchors=RECEIVERS, measurements=ROWS))
-    assert (record.official, record.folds) == (None, None)
-    again = write_ble_folder(tmp_path / "again", record)
-    assert sorted(file.name for file in again.iterdir()) == ["measurements.csv", "receivers.csv"]
-    assert_same(read_ble_folder(again), record, "name")
+    np.testing.assert_equal((record.official, record.folds), (official and tuple(map(np.array, official)), folds))
+    if folds:
+        assert [split.test.tolist() for split in make_splits(record, "blocked")] == [[0, 2], [1]]
+    if not official:
+        again = write_ble_folder(tmp_path / "again", record)
+        assert sorted(file.name for file in again.iterdir()) == ["measurements.csv", "receivers.csv"]
+        assert_same(read_ble_folder(again), record, "name")
 
 
 @pytest.mark.parametrize(
@@ -77,6 +72,12 @@ def test_one_file_without_a_split(tmp_path: Path):
 )
 def test_ambiguous_files_are_refused(files: dict[str, str], message: str, tmp_path: Path):
     refusal(read_ble_folder, folder_of(tmp_path, **{"receivers": RECEIVERS, **files}), message)
+
+
+def test_carriers_of_rows_beside_those_of_receivers_are_refused(tmp_path: Path):
+    rows = ROWS.replace("x,y,z", "x,y,frequency_hz")
+    folder = folder_of(tmp_path, receivers=receivers_with("frequency_hz", "1e9", "2e9"), train=rows, test=rows)
+    refusal(read_ble_folder, folder, r"train\.csv: line 1: frequency_hz is a column of receivers\.csv, too")
 
 
 def test_ids_are_any_text_on_one_line(tmp_path: Path):
@@ -121,17 +122,13 @@ def test_orientations_carriers_and_antennas_are_read_and_written(tmp_path: Path)
     assert (second.orientation_xyzw.tolist(), first.frequency_hz, second.frequency_hz) == ([*UPRIGHT], 3.56e9, 3.69e9)
     np.testing.assert_array_equal(record.receiver_carriers_hz, [3.56e9, 3.69e9])
     assert_same(read_ble_folder(write_ble_folder(tmp_path / "again", record)), record, "name")
-
-
-def test_a_quaternion_may_take_the_place_of_angles(tmp_path: Path):
+    # A quaternion may take the place of angles.
     half = np.sqrt(0.5)
-    record = read_with(tmp_path, "qx,qy,qz,qw,frame", f"0,0,{half},{half},", "0,0,0,1,world")
+    record = read_with(tmp_path / "b", "qx,qy,qz,qw,frame", f"0,0,{half},{half},", "0,0,0,1,world")
     np.testing.assert_allclose(record.receivers[0].orientation_xyzw, [0, 0, half, half])
     assert [receiver.antenna.frame for receiver in record.receivers] == ["array", "world"]
-
-
-def test_equal_carriers_of_receivers_are_the_carrier_of_the_record(tmp_path: Path):
-    record = read_with(tmp_path, "frequency_hz", "868e6", "868e6")
+    # Equal carriers of receivers are the carrier of the record.
+    record = read_with(tmp_path / "c", "frequency_hz", "868e6", "868e6")
     assert record.receiver_carriers_hz is None
     np.testing.assert_array_equal(record.frequencies_hz, [868e6])
 
@@ -150,13 +147,6 @@ def test_equal_carriers_of_receivers_are_the_carrier_of_the_record(tmp_path: Pat
 )
 def test_wrong_columns_of_receivers_are_refused(columns: str, rows: tuple[str, str], message: str, tmp_path: Path):
     refusal(lambda folder: read_with(folder, columns, *rows), tmp_path, rf"receivers\.csv: {message}")
-
-
-def test_carriers_of_rows_beside_those_of_receivers_are_refused(tmp_path: Path):
-    rows = ROWS.replace("x,y,z", "x,y,frequency_hz")
-    files = {"receivers": receivers_with("frequency_hz", "1e9", "2e9"), "train": rows, "test": rows}
-    message = r"train\.csv: line 1: frequency_hz is a column of receivers\.csv, too"
-    refusal(read_ble_folder, folder_of(tmp_path, **files), message)
 
 
 @pytest.mark.parametrize("second_hz", [None, "2e9"])

@@ -60,19 +60,16 @@ def test_training_rows_are_refused_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_row_of_a_later_fold_is_refused_at_once(two_gateways: Record, tmp_path: Path) -> None:
-    folded = replace(two_gateways, folds=np.arange(len(two_gateways)) % 2)
-    refusal(train_field, changed(folded, ((0, 2, 4, 5), np.nan)), tmp_path / "run", "blocked", "row 2: 1 of 800")
-    assert not (tmp_path / "run").exists()
-
-
 def test_fields_need_every_receiver_in_every_row(two_gateways: Record, tmp_path: Path) -> None:
-    """Other models are fitted to the rows that a receiver received."""
+    """Other models are fitted to the rows that a receiver received. A row of a later fold is refused at once."""
     row = int(official(two_gateways).train[0])
     missed = changed(two_gateways, ((1, row), np.nan))
     message = f"row {row}: 800 of 800 .*; remove the row or choose another model"
     refusal(train_field, missed, tmp_path / "field", message)
     train_idw(missed, tmp_path / "idw")
+    folded = changed(replace(two_gateways, folds=np.arange(len(two_gateways)) % 2), ((0, 2, 4, 5), np.nan))
+    refusal(train_field, folded, tmp_path / "field", "blocked", "row 2: 1 of 800")  # it trains in the second fold
+    assert not (tmp_path / "field").exists()
 
 
 @BOTH
@@ -100,9 +97,7 @@ def test_a_split_without_a_finite_test_row_is_refused(two_gateways: Record) -> N
     broken = changed(two_gateways, ((slice(None), split.test, 0, 0), np.nan))
     message = "split official: no test row to score is finite; use another split"
     refusal(evaluate, broken, split, lambda rows, receiver: broken.observation[receiver, rows], message)
-
-
-def test_finite_and_missing_observations_stay(two_gateways: Record) -> None:
+    # Observations that are finite or missing stay.
     missed = changed(two_gateways, ((0, 3), np.nan)).observation
     kept, count = scorable(missed)
     assert (kept is missed, count) == (True, 0)

@@ -88,10 +88,7 @@ def test_an_incomplete_layout_names_the_missing_file(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / name).write_text("x,y,z\n1,2,3\n")
         refusal(load, tmp_path / name, f"{missing}: missing")
-
-
-def test_a_table_with_other_separators_is_told_so(tmp_path: Path) -> None:
+    # A table with other separators is told so.
     folder = write_flat(tmp_path / "office")
-    file = folder / "calibration_df.csv"
-    file.write_text(file.read_text().replace(",", ";"))
+    (folder / "calibration_df.csv").write_text((folder / "calibration_df.csv").read_text().replace(",", ";"))
     refusal(load, folder, "the first line must name each column once, separated by commas")

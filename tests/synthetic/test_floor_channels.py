@@ -177,10 +177,23 @@ def test_users_walk_in_the_open_and_through_doors(place: str) -> None:
     assert tree.query([plan.station_m])[0] > 0.15
 
 
-def test_names_are_known(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+NAMES = {
+    "traced-csi-flat": ("walked_channels", ("flat",)),
+    "traced-csi-office": ("walked_channels", ("office",)),
+    "traced-floor-receivers": ("traced_floor_strengths", ()),
+    "traced-floor-receivers-csi": ("traced_floor_channels", ()),
+    "traced-room-bands": ("traced_room_bands", ()),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_of_synthetic_data_are_known(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    function, arguments = NAMES[name]
     asked = []
-    monkeypatch.setattr("wrf_mi.synthetic.walked_channels", lambda place, progress: asked.append(place))
-    load_record("traced-csi-flat")
-    load_record("traced-csi-office")
-    assert asked == ["flat", "office"]
+    monkeypatch.setattr(f"wrf_mi.synthetic.{function}", lambda *given, progress: asked.append((given, progress)))
+    load_record(name, progress=True)
+    assert asked == [(arguments, True)]
+
+
+def test_unknown_places_are_refused(tmp_path: Path) -> None:
     refusal(walked_channels, "garden", tmp_path, "place 'garden': unknown; give one of flat, office")

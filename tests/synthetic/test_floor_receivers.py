@@ -12,7 +12,7 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi.core import Record
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.receivers.channel import csi, rssi_dbm
-from wrf_mi.synthetic import load_record, traced_floor_channels, traced_floor_strengths
+from wrf_mi.synthetic import traced_floor_channels, traced_floor_strengths
 from wrf_mi.synthetic.floor_receivers import (
     CARRIER_HZ,
     DEFAULT,
@@ -98,7 +98,7 @@ def test_strengths_are_the_power_of_all_paths(traced: TraceResult) -> None:
     assert 8 not in kinds
 
 
-def test_offsets_and_noise_have_the_stated_deviations(traced: TraceResult) -> None:
+def test_offsets_noise_and_sensitivity_are_the_stated_ones(traced: TraceResult) -> None:
     quiet = strengths_of(traced, QUIET).observation
     offset = strengths_of(traced, replace(QUIET, offset_db=3.0)).observation - quiet
     assert (np.nanmax(offset, axis=1) - np.nanmin(offset, axis=1)).max() < FLOAT32_DB
@@ -106,8 +106,7 @@ def test_offsets_and_noise_have_the_stated_deviations(traced: TraceResult) -> No
     noise = strengths_of(traced, replace(QUIET, noise_db=2.0)).observation - quiet
     assert np.nanstd(noise) == pytest.approx(2, rel=0.3)  # three standard deviations of the estimate from 70 values
 
-
-def test_strengths_below_the_sensitivity_are_not_received(traced: TraceResult) -> None:
+    # Strengths below the sensitivity are not received.
     all_received = strengths_of(traced, replace(SMALL, sensitivity_dbm=-500.0)).observation
     ordered = np.sort(all_received[np.isfinite(all_received)])
     limit = float(ordered[len(ordered) // 2 :][:2].mean())
@@ -150,12 +149,3 @@ def test_splits_hold_out_receivers(record: Record) -> None:
     held = [split.held_receivers for split in make_splits(many, "receiver")]
     assert sorted(sum(held, ())) == list(range(16))
     assert [len(part) for part in held] == [4] * 4
-
-
-def test_names_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-    for kind in ("strengths", "channels"):
-        monkeypatch.setattr(f"wrf_mi.synthetic.traced_floor_{kind}", lambda progress, kind=kind: asked.append(kind))
-    load_record("traced-floor-receivers")
-    load_record("traced-floor-receivers-csi")
-    assert asked == ["strengths", "channels"]
