@@ -58,19 +58,19 @@ def remove(name: str) -> Change:
     return lambda folder: (folder / name).unlink()
 
 
-def error_line(function: Callable[..., Any], *given: Any, **options: Any) -> str:
+def error_line(function: Callable[..., Any], *arguments: Any, **options: Any) -> str:
     """The error of a function, one line; the last argument is the pattern that it matches."""
-    *arguments, message = given
+    *passed, message = arguments
     with pytest.raises(InputError, match=message) as error:
-        function(*arguments, **options)
+        function(*passed, **options)
     line = str(error.value)
     del error  # and its frames, which hold the sockets of downloads
     assert "\n" not in line
     return line
 
 
-def refusal(function: Callable[..., Any], *given: Any, **options: Any) -> str:
+def refusal(function: Callable[..., Any], *arguments: Any, **options: Any) -> str:
     """Likewise an error that states a remedy."""
-    line = error_line(function, *given, **options)
+    line = error_line(function, *arguments, **options)
     assert ";" in line, "no remedy"
     return line

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -163,12 +164,8 @@ def one_sample(path: Path) -> None:
     write(path, np.random.default_rng(2).integers(-9, 9, (1, 1, 1, 2, 800)).astype(np.int16), SOUNDER)
 
 
-def of_argos(**changes: Any) -> Callable[[Path], object]:
-    return lambda path: argos(path, **changes)
-
-
-def of_sounder(**changes: Any) -> Callable[[Path], object]:
-    return lambda path: sounder(path, **changes)
+def of_pilots(kind: Any) -> Callable[[Path], object]:
+    return partial(sounder, PILOT_SEQ_TYPE=kind)
 
 
 WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
@@ -177,32 +174,20 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "no pilots": (no_pilots, "neither /Pilot_Samples nor /Data/Pilot_Samples in it"),
     "three axes": (samples(2, 3, 4, attributes={}), r"holds int16 \[2, 3, 4\]; whole"),
     "floats": (samples(2, 3, 4, 2, dtype=float, attributes={}), "holds float64"),
-    "no users": (of_argos(num_mob_ant=None), "attribute num_mob_ant is missing"),
-    "users of words": (of_argos(num_mob_ant="many"), "attribute num_mob_ant is 'many'"),
-    "too many users": (of_argos(num_mob_ant=9), "9 users have 224 samples each"),
-    "many users": (
-        of_argos(num_mob_ant=np.full(500, -1)),
-        r"attribute num_mob_ant is array\(\[-1, -1,.*\.\.\.; it must state",
-    ),
-    "short slots": (of_argos(samples_per_user=100), "at 47, 111 do not fit in slots of 100"),
-    "no prefix": (of_sounder(PREFIX_LEN=None), "attribute PREFIX_LEN is missing"),
-    "long prefix": (of_sounder(PREFIX_LEN=450), "do not fit in slots of 470 samples; give start"),
-    "other pilots": (of_sounder(PILOT_SEQ_TYPE=np.array([b"zadoff-chu"])), "'zadoff-chu' of 64 samples"),
-    "attribute of a time": (
-        unreadable_attribute,
-        r"an attribute cannot be read \(.*; write it again as a number or as",
-    ),
-    "no word of pilots": (of_sounder(PILOT_SEQ_TYPE=np.array([], "S3")), "PILOT_SEQ_TYPE is empty; it must be lts"),
-    "empty word of pilots": (
-        of_sounder(PILOT_SEQ_TYPE=np.array([b""], "S3")),
-        "attribute PILOT_SEQ_TYPE is empty; it must be lts",
-    ),
-    "nothing of pilots": (
-        of_sounder(PILOT_SEQ_TYPE=h5py.Empty("S3")),
-        r"attribute PILOT_SEQ_TYPE is .*Empty\(.*; it must be lts",
-    ),
-    "pilots not UTF-8": (of_sounder(PILOT_SEQ_TYPE=np.array([b"\xff\xfe"])), r"pilots .*xff.* of 64"),
-    "longer symbols": (of_sounder(FFT_SIZE=2048), "of 2048 samples; the long training symbol"),
+    "no users": (partial(argos, num_mob_ant=None), "attribute num_mob_ant is missing"),
+    "users of words": (partial(argos, num_mob_ant="many"), "attribute num_mob_ant is 'many'"),
+    "too many users": (partial(argos, num_mob_ant=9), "9 users have 224 samples each"),
+    "many users": (partial(argos, num_mob_ant=np.full(500, -1)), r"mob_ant is array\(\[-1, -1,.*\.\.\.; it must state"),
+    "short slots": (partial(argos, samples_per_user=100), "at 47, 111 do not fit in slots of 100"),
+    "no prefix": (partial(sounder, PREFIX_LEN=None), "attribute PREFIX_LEN is missing"),
+    "long prefix": (partial(sounder, PREFIX_LEN=450), "do not fit in slots of 470 samples; give start"),
+    "other pilots": (of_pilots(np.array([b"zadoff-chu"])), "'zadoff-chu' of 64 samples"),
+    "attribute of a time": (unreadable_attribute, r"attribute cannot be read \(.*; write it again as a number or as"),
+    "no word of pilots": (of_pilots(np.array([], "S3")), "attribute PILOT_SEQ_TYPE is empty; it must be lts"),
+    "empty word of pilots": (of_pilots(np.array([b""], "S3")), "attribute PILOT_SEQ_TYPE is empty; it must be lts"),
+    "nothing of pilots": (of_pilots(h5py.Empty("S3")), r"attribute PILOT_SEQ_TYPE is .*Empty\(.*; it must be lts"),
+    "pilots not UTF-8": (of_pilots(np.array([b"\xff\xfe"])), r"pilots .*xff.* of 64"),
+    "longer symbols": (partial(sounder, FFT_SIZE=2048), "of 2048 samples; the long training symbol"),
     "half a pair": (samples(2, 1, 1, 2, 301), "301 numbers a slot, which are no pairs"),
     "one sample": (one_sample, "1 of 1 samples hold a"),
     "silence": (samples(3, 1, 1, 2, 800), "0 of 3 samples hold a sig"),

@@ -13,15 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from changed_folders import DATA, error_line, needs, refusal
-from spectrum_records import assert_same
+from spectrum_records import assert_same, make_record
 
-from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import datasets, fetch, load, read_newrf, read_spectrum_folder, registry, write_spectrum_folder
 from wrf_mi.datasets.download import download
 from wrf_mi.datasets.newrf import arrays_sha256, convert_newrf
 from wrf_mi.datasets.registry import DATA_VARIABLE, DataSet, RemoteFile, known, remote_files
 
-ROWS = 6
 NAMES = ("rfid-lab", "flat-ble", "newrf-conference", "newrf-office", "laboratory", "traced-room", "traced-room-bands")
 NAMES += ("traced-csi-flat", "traced-csi-office", "traced-floor-receivers", "traced-floor-receivers-csi")
 PICKLES = Path(__file__).parent / "data"
@@ -62,16 +60,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def small_folder(path: Path) -> Path:
-    rng = np.random.default_rng(1)
-    record = Record(
-        "small",
-        "spectrum",
-        rng.normal(size=(ROWS, 3)),
-        (Receiver("gateway1", np.zeros(3), np.array([0.0, 0, 0, 1])),),
-        rng.random((1, ROWS, 4, 8)).astype(np.float32),
-        official=(np.arange(2, ROWS), np.arange(2)),
-    )
-    return write_spectrum_folder(path, record)
+    return write_spectrum_folder(path, make_record(6))
 
 
 def remote(path: Path, name: str) -> RemoteFile:
@@ -92,8 +81,8 @@ def test_download_is_complete_and_checked_again(server: tuple[str, Path], tmp_pa
     shutil.rmtree(root / "abc123")
     assert download(DATASET, entries, target, url) == target, "what is there needs no server"
     (target / "tx_pos.csv").write_text("x,y,z\n")
-    with pytest.raises(InputError, match=r"tx_pos.csv: missing or is not the published file \(1 of \d+ are not\)"):
-        download(DATASET, entries, target, url)
+    message = r"tx_pos.csv: missing or is not the published file \(1 of \d+ are not\)"
+    refusal(download, DATASET, entries, target, url, message)
 
 
 def refused(entries: list[RemoteFile], home: Path, url: str, message: str, progress: bool = False) -> None:

@@ -2,6 +2,7 @@
 
 import itertools
 import pickle
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -153,11 +154,7 @@ def test_every_faulty_field_is_collected_once(tmp_path: Path) -> None:
     ("rows", "count", "message"),
     [
         ("{header}\n1,2\n3\n", 4, "; correct or remove the row"),
-        (
-            "x,y,rssi_1,rssi_3,count_1\n1,2,-50,-60,7\n",
-            2,
-            ": line 1: no column count_3; give one for every anchor in both files, or none",
-        ),
+        ("x,y,rssi_1,rssi_3,count_1\n1,2,-50,-60,7\n", 2, ": line 1: no column count_3; .* in both files, or none"),
     ],
 )
 def test_rows_of_other_lengths_and_missing_columns_are_the_only_faults(
@@ -167,7 +164,7 @@ def test_rows_of_other_lengths_and_missing_columns_are_the_only_faults(
     for name in (ble.TRAIN_FILE, ble.TEST_FILE):
         (folder / name).write_text(rows.format(header=(folder / name).read_text().splitlines()[0]))
     found = lines(folder)
-    assert [message in line for line in found] == [True] * count
+    assert [bool(re.search(message, line)) for line in found] == [True] * count
 
 
 @needs("flat-ble")

@@ -81,11 +81,7 @@ def test_aliases_and_scenes_of_known_plugins_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (
-            "^dataset_name",
-            r"array: {rows: 100000, columns: 100000, spacing_m: 0.1}\ndataset_name",
-            "give 16384 at most",
-        ),
+        ("^dataset_name", r"array: {rows: 100000, columns: 100000, spacing_m: 1}\ndataset_name", "give 16384 at most"),
         (r"^\w+:$", "..:", "cannot name a folder"),
     ],
 )

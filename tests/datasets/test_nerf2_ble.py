@@ -107,9 +107,7 @@ WRONG = {  # each is refused, see test_faults.py
     "gateway of 400 digits": replaced(YML, "3.0", "9" * 400, "no int .*too large to convert.*line 1, column 22"),
     "gateway too far": replaced(YML, "3.0", "1.0e+39", "gateway1: position is .*; give a list of 3 finite numbers"),
     "deep YAML": rewritten(YML, "a: " + "[" * 1000, "not YAML"),
-    "gateway of two lines": rewritten(
-        YML, '"gate\\nway": [1, 2, 3]\n', r"gateway 'gate\\nway' does not go into one line; call it gateway1"
-    ),
+    "gateway of two lines": rewritten(YML, '"gate\\nway": [1, 2, 3]\n', r"'gate\\nway' does not .*; call it gateway1"),
     "two coordinates": replaced(POS, "x,y,z", "x,y", "row 1: 3 fields, but the header has 2"),
     "four coordinates": rewritten(POS, "a,b,c,d\n1,2,3,4\n", "line 1: header 'a,b,c,d' has 4 columns"),
     "position not finite": replaced(POS, "0.25", "nan", "row 2: x is 'nan'"),
@@ -118,21 +116,15 @@ WRONG = {  # each is refused, see test_faults.py
     "header of other numbers": replaced(RSSI, "gateway1,gateway2", "1,0", "line 1: '1,0' is a row of numbers"),
     "powers without header": replaced(RSSI, "gateway1,gateway2\n", "", "line 1: '-54.25,-100' is a row of numbers"),
     "rows differ": (text(POS, "1.25,2,1\n", ""), RSSI, "4 rows, but tx_pos.csv has 3"),
-    "column too many": rewritten(
-        RSSI, "gateway1,gateway2,gateway3\n1,2,3\n", "3 columns, but gateway_position.yml has 2 gateways"
-    ),
+    "column too many": rewritten(RSSI, "a,b,c\n1,2,3\n", "3 columns, but gateway_position.yml has 2 gateways"),
     "other gateway": replaced(RSSI, "gateway2", "gateway9", "line 1: no column gateway2"),
     "power of words": replaced(RSSI, "-61", "weak", "row 2: gateway2 is 'weak'"),
-    "power of words in a numbered column": rewritten(
-        RSSI, "0,1\n-50,-60\n\n-50,weak\n", r"row 2: column 1 \(gateway2\) is 'weak'"
-    ),
+    "power below 0,1": rewritten(RSSI, "0,1\n-50,-60\n\n-50,weak\n", r"row 2: column 1 \(gateway2\) is 'weak'"),
     "power too large": replaced(RSSI, "-61", "1e39", "row 2: gateway2 is '1e39'; give a finite number of single pre"),
     "power missing": replaced(RSSI, "-61", "", "row 2: gateway2 is ''"),
     "one row": (one_row, POS, "1 row; give 2 at least"),
     "index out of range": replaced("train_index.txt", "3", "4", "row 4 is out of range.*rows 0 to 3"),
-    "index of 5000 digits": replaced(
-        "train_index.txt", "3", "9" * 5000, "line 1: '9+' has more than 18 digits; correct it"
-    ),
+    "index of 5000 digits": replaced("train_index.txt", "3", "9" * 5000, "1: '9+' has more than 18 digits; correct it"),
     "index in both": replaced("test_index.txt", "1", "3", "row 3 is in train_index.txt as well"),
     "one index file": (remove("test_index.txt"), "test_index.txt", "missing"),
 }

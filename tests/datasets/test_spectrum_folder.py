@@ -13,10 +13,11 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 from spectrum_records import assert_same, make_record
 
-from wrf_mi.core import Antenna, InputError, Record
+from wrf_mi.core import Antenna, InputError, Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import read_spectrum_folder, write_spectrum_folder
 
+YML, POS = "gateway_info.yml", "tx_pos.csv"
 READ_SECONDS = 0.5
 """Reading 200 images of 90 x 360 may take this long; it takes 0.1 s on two slow cores."""
 
@@ -32,8 +33,8 @@ def test_reads_a_folder_written_by_hand(tmp_path: Path):
     grey = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
     for row in range(3):
         Image.fromarray(grey + row).save(tmp_path / "spectrum" / f"{row + 1:05d}.png")
-    (tmp_path / "tx_pos.csv").write_bytes(b"x,y,z\r\n0.1,0.2,0.3\r\n-1,2,3\r\n4e-1,5,6\r\n")
-    (tmp_path / "gateway_info.yml").write_text(
+    (tmp_path / POS).write_bytes(b"x,y,z\r\n0.1,0.2,0.3\r\n-1,2,3\r\n4e-1,5,6\r\n")
+    (tmp_path / YML).write_text(
         "dataset_name: s23\ngateway1:\n  position: [5.0, 0.26, 0]\n"
         "  orientation:  [ 0.51291602, -0.48674136, -0.48674136,  0.51291602]  # quaternion"
     )
@@ -82,7 +83,7 @@ def test_carrier_and_array_are_optional(folder: Path, tmp_path: Path):
     elements = np.random.default_rng(3).normal(size=(5, 3))
     told = replace(record, frequencies_hz=np.array([915.25e6])).with_array(elements)
     assert_same(again(tmp_path / "told" / "made-up", told), told)
-    append("gateway_info.yml", "frequency_hz: 920e6\narray: {rows: 2, columns: 3, spacing_m: 0.16}")(folder)
+    append(YML, "frequency_hz: 920e6\narray: {rows: 2, columns: 3, spacing_m: 0.16}")(folder)
     told = replace(record, frequencies_hz=np.array([920e6])).with_array(planar_array(2, 3, 0.16))
     assert_same(read_spectrum_folder(folder), told)
 
@@ -107,8 +108,8 @@ GREY = np.zeros((5, 8), np.uint8)
 SEVERAL = "several carriers.*column frequency_hz, or make a folder for each"
 ANTENNA = "gateway9:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0, 1]\n  antenna: "
 WRONG = {  # each is refused, see test_faults.py
-    "no poses": (remove("gateway_info.yml"), "gateway_info.yml", "missing"),
-    "no positions file": (remove("tx_pos.csv"), "tx_pos.csv", "missing"),
+    "no poses": (remove(YML), YML, "missing"),
+    "no positions file": (remove(POS), POS, "missing"),
     "one index file": (remove("test_index.txt"), "test_index.txt", "missing"),
     "image missing": (remove("spectrum/00007.png"), "00007.png", r"row 7: missing \(11 images for 12 rows"),
     "image too many": (image("spectrum/00013.png", GREY), "00013.png", "13 images for 12 rows"),
@@ -116,24 +117,24 @@ WRONG = {  # each is refused, see test_faults.py
     "image cut short": (cut("spectrum/00004.png"), "00004.png", "row 4: unreadable"),
     "no image at all": (write("spectrum/00005.png", "hello"), "00005.png", "row 5: unreadable"),
     "colour image": (image("spectrum/00006.png", np.zeros((5, 8, 3), np.uint8)), "00006.png", "row 6: image mode RGB"),
-    "position missing": (text("tx_pos.csv", r"^[^,x]+,.*\n", ""), "00012.png", "12 images for 11 rows"),
-    "NaN position": replaced("tx_pos.csv", r"^[^,x]+,", "nan,", "row 1: x is 'nan'"),
-    "infinite position": replaced("tx_pos.csv", r"^[^,x]+,", "-inf,", "row 1: x is '-inf'; give a finite"),
-    "position of words": replaced("tx_pos.csv", r"^[^,x]+,", "here,", "row 1: x is 'here'; give a finite"),
-    "position of two numbers": replaced("tx_pos.csv", r"^[^,x]+,", "", "row 1: 2 fields, but"),
-    "position of one number": replaced("tx_pos.csv", r"^[^,x]+,[^\n]*", "5", "row 1: 1 field, but"),
-    "position of four numbers": replaced("tx_pos.csv", r"^[^,x]+,", "1,2,", "row 1: 4 fields, but"),
-    "no header": replaced("tx_pos.csv", r"^x,y,z\n", "", "line 1: header"),
-    "no rows": rewritten("tx_pos.csv", "x,y,z\n", "no rows below the header"),
-    "empty positions file": rewritten("tx_pos.csv", "", "empty; give a header"),
-    "not text": rewritten("tx_pos.csv", b"\xff\xfe\x00", "cannot be read"),
-    "not YAML": rewritten("gateway_info.yml", "a: [1\nb: }", "not YAML"),
-    "no receiver": rewritten("gateway_info.yml", "dataset_name: a", "no receiver"),
-    "YAML list": rewritten("gateway_info.yml", "- 1", "no receiver"),
-    "receiver that climbs": replaced("gateway_info.yml", "gateway1", "../up", "cannot name a folder"),
-    "quaternion not unit": replaced("gateway_info.yml", "0.8", "0.9", "gateway1: quaternion of norm"),
-    "quaternion of three": replaced("gateway_info.yml", "0.6, ", "", "gateway1: orientation is"),
-    "NaN receiver": replaced("gateway_info.yml", r"position: \[", "position: [.nan, ", "position is"),
+    "position missing": (text(POS, r"^[^,x]+,.*\n", ""), "00012.png", "12 images for 11 rows"),
+    "NaN position": replaced(POS, r"^[^,x]+,", "nan,", "row 1: x is 'nan'"),
+    "infinite position": replaced(POS, r"^[^,x]+,", "-inf,", "row 1: x is '-inf'; give a finite"),
+    "position of words": replaced(POS, r"^[^,x]+,", "here,", "row 1: x is 'here'; give a finite"),
+    "position of two numbers": replaced(POS, r"^[^,x]+,", "", "row 1: 2 fields, but"),
+    "position of one number": replaced(POS, r"^[^,x]+,[^\n]*", "5", "row 1: 1 field, but"),
+    "position of four numbers": replaced(POS, r"^[^,x]+,", "1,2,", "row 1: 4 fields, but"),
+    "no header": replaced(POS, r"^x,y,z\n", "", "line 1: header"),
+    "no rows": rewritten(POS, "x,y,z\n", "no rows below the header"),
+    "empty positions file": rewritten(POS, "", "empty; give a header"),
+    "not text": rewritten(POS, b"\xff\xfe\x00", "cannot be read"),
+    "not YAML": rewritten(YML, "a: [1\nb: }", "not YAML"),
+    "no receiver": rewritten(YML, "dataset_name: a", "no receiver"),
+    "YAML list": rewritten(YML, "- 1", "no receiver"),
+    "receiver that climbs": replaced(YML, "gateway1", "../up", "cannot name a folder"),
+    "quaternion not unit": replaced(YML, "0.8", "0.9", "gateway1: quaternion of norm"),
+    "quaternion of three": replaced(YML, "0.6, ", "", "gateway1: orientation is"),
+    "NaN receiver": replaced(YML, r"position: \[", "position: [.nan, ", "position is"),
     "row zero": replaced("train_index.txt", r"^\d+", "00000", "line 1: row 0 is out of range"),
     "row beyond the end": replaced("test_index.txt", r"^\d+", "00013", "line 1: row 13 is out of"),
     "row of words": replaced("test_index.txt", r"^\d+", "12a", "line 1: '12a' is not a whole number"),
@@ -146,7 +147,7 @@ WRONG = {  # each is refused, see test_faults.py
     "fold far away": replaced("blocked_folds.txt", r"^2", "9" * 15, "fold 3 has no row"),
     "one fold": rewritten("blocked_folds.txt", "0\n" * 12, "one fold only"),
     **{
-        line: (append("gateway_info.yml", line), "gateway_info.yml", message)
+        line: (append(YML, line), YML, message)
         for line, message in (
             ("frequency_hz: 0", "frequency_hz is 0; give the carrier in Hz"),
             ("frequency_hz: .inf", "frequency_hz is inf"),
@@ -172,8 +173,8 @@ WRONG = {  # each is refused, see test_faults.py
     },
     **{
         f"carrier {row}": (
-            write("tx_pos.csv", "\n".join(["x,y,z,frequency_hz", "1,2,3,9e8", row, *["1,2,3,9e8"] * 10])),
-            "tx_pos.csv",
+            write(POS, "\n".join(["x,y,z,frequency_hz", "1,2,3,9e8", row, *["1,2,3,9e8"] * 10])),
+            POS,
             message,
         )
         for row, message in (
@@ -184,21 +185,15 @@ WRONG = {  # each is refused, see test_faults.py
             ("1,2,3,many", "row 2: frequency_hz is 'many'; give a finite number"),
         )
     },
-    "quaternion beyond the tolerance": replaced("gateway_info.yml", "0.8", "0.8025", r"norm 1\.002"),
+    "quaternion beyond the tolerance": replaced(YML, "0.8", "0.8025", r"norm 1\.002"),
     "row of both parts": (overlap, "test_index.txt", r"row \d+ is in train_index.txt as well"),
-    "empty run": rewritten(
-        "tx_pos.csv", "x,y,z,run\n1,2,3,a\n1,2,3, \n" + "1,2,3,b\n" * 10, "row 2: run is empty; give the name or number"
-    ),
-    "run before carrier": rewritten(
-        "tx_pos.csv",
-        "x,y,z,run,frequency_hz\n" + "1,2,3,a,9e8\n" * 12,
-        "line 1: header is 'x,y,z,run,frequency_hz'; it must be",
-    ),
+    "empty run": rewritten(POS, "x,y,z,run\n1,2,3,a\n1,2,3, \n" + "1,2,3,b\n" * 10, "row 2: run is empty; give the"),
+    "run before carrier": rewritten(POS, "x,y,z,run,frequency_hz\n" + "1,2,3,a,9e8\n" * 12, "header is .*; it must be"),
 }
 
 
 def test_quaternions_within_the_tolerance_are_accepted(folder: Path):
-    text("gateway_info.yml", "0.8", "0.8005")(folder)  # norm 1.0004; 1.0020 is in WRONG
+    text(YML, "0.8", "0.8005")(folder)  # norm 1.0004; 1.0020 is in WRONG
     assert len(read_spectrum_folder(folder).receivers) == 1
 
 
@@ -244,19 +239,20 @@ def test_antennas_are_read_and_written(tmp_path: Path):
 
 
 ONE = make_record(4)
+CARRIERS_HZ = np.array([915e6, 2.44e9, 915e6, 5.1e9])
+
+
+def named(name: str) -> tuple[Receiver, ...]:
+    return (replace(ONE.receivers[0], name=name),)
+
+
 BEYOND = {  # what the layout cannot state
-    "receiver named array": ({"receivers": (replace(ONE.receivers[0], name="array"),)}, "a receiver is named 'array'"),
-    "receiver named tx_antenna": (
-        {"receivers": (replace(ONE.receivers[0], name="tx_antenna"),)},
-        "a receiver is named 'tx_antenna'",
-    ),
+    "receiver named array": ({"receivers": named("array")}, "a receiver is named 'array'"),
+    "receiver named tx_antenna": ({"receivers": named("tx_antenna")}, "a receiver is named 'tx_antenna'"),
     "truth": ({"truth": ONE.observation}, "has truth, which this layout does not state; set Record.truth to"),
     "heading": ({"tx_heading_rad": ONE.folds}, "has tx_heading_rad, which .* not state; set Record.tx_heading_rad to"),
     "powers": ({"task": "rssi", "observation": ONE.observation[:, :, 0, 0]}, "no spectra within"),
-    "carriers of all rows": (
-        {"frequencies_hz": np.array([915e6, 2.4e9])},
-        r"2 carriers for all rows, and gateway_info\.yml states one; give that of each row",
-    ),
+    "carriers": ({"frequencies_hz": CARRIERS_HZ}, r"4 carriers for all rows, and gateway_info\.yml states one; give"),
     **{
         f"run {run!r}": (
             {"runs": np.array(["a", run, "a", "b"])},
@@ -278,24 +274,21 @@ def test_attributes_beyond_the_layout_are_not_written(tmp_path: Path, case: str)
 def test_several_carriers_of_receivers_are_refused_and_equal_ones_are_one(tmp_path: Path):
     folder = write_spectrum_folder(tmp_path / "two", make_record(4, gateways=2))
     for name in ("gateway1", "gateway2"):
-        text("gateway_info.yml", f"{name}:\n", f"{name}:\n  frequency_hz: 915e6\n")(folder)
+        text(YML, f"{name}:\n", f"{name}:\n  frequency_hz: 915e6\n")(folder)
     np.testing.assert_array_equal(read_spectrum_folder(folder).frequencies_hz, [915e6])
-    text("gateway_info.yml", "gateway2:\n  frequency_hz: 915e6", "gateway2:\n  frequency_hz: 2.44e9")(folder)
+    text(YML, "gateway2:\n  frequency_hz: 915e6", "gateway2:\n  frequency_hz: 2.44e9")(folder)
     message = r"gateway1: frequency_hz of 9.15e\+08 and gateway2: frequency_hz of 2.44e\+09"
     refusal(read_spectrum_folder, folder, message)
-
-
-CARRIERS_HZ = np.array([915e6, 2.44e9, 915e6, 5.1e9])
 
 
 def test_the_carrier_of_each_row_is_kept(tmp_path: Path):
     folder, record = tmp_path / "made-up", make_record(4).at_carriers(CARRIERS_HZ)
     assert_same(again(folder, record), record)
-    (folder / "tx_pos.csv").write_text("x,y,z,frequency_hz\n" + "1,2,3,868e6\n" * 4)
+    (folder / POS).write_text("x,y,z,frequency_hz\n" + "1,2,3,868e6\n" * 4)
     one = read_spectrum_folder(folder)
     np.testing.assert_array_equal(one.frequencies_hz, [868e6])
     assert one.carriers_hz is None
-    append("gateway_info.yml", "frequency_hz: 868e6")(folder)
+    append(YML, "frequency_hz: 868e6")(folder)
     refusal(read_spectrum_folder, folder, r"tx_pos.csv: line 1: column frequency_hz, but gateway_info.yml states a car")
 
 
@@ -304,5 +297,5 @@ def test_the_run_of_each_row_is_kept(tmp_path: Path, several: bool):
     record = replace(make_record(4), runs=np.array(["day 1", "day 1", "2", "with, comma"]))
     record = record.at_carriers(CARRIERS_HZ) if several else record
     assert_same(again(tmp_path / "made-up", record), record)
-    header = (tmp_path / "made-up" / "tx_pos.csv").read_text().splitlines()[0]
+    header = (tmp_path / "made-up" / POS).read_text().splitlines()[0]
     assert header == ("x,y,z,frequency_hz,run" if several else "x,y,z,run")

@@ -101,7 +101,8 @@ def test_layouts_that_do_not_fit_are_refused_in_one_line(
 
 @pytest.mark.skipif(not (data_home() / "rfid-lab").is_dir(), reason="needs the data set rfid-lab")
 def test_measured_spectra_read_back(tmp_path: Path) -> None:
+    measured = load("rfid-lab")
     export("rfid-lab", "npz", tmp_path / "lab.npz")
-    assert_same(load(tmp_path / "lab.npz"), load("rfid-lab"))
+    assert_same(load(tmp_path / "lab.npz"), measured)
     export("rfid-lab", "spectra", tmp_path / "lab")
-    np.testing.assert_array_equal(load(tmp_path / "lab").observation, load("rfid-lab").observation)
+    np.testing.assert_array_equal(load(tmp_path / "lab").observation, measured.observation)

@@ -35,19 +35,15 @@ that differ by 0.015 rad at most."""
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("walked") / "flat"
+def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    return walked_channels("flat", tmp_path_factory.mktemp("walked") / "flat", SMALL)
 
 
-@pytest.fixture(scope="module")
-def record(folder: Path) -> Record:
-    return walked_channels("flat", folder, SMALL)
-
-
-def test_data_are_stored_and_reproducible(folder: Path, record: Record, tmp_path: Path) -> None:
-    before = (folder / "csidata.npy").stat().st_mtime_ns
-    assert_same(walked_channels("flat", folder, SMALL), record)
-    assert (folder / "csidata.npy").stat().st_mtime_ns == before
+def test_data_are_stored_and_reproducible(record: Record, tmp_path: Path) -> None:
+    file = Path(record.source, "csidata.npy")
+    before = file.stat().st_mtime_ns
+    assert_same(walked_channels("flat", record.source, SMALL), record)
+    assert file.stat().st_mtime_ns == before
     moved = walked_channels("flat", tmp_path / "moved", replace(SMALL, seed=2))
     assert not np.array_equal(record.tx_pos_m, moved.tx_pos_m)
     walked_channels("flat", tmp_path / "moved", SMALL)
@@ -190,7 +186,7 @@ NAMES = {
 def test_names_of_synthetic_data_are_known(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     function, arguments = NAMES[name]
     asked = []
-    monkeypatch.setattr(f"wrf_mi.synthetic.{function}", lambda *given, progress: asked.append((given, progress)))
+    monkeypatch.setattr(f"wrf_mi.synthetic.{function}", lambda *place, progress: asked.append((place, progress)))
     load_record(name, progress=True)
     assert asked == [(arguments, True)]
 
