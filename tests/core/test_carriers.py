@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -188,9 +189,7 @@ def spectra_of(record: Record) -> Record:
 
 
 @pytest.mark.parametrize("make", [lambda record: record, spectra_of])
-def test_reflections_equal_a_trace_at_the_rows_carrier(
-    make: Callable[[Record], Record], flat: Record, room: Path, tmp_path: Path
-) -> None:
+def test_reflections_equal_a_trace_at_the_carrier(make: Callable[[Record], Record], flat: Record, room: Path) -> None:
     record = make(flat)
     options, rows = TraceOptions(depth=2, transmission=True, rays=20000), np.arange(9)
     carriers, tx = record.carriers_hz[rows], record.tx_pos_m[rows]
@@ -245,9 +244,7 @@ def test_reference_interpolates_rows_of_the_same_carrier(flat: Record) -> None:
     np.testing.assert_allclose(moved, [np.where(flat.carriers_hz[rows] == LOW, 30, 0)] * 2, atol=FLOAT32_DB)
 
 
-def test_data_command_shows_carriers_readings_and_noise(
-    flat: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_data_command_shows_carriers_readings_and_noise(flat: Record, tmp_path: Path, capsys: Any) -> None:
     shape = flat.observation.shape
     readings = np.ones(shape, np.int64)
     readings[:, ::2] = 5

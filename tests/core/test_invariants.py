@@ -92,9 +92,7 @@ def test_images_are_linear_in_signals(field: Field, factor: complex, seed: int) 
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 10**6), st.randoms(use_true_random=False), st.floats(0.1, 10))
-def test_bartlett_spectrum_ignores_order_of_elements_and_scales_with_power(
-    seed: int, random: Any, amplitude: float
-) -> None:
+def test_bartlett_spectrum_ignores_order_and_scales_with_power(seed: int, random: Any, amplitude: float) -> None:
     rng = np.random.default_rng(seed)
     elements, direction = planar_array(4, 4, 0.16), rng.normal(size=3)
     h = array_response(elements, direction / np.linalg.norm(direction), 920e6) + 0.1 * rng.normal(size=16)

@@ -63,9 +63,7 @@ def test_package_computes_the_stored_channels(tmp_path: Path, name: str) -> None
 
 
 @pytest.mark.parametrize("selected", [[0, 21, 42, 63], [0, 1, 5, 63]])
-def test_channels_of_several_base_stations_and_sets_of_users_equal_those_of_the_package(
-    tmp_path: Path, selected: list[int]
-) -> None:
+def test_channels_of_stations_and_sets_of_users_equal_those_of_the_package(tmp_path: Path, selected: list[int]) -> None:
     folder = scenario(tmp_path, stations=2, users=(60, 30))
     chosen = {**CHOSEN["array"], "ofdm": {**CHOSEN["array"]["ofdm"], "selected_subcarriers": selected}}
     record = read_deepmimo(folder, params={**chosen, "base_stations": "all"})

@@ -6,9 +6,10 @@ import shutil
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ from wrf_mi.datasets.registry import DATA_VARIABLE, DataSet, RemoteFile, known, 
 
 NAMES = ("rfid-lab", "flat-ble", "newrf-conference", "newrf-office", "laboratory", "traced-room", "traced-room-bands")
 NAMES += ("traced-csi-flat", "traced-csi-office", "traced-floor-receivers", "traced-floor-receivers-csi")
+Server = tuple[str, Path]
+"""The URL and the folder that it serves."""
 PICKLES = Path(__file__).parent / "data"
 DATASET = DataSet("small", "spectrum", "MIT", "made up", base_url="http://unused")
 
@@ -38,7 +41,7 @@ def _without_retries(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, Path]]:
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     """A server of files on this machine: its URL and the folder it serves."""
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     root = tmp_path / "served"
@@ -71,7 +74,7 @@ def manifest(folder: Path) -> list[RemoteFile]:
     return [remote(path, path.relative_to(folder).as_posix()) for path in sorted(folder.rglob("*")) if path.is_file()]
 
 
-def test_download_is_complete_and_checked_again(server: tuple[str, Path], tmp_path: Path):
+def test_download_is_complete_and_checked_again(server: Server, tmp_path: Path):
     url, root = server
     entries = manifest(small_folder(root / "abc123"))
     target = download(DATASET, entries, tmp_path / "home" / "small", url)
@@ -93,9 +96,7 @@ def refused(entries: list[RemoteFile], home: Path, url: str, message: str, progr
 
 
 @pytest.mark.parametrize("progress", [False, True])
-def test_missing_corrupted_and_endless_files_are_refused(
-    server: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, progress: bool
-):
+def test_missing_corrupted_and_endless_files(server: Server, tmp_path: Path, monkeypatch: Any, progress: bool):
     url, root = server
     entries = manifest(small_folder(root / "abc123"))
     image = root / "abc123" / "spectrum" / "00004.png"
@@ -169,7 +170,7 @@ def test_manifests_are_complete(name: str):
         assert name != "rfid-lab" or path in (entry.path, f"data_test200/{entry.path}")
 
 
-def fetched_from_copy(name: str, server: tuple[str, Path], **options: bool) -> Path:
+def fetched_from_copy(name: str, server: Server, **options: bool) -> Path:
     """The data set as it is fetched from a server of this machine's copy."""
     url, root = server
     for entry in remote_files(known(name)):
@@ -179,7 +180,7 @@ def fetched_from_copy(name: str, server: tuple[str, Path], **options: bool) -> P
 
 
 @needs("rfid-lab")
-def test_fetch_rfid_lab_from_a_copy(server: tuple[str, Path], home: Path):
+def test_fetch_rfid_lab_from_a_copy(server: Server, home: Path):
     target = fetched_from_copy("rfid-lab", server, progress=False)
     assert target == home / "cache" / "rfid-lab"
     fetched, copy = load("rfid-lab"), read_spectrum_folder(DATA / "rfid-lab")
@@ -193,7 +194,7 @@ def test_fetch_rfid_lab_from_a_copy(server: tuple[str, Path], home: Path):
 
 
 @needs("rfid-lab")
-def test_fetch_flat_ble_from_a_copy(server: tuple[str, Path], home: Path, capsys: pytest.CaptureFixture[str]):
+def test_fetch_flat_ble_from_a_copy(server: Server, home: Path, capsys: pytest.CaptureFixture[str]):
     target = fetched_from_copy("flat-ble", server)
     assert "lidar/points.npz and lidar/gridmap.npz" in capsys.readouterr().err
     assert "CC BY 4.0" in (target / "SOURCE.txt").read_text()
@@ -204,9 +205,7 @@ def test_fetch_flat_ble_from_a_copy(server: tuple[str, Path], home: Path, capsys
 
 
 @pytest.mark.parametrize("folder", ["newrf", "newrf-office"])
-def test_a_room_is_found_in_a_folder_of_its_own_or_beside_others(
-    home: Path, monkeypatch: pytest.MonkeyPatch, folder: str
-):
+def test_a_room_is_found_in_its_own_folder_or_beside_others(home: Path, monkeypatch: pytest.MonkeyPatch, folder: str):
     monkeypatch.setenv("WRF_MI_DATA", str(home / "data"))
     place = home / "data" / folder
     place.mkdir(parents=True)
@@ -229,7 +228,7 @@ def room(root: Path) -> list[RemoteFile]:
     ]
 
 
-def test_a_room_is_converted_and_its_arrays_are_checked_again(server: tuple[str, Path], tmp_path: Path):
+def test_a_room_is_converted_and_its_arrays_are_checked_again(server: Server, tmp_path: Path):
     url, root = server
     entries = room(root)
     target = download(DATASET, entries, tmp_path / "home" / "hall", url)
@@ -256,9 +255,7 @@ def test_a_room_is_converted_and_its_arrays_are_checked_again(server: tuple[str,
         ),
     ],
 )
-def test_a_pickle_with_other_content_is_refused_and_nothing_is_left(
-    server: tuple[str, Path], tmp_path: Path, change: Callable[[bytes], bytes], message: str
-):
+def test_a_pickle_with_other_content_is_refused(server: Server, tmp_path: Path, change: Any, message: str):
     url, root = server
     entries, served = room(root), root / "abc123" / "data.pkl"
     served.write_bytes(change(served.read_bytes()))

@@ -157,9 +157,7 @@ def test_every_faulty_field_is_collected_once(tmp_path: Path) -> None:
         ("x,y,rssi_1,rssi_3,count_1\n1,2,-50,-60,7\n", 2, ": line 1: no column count_3; .* in both files, or none"),
     ],
 )
-def test_rows_of_other_lengths_and_missing_columns_are_the_only_faults(
-    rows: str, count: int, message: str, tmp_path: Path
-) -> None:
+def test_faults_of_columns_are_the_only_ones(rows: str, count: int, message: str, tmp_path: Path) -> None:
     folder = made(tmp_path / "data", "ble")
     for name in (ble.TRAIN_FILE, ble.TEST_FILE):
         (folder / name).write_text(rows.format(header=(folder / name).read_text().splitlines()[0]))

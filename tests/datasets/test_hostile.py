@@ -64,9 +64,7 @@ REFUSED: list[tuple[Callable[..., Any], str, str | bytes, str]] = [  # reader, n
 
 
 @pytest.mark.parametrize(("read", "name", "content", "message"), REFUSED)
-def test_files_that_mean_harm_are_refused(
-    read: Callable[..., Any], name: str, content: str | bytes, message: str, tmp_path: Path
-) -> None:
+def test_files_that_mean_harm_are_refused(read: Any, name: str, content: Any, message: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content.encode() if isinstance(content, str) else content)
     error_line(read, tmp_path / name, *([0.1] if read is read_plan else []), message)
 
@@ -85,9 +83,7 @@ def test_aliases_and_scenes_of_known_plugins_are_read(tmp_path: Path) -> None:
         (r"^\w+:$", "..:", "cannot name a folder"),
     ],
 )
-def test_a_receivers_file_that_asks_for_too_much_is_refused(
-    old: str, new: str, message: str, folder: Path, tmp_path: Path
-) -> None:
+def test_receivers_that_ask_for_too_much_are_refused(old: str, new: str, message: str, folder: Path, tmp_path: Path):
     copy = shutil.copytree(folder, tmp_path / "copy")
     text("gateway_info.yml", old, new)(copy)
     refusal(load, copy, message)

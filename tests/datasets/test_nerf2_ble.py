@@ -79,9 +79,7 @@ def with_blank_lines(table: str) -> str:
         ({POS: with_blank_lines(POSITIONS), RSSI: with_blank_lines(POWERS)}, [0, 1], [0, 1, 2]),
     ],
 )
-def test_columns_are_assigned_by_name_or_else_by_order_and_blank_lines_are_skipped(
-    changes: dict[str, str], order: list[int], axes: list[int], folder: Path
-) -> None:
+def test_columns_are_assigned_by_name_or_order(changes: dict, order: list[int], axes: list[int], folder: Path) -> None:
     plain = read_nerf2_ble(folder)
     for name, content in changes.items():
         (folder / name).write_text(content)

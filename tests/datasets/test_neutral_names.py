@@ -43,9 +43,7 @@ def test_neutral_and_historic_names_give_equal_records(tmp_path: Path):
     ("words", "official", "folds"),
     [(("train", " Test", "train"), [[0, 2], [1]], None), (("2", "7", "2"), None, [0, 1, 0]), ((), None, None)],
 )
-def test_one_file_with_the_official_split_with_folds_and_without(
-    words: tuple[str, ...], official: list | None, folds: list | None, tmp_path: Path
-):
+def test_one_file_with_and_without_a_split(words: tuple, official: list | None, folds: list | None, tmp_path: Path):
     files = {"receivers": RECEIVERS, "measurements": with_split(*words) if words else ROWS}
     record = read_ble_folder(folder_of(tmp_path, **files))
     np.testing.assert_array_equal(record.observation, [[-50, -51, np.nan], [-40, -41, -42]])

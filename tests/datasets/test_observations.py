@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -49,9 +48,7 @@ BOTH = pytest.mark.parametrize("train", [train_field, train_idw])
 @BOTH
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("part", ["train", "validation"])
-def test_training_rows_are_refused_before_anything_is_written(
-    train: Callable[..., Path], value: float, part: str, two_gateways: Record, tmp_path: Path
-) -> None:
+def test_rows_that_train_are_refused(train: Any, value: float, part: str, two_gateways: Record, tmp_path: Path) -> None:
     row = int(getattr(official(two_gateways), part)[0])
     name = two_gateways.receivers[1].name
     message = f"made-here, receiver {name}, row {row}: 1 of 800 values are not finite; correct or remove the row"
@@ -73,9 +70,7 @@ def test_fields_need_every_receiver_in_every_row(two_gateways: Record, tmp_path:
 
 
 @BOTH
-def test_test_rows_that_are_not_finite_are_counted_and_not_scored(
-    train: Callable[..., Path], two_gateways: Record, tmp_path: Path
-) -> None:
+def test_rows_that_test_are_counted_and_not_scored(train: Any, two_gateways: Record, tmp_path: Path) -> None:
     a, b, c = (int(row) for row in official(two_gateways).test[:3])
     broken = changed(two_gateways, ((0, a, 4, 5), np.nan), ((1, b), np.inf), ((1, c), np.nan))
     whole, found = train(two_gateways, tmp_path / "whole"), train(broken, tmp_path / "broken")
@@ -104,9 +99,7 @@ def test_a_split_without_a_finite_test_row_is_refused(two_gateways: Record) -> N
 
 
 @pytest.mark.parametrize("arguments", [{}, {"model": "ray-tracing", "scene": "room"}, {"model": "kriging"}], ids=str)
-def test_a_sweep_is_refused_before_its_first_run(
-    arguments: dict[str, str], two_gateways: Record, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sweep_is_refused_before_its_first_run(arguments: dict, two_gateways: Record, monkeypatch: Any) -> None:
     row = int(official(two_gateways).train[0])
     broken = changed(two_gateways, ((0, row, 0, 0), np.nan))
     monkeypatch.setattr(sweep, "_record", lambda dataset: broken)
@@ -150,9 +143,7 @@ def test_a_gateway_without_training_rows_is_left_out_where_asked(
     assert message == f"silent: {expected}"
 
 
-def test_data_without_any_received_training_row_are_refused_before_anything_is_done(
-    silent: Path, room: Path, tmp_path: Path
-) -> None:
+def test_data_without_a_received_training_row_are_refused_first(silent: Path, room: Path, tmp_path: Path) -> None:
     record = load(silent)
     record.observation[:, :3] = np.nan
     split = Split("mine", 0, np.arange(3), np.zeros(0, np.int64), np.arange(3, 5))

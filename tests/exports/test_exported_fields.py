@@ -53,9 +53,7 @@ def exported(run: Path, out: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize("model", FIELDS)
-def test_ply_has_the_properties_of_3dgs_and_the_gaussians_of_the_field(
-    runs: dict[str, Path], tmp_path: Path, model: str
-) -> None:
+def test_ply_has_the_properties_of_3dgs_and_the_gaussians(runs: dict[str, Path], tmp_path: Path, model: str) -> None:
     found, read = gaussians(runs[model]), exported(runs[model], tmp_path / "field.ply")
     known = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     known += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]

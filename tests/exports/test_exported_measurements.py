@@ -83,9 +83,7 @@ def test_channels_read_back(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(read, name), getattr(record, name))
 
 
-def test_layouts_that_do_not_fit_are_refused_in_one_line(
-    folder: Path, flat_folder: Path, tmp_path: Path, capsys
-) -> None:
+def test_layouts_that_do_not_fit_are_refused(folder: Path, flat_folder: Path, tmp_path: Path, capsys: Any) -> None:
     out = ["--out", tmp_path / "x"]
     (tmp_path / "x").mkdir()
     for dataset, layout, message in (
