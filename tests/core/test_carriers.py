@@ -14,7 +14,7 @@ from changed_folders import refusal
 from made_channels import channels
 from scipy.constants import speed_of_light
 
-from wrf_mi.core import InputError, Record, Split
+from wrf_mi.core import Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.carriers import by_carrier
 from wrf_mi.datasets import load, write_ble_folder, write_nerf2_csi
@@ -71,21 +71,17 @@ def test_models_of_one_carrier_refuse_several(name: str, flat: Record, one_gatew
             assert not (tmp_path / "run").exists()
 
 
-def test_models_of_several_carriers_are_named(flat: Record) -> None:
+def test_inconsistent_carriers_are_refused(flat: Record) -> None:
     message = r"choose another model \(wrf-gs, wrf-gs\+, factorised, hybrid, idw, kriging, tre"
     refusal(plan_run, flat, RunRequest("nerf2"), message)
-
-
-def test_inconsistent_carriers_are_refused(flat: Record) -> None:
     for change, message in (
         ({"carriers_hz": np.ones(3)}, r"carriers_hz \[3\]; give 30 positive"),
         ({"carriers_hz": np.zeros(len(flat))}, r"carriers_hz \[30\]; give 30 positive"),
         ({"frequencies_hz": np.ones(1)}, "set one of the two to None"),
     ):
         refusal(plan_run, replace(flat, **change), RunRequest("idw"), message)
-    record = channels()
-    with pytest.raises(InputError, match="carriers_hz belongs to spectra and signal strengths"):
-        plan_run(replace(record, frequencies_hz=None, carriers_hz=np.ones(len(record))), RunRequest("linear"))
+    record = replace(channels(), frequencies_hz=None, carriers_hz=np.ones(30))
+    refusal(plan_run, record, RunRequest("linear"), "carriers_hz belongs to spectra and signal strengths")
 
 
 @pytest.mark.parametrize("name", SETTINGS)

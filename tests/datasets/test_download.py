@@ -109,18 +109,15 @@ def test_missing_corrupted_and_endless_files(server: Server, tmp_path: Path, mon
     refused(entries, tmp_path / "home", url, r"404 .*00004\.png", progress)
 
 
-def test_missing_network_is_reported_in_one_line(home: Path, monkeypatch: pytest.MonkeyPatch):
+def test_missing_network_and_unwritable_folders_are_reported(home: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))  # bound and not listening: connections are refused
         url = f"http://127.0.0.1:{unused.getsockname()[1]}"
         refusal(fetch, "rfid-lab", r"127\.0\.0\.1:\d+ cannot be reached; .*WRF_MI_DATA", base_url=url, progress=False)
     assert list((home / "cache").iterdir()) == []
-
-
-def test_unwritable_folder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "file").write_text("in the way")
-    monkeypatch.setenv(DATA_VARIABLE, str(tmp_path / "file"))
+    (home / "file").write_text("in the way")
+    monkeypatch.setenv(DATA_VARIABLE, str(home / "file"))
     refusal(fetch, "rfid-lab", "cannot be written", base_url="http://127.0.0.1:9", progress=False)
 
 

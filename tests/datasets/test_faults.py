@@ -108,25 +108,14 @@ def test_faults_of_all_files_are_collected(tmp_path: Path) -> None:
     record, faults = collect_faults(lambda: load(folder))
     assert record is None
     found = [(fault.file.name, fault.place, fault.row) for fault in faults if isinstance(fault, DataFault)]
-    assert sorted(found, key=str) == sorted(
-        [
-            ("gateway_info.yml", "", None),
-            ("tx_pos.csv", "row 5", 5),  # number of fields
-            ("tx_pos.csv", "row 2", 2),  # x
-            ("tx_pos.csv", "row 2", 2),  # z
-            ("00003.png", "row 3", 3),
-            ("00004.png", "row 4", 4),
-            ("00099.png", "", None),
-            ("train_index.txt", "line 2", None),
-            ("train_index.txt", "line 3", None),
-            ("train_index.txt", "line 4", None),
-            ("test_index.txt", "", None),
-            ("blocked_folds.txt", "line 2", None),
-            ("blocked_folds.txt", "", None),  # number of lines
-            ("blocked_folds.txt", "", None),  # a single fold
-        ],
-        key=str,
-    )
+    expected = [
+        *(("tx_pos.csv", f"row {row}", row) for row in (5, 2, 2)),  # number of fields, x and z
+        *((f"0000{row}.png", f"row {row}", row) for row in (3, 4)),
+        *(("train_index.txt", f"line {line}", None) for line in (2, 3, 4)),
+        *((name, "", None) for name in ("gateway_info.yml", "00099.png", "test_index.txt")),
+        *(("blocked_folds.txt", place, None) for place in ("line 2", "", "")),  # number of lines, and a single fold
+    ]
+    assert sorted(found, key=str) == sorted(expected, key=str)
     assert len(faults) == len(found)
 
 
@@ -189,10 +178,8 @@ def test_parts_without_a_value_are_skipped() -> None:
         stop_at_faults()
         later()
 
-    assert list(map(str, collect_faults(read)[1])) == [
-        "a.csv: row 3: wrong; correct it",
-        "b.csv: wrong, too; correct it",
-    ]
+    faults = [str(fault) for fault in collect_faults(read)[1]]
+    assert faults == ["a.csv: row 3: wrong; correct it", "b.csv: wrong, too; correct it"]
     refusal(attempt, wrong, r"a\.csv: row 3")
     refusal(refuse, DataFault("b.csv", "wrong; correct it"), r"b\.csv: wrong")
     stop_at_faults()

@@ -40,13 +40,11 @@ def test_reads_a_folder(folder: Path) -> None:
     assert record.observation.dtype == np.float32
     assert [part.tolist() for part in record.official] == [[3, 0], [1]]  # NeRF2 counts these from 0
     np.testing.assert_array_equal(record.scored, record.observation)
-
-
-def test_rows_that_no_gateway_received_are_in_no_split(folder: Path) -> None:
     for name in INDICES:
         (folder / name).unlink()
     record = read_nerf2_ble(folder)
     assert record.official is None
+    # Rows that no gateway received are in no split.
     (split,) = make_splits(record, "trajectory")
     assert (split.all_train.tolist(), split.test.tolist()) == ([0, 1], [3])
 

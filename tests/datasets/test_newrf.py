@@ -120,6 +120,14 @@ def test_the_authors_pickle_is_converted(protocol: int):
     assert arrays_sha256(arrays) == arrays_sha256(expected)
 
 
+@pytest.mark.parametrize("strings", ["strings", "arrow"])
+def test_a_table_of_pandas_3_is_read(strings: str):
+    """Written by pandas 3.1.1, whose names of columns are arrays of texts, by NumPy or by Arrow."""
+    columns = read_pickled_table(PICKLES / f"pandas-3-{strings}.pkl")
+    np.testing.assert_array_equal(columns["TxID"], [1.0, 2.0])
+    np.testing.assert_array_equal(columns["TxPos"][1], [[1.0, 2.0, 3.0]])
+
+
 def test_the_hash_is_of_names_types_shapes_and_values():
     arrays = drawn()
     csi, gain = arrays["csi"], arrays["path_gain"]
@@ -203,11 +211,3 @@ def test_the_real_data(name: str, rows: int, held_out: int):
     distance = np.linalg.norm(record.tx_pos_m - record.receivers[0].position_m, axis=1)[direct]
     loss = speed_of_light / record.frequencies_hz[0] / (4 * np.pi * distance)
     np.testing.assert_allclose(np.abs(gain[start[direct]]), loss, rtol=1e-9)
-
-
-@pytest.mark.parametrize("strings", ["strings", "arrow"])
-def test_a_table_of_pandas_3_is_read(strings: str):
-    """Written by pandas 3.1.1, whose names of columns are arrays of texts, by NumPy or by Arrow."""
-    columns = read_pickled_table(PICKLES / f"pandas-3-{strings}.pkl")
-    np.testing.assert_array_equal(columns["TxID"], [1.0, 2.0])
-    np.testing.assert_array_equal(columns["TxPos"][1], [[1.0, 2.0, 3.0]])

@@ -107,48 +107,36 @@ def test_a_sweep_is_refused_before_its_first_run(arguments: dict, two_gateways: 
 
 
 DIRECT = TraceOptions(reflection=False, depth=0)
-ROWS, TRAINED = 12, 8
-GATEWAYS_M = {"near": (0.4, 0.5, 2.1), "far": (4.5, 3.4, 2.3)}
 
 
 @pytest.fixture
-def silent(tmp_path: Path) -> Path:
-    """Strengths in the flat's room, in NeRF2's layout; the second gateway received none of the training rows."""
-    folder = tmp_path / "silent"
-    folder.mkdir()
-    places = np.random.default_rng(4).uniform([0.6, 0.6, 1], [4.2, 3.2, 1.5], (ROWS, 3))
-    lines = [f"{name}: [{x}, {y}, {z}]" for name, (x, y, z) in GATEWAYS_M.items()]
-    (folder / "gateway_position.yml").write_text("\n".join([*lines, ""]))
-    np.savetxt(folder / "tx_pos.csv", places, delimiter=",", header="x,y,z", comments="")
-    powers = [f"{-50 - row},{-100 if row < TRAINED else -70 + row}" for row in range(ROWS)]
-    (folder / "gateway_rssi.csv").write_text("\n".join(["near,far", *powers, ""]))
-    for name, rows in (("train_index.txt", range(TRAINED)), ("test_index.txt", range(TRAINED, ROWS))):
-        (folder / name).write_text("".join(f"{row}\n" for row in rows))
-    return folder
+def silent(flat_folder: Path) -> Record:
+    """Strengths in the flat, of which the second anchor received none of the training rows."""
+    flat = load(flat_folder)
+    return changed(replace(flat, name="silent"), ((1, flat.official[0]), np.nan))
 
 
 @pytest.mark.parametrize("model", ["ray-tracing", "kriging", "mri"])
 def test_a_gateway_without_training_rows_is_left_out_where_asked(
-    model: str, silent: Path, room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    model: str, silent: Record, room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     settings, scene = (DIRECT, room) if model == "ray-tracing" else ((), None)
     left_out, alone = (
         train(data, tmp_path / name, model, scene=scene, settings=settings, min_rows=2)
-        for name, data in (("run", silent), ("alone", load(silent).at_receivers([0])))
+        for name, data in (("run", silent), ("alone", silent.at_receivers([0])))
     )
-    assert left_out.metrics["receivers_left_out"] == {"far": 0}
+    assert left_out.metrics["receivers_left_out"] == {"anchor2": 0}
     assert left_out.metrics["abs_error_db"] == alone.metrics["abs_error_db"]
     (message,) = [record.message for record in caplog.records if record.name == "wrf_mi.datasets.observations"]
-    expected = "receivers with fewer than 2 training rows are left out, with their number of rows: far (0)"
+    expected = "receivers with fewer than 2 training rows are left out, with their number of rows: anchor2 (0)"
     assert message == f"silent: {expected}"
 
 
-def test_data_without_a_received_training_row_are_refused_first(silent: Path, room: Path, tmp_path: Path) -> None:
-    record = load(silent)
-    record.observation[:, :3] = np.nan
+def test_data_without_a_received_training_row_are_refused_first(silent: Record, room: Path, tmp_path: Path) -> None:
+    record = changed(silent, ((slice(None), slice(3)), np.nan))
     split = Split("mine", 0, np.arange(3), np.zeros(0, np.int64), np.arange(3, 5))
     stages: list[str] = []
-    message = r"nothing was received in the training rows by any receiver \(near, far\); use another split"
+    message = r"nothing was received in the training rows by any receiver \(anchor1, anchor2\); use another split"
     for model, options in (("ray-tracing", {"scene": room, "settings": DIRECT}), ("kriging", {})):
         options |= {"split": split, "on_progress": lambda *said: stages.append(said[0])}
         refusal(train, record, tmp_path / "run", model, message, **options)
@@ -168,14 +156,7 @@ def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(flat_folder: Path,
 @pytest.mark.parametrize(("module", "stage"), [(ray_tracing, "fit_offsets"), (runs, "score_part")])
 @pytest.mark.parametrize("split", ["official", "blocked"])
 def test_a_stopped_trace_goes_on_with_its_paths(
-    module: Any,
-    stage: str,
-    split: str,
-    flat_folder: Path,
-    room: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    module: Any, stage: str, split: str, flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
 ) -> None:
     def stopped(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt

@@ -192,12 +192,9 @@ WRONG = {  # each is refused, see test_faults.py
 }
 
 
-def test_quaternions_within_the_tolerance_are_accepted(folder: Path):
+def test_several_gateways_need_a_folder_each_and_unit_quaternions(folder: Path, tmp_path: Path):
     text(YML, "0.8", "0.8005")(folder)  # norm 1.0004; 1.0020 is in WRONG
     assert len(read_spectrum_folder(folder).receivers) == 1
-
-
-def test_several_gateways_need_a_folder_each(tmp_path: Path):
     folder = write_spectrum_folder(tmp_path / "a", make_record(gateways=2))
     (folder / "spectrum" / "gateway2").rename(folder / "spectrum" / "other")
     refusal(read_spectrum_folder, folder, "gateway2: missing folder")

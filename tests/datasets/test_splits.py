@@ -211,15 +211,12 @@ def test_runs_are_held_out_in_the_order_of_their_first_rows():
     assert len(second.all_train) == 12
 
 
+FRACTIONS = st.sampled_from([0, 0.1, 0.15, 0.5, 0.9])
+SEEDED = st.sampled_from(["official", "random", "trajectory"])
+
+
 @settings(max_examples=60, deadline=None)
-@given(
-    rows=st.integers(5, 120),
-    smaller=st.integers(1, 100),
-    larger=st.integers(1, 100),
-    fraction=st.sampled_from([0, 0.1, 0.15, 0.5, 0.9]),
-    seed=st.integers(0, 2**32 - 1),
-    rule=st.sampled_from(["official", "random", "trajectory"]),
-)
+@given(st.integers(5, 120), st.integers(1, 100), st.integers(1, 100), FRACTIONS, st.integers(0, 2**32 - 1), SEEDED)
 def test_subsets_are_nested_validation_included(rows, smaller, larger, fraction, seed, rule):
     record = make_record(rows)
     whole = make_splits(record, rule, seed, validation_fraction=fraction)[0]

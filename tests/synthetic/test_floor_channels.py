@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -141,35 +142,29 @@ def test_ray_tracing_of_the_same_floor_explains_most_of_the_channel(record: Reco
     refusal(instrument_of, replace(record, frequencies_hz=None), r"state frequencies_hz in base-station\.yml")
 
 
-def crossings(triangles: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Which segments [n] meet a triangle: Moeller and Trumbore's test."""
-    corner, edges = triangles[:, 0], (triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    met = np.zeros(len(start), bool)
-    for row, (origin, way) in enumerate(zip(start, end - start, strict=True)):
-        across = np.cross(way, edges[1])
-        volume = (edges[0] * across).sum(axis=1)
-        crossed = np.abs(volume) > 1e-12
-        scale, off = 1 / np.where(crossed, volume, 1), origin - corner
-        turned = np.cross(off, edges[0])
-        u, v = (off * across).sum(axis=1) * scale, (turned * way).sum(axis=1) * scale
-        t = (edges[1] * turned).sum(axis=1) * scale
-        met[row] = (crossed & (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)).any()
-    return met
+def crossed(scene: Any, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Which segments [n] meet a surface."""
+    import mitsuba as mi
+
+    origin, way = mi.Point3f(start.T.astype(np.float32)), mi.Vector3f((end - start).T.astype(np.float32))
+    return np.array(scene.mi_scene.ray_test(mi.Ray3f(origin, way, 1.0, 0.0, [])))
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_users_walk_in_the_open_and_through_doors(place: str) -> None:
+def test_users_walk_in_the_open_and_through_doors(place: str, tmp_path: Path) -> None:
     plan, walk, rng = PLACES[place](), Walk(), np.random.default_rng(0)
+    write_scene(tmp_path, plan.parts, "test")
+    scene = open_scene(tmp_path, CARRIER_HZ)
     mesh = trimesh.util.concatenate([mesh for _, mesh in plan.parts.values()])
     tree = cKDTree(sample_surface(mesh, int(mesh.area / 1e-3), seed=1)[0])
     for route in plan.routes:
         way = users_way(route, walk, rng)
         assert way.shape == (walk.places, 3)
         assert tree.query(way)[0].min() > 0.15  # a person's half width
-        assert not crossings(mesh.triangles, way, np.roll(way, -1, axis=0)).any()
+        assert not crossed(scene, way, np.roll(way, -1, axis=0)).any()
         steps = np.linalg.norm(way - np.roll(way, 1, axis=0), axis=1)
         assert steps.max() < 2 * np.median(steps)
-    assert crossings(mesh.triangles, np.array([[1.0, 1.0, 1.2]]), np.array([[1.0, -1.0, 1.2]])).all()  # a wall
+    assert crossed(scene, np.array([[1.0, 1.0, 1.2]]), np.array([[1.0, -1.0, 1.2]])).all()  # a wall
     assert tree.query([plan.station_m])[0] > 0.15
 
 
