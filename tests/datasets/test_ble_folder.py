@@ -84,13 +84,18 @@ def test_anchors_have_numbers_or_names(folder: Path):
     np.testing.assert_array_equal(record.observation, [[-4, -8], [-1, -5], [-3, -7], [-2, -6]])
 
 
-def heights(training: str, test: str):
+def add_columns(file: Path, **columns: list[str]) -> None:
+    header, *rows = file.read_text().splitlines()
+    rows = [",".join(fields) for fields in zip(rows, *columns.values(), strict=True)]
+    file.write_text("\n".join([",".join([header, *columns]), *rows]) + "\n")
+
+
+def heights(training: str, test: str) -> Change:
     """Add a column z with one text for each file."""
 
     def change(folder: Path) -> None:
-        for name, value in ((TRAIN_FILE, training), (TEST_FILE, test)):
-            header, *rows = (folder / name).read_text().splitlines()
-            (folder / name).write_text("\n".join([f"z,{header}", *(f"{value},{row}" for row in rows)]) + "\n")
+        add_columns(folder / TRAIN_FILE, z=[training] * 4)
+        add_columns(folder / TEST_FILE, z=[test])
 
     return change
 
@@ -164,10 +169,7 @@ def test_the_real_data():
 
 
 def with_columns(folder: Path, **columns: list[str]) -> Path:
-    """Add columns to ``anchors.csv``."""
-    lines = (folder / "anchors.csv").read_text().splitlines()
-    rows = [",".join([line, *words]) for line, *words in zip(lines[1:], *columns.values(), strict=True)]
-    (folder / "anchors.csv").write_text("\n".join([",".join([lines[0], *columns]), *rows]) + "\n")
+    add_columns(folder / "anchors.csv", **columns)
     return folder
 
 
@@ -192,12 +194,9 @@ WRONG |= {
 
 def with_noise(folder: Path) -> Path:
     """State readings and noise of all that the anchors of ``folder`` received."""
-    counts = {TRAIN_FILE: ["4,2", ",1", "0,", "9,nan"], TEST_FILE: ["3,16"]}
-    stds = {TRAIN_FILE: ["0.5,1.5", ",2", ",", "0.25,"], TEST_FILE: ["1,1"]}
-    for name in counts:
-        header, *rows = (folder / name).read_text().splitlines()
-        rows = [",".join(parts) for parts in zip(rows, counts[name], stds[name], strict=True)]
-        (folder / name).write_text("\n".join([f"{header},count_1,count_3,std_1,std_3", *rows]) + "\n")
+    stds = {"std_1": ["0.5", "", "", "0.25"], "std_3": ["1.5", "2", "", ""]}
+    add_columns(folder / TRAIN_FILE, count_1=["4", "", "0", "9"], count_3=["2", "1", "", "nan"], **stds)
+    add_columns(folder / TEST_FILE, count_1=["3"], count_3=["16"], std_1=["1"], std_3=["1"])
     return folder
 
 
