@@ -27,9 +27,9 @@ def folder_of(folder: Path, **files: str) -> Path:
     return folder
 
 
-def with_split(*words: str) -> str:
-    header, *rows = ROWS.splitlines()
-    return "\n".join([f"{header},split", *(f"{row},{word}" for row, word in zip(rows, words, strict=True))]) + "\n"
+def with_columns(table: str, columns: str, *fields: str) -> str:
+    header, *rows = table.splitlines()
+    return "\n".join([f"{header},{columns}", *(f"{row},{field}" for row, field in zip(rows, fields, strict=True))])
 
 
 def test_neutral_and_historic_names_give_equal_records(tmp_path: Path):
@@ -44,7 +44,7 @@ def test_neutral_and_historic_names_give_equal_records(tmp_path: Path):
     [(("train", " Test", "train"), [[0, 2], [1]], None), (("2", "7", "2"), None, [0, 1, 0]), ((), None, None)],
 )
 def test_one_file_with_and_without_a_split(words: tuple, official: list | None, folds: list | None, tmp_path: Path):
-    files = {"receivers": RECEIVERS, "measurements": with_split(*words) if words else ROWS}
+    files = {"receivers": RECEIVERS, "measurements": with_columns(ROWS, "split", *words) if words else ROWS}
     record = read_ble_folder(folder_of(tmp_path, **files))
     np.testing.assert_array_equal(record.observation, [[-50, -51, np.nan], [-40, -41, -42]])
     np.testing.assert_equal((record.official, record.folds), (official and tuple(map(np.array, official)), folds))
@@ -63,9 +63,18 @@ def test_one_file_with_and_without_a_split(words: tuple, official: list | None, 
         ({"train": ROWS, "test": ROWS, "test_robot_df": ROWS}, r"test\.csv and test_robot_df\.csv state the same"),
         ({"measurements": ROWS, "train": ROWS}, r"measurements\.csv and train\.csv state the same; remove one"),
         ({"train": ROWS}, r"test\.csv: missing; give a file that exists"),
-        ({"measurements": with_split("train", "val", "test")}, r"row 2: split is 'val'; give train or test"),
-        ({"measurements": with_split("train", "train", "train")}, "all rows have train in the column split; mark"),
-        ({"measurements": with_split("train", "1", "test")}, "row 2: split is '1'; give train or test, or in all rows"),
+        (
+            {"measurements": with_columns(ROWS, "split", "train", "val", "test")},
+            r"row 2: split is 'val'; give train or test",
+        ),
+        (
+            {"measurements": with_columns(ROWS, "split", "train", "train", "train")},
+            "all rows have train in the column split; mark",
+        ),
+        (
+            {"measurements": with_columns(ROWS, "split", "train", "1", "test")},
+            "row 2: split is '1'; give train or test, or in all rows",
+        ),
     ],
 )
 def test_ambiguous_files_are_refused(files: dict[str, str], message: str, tmp_path: Path):
@@ -74,7 +83,7 @@ def test_ambiguous_files_are_refused(files: dict[str, str], message: str, tmp_pa
 
 def test_carriers_of_rows_beside_those_of_receivers_are_refused(tmp_path: Path):
     rows = ROWS.replace("x,y,z", "x,y,frequency_hz")
-    folder = folder_of(tmp_path, receivers=receivers_with("frequency_hz", "1e9", "2e9"), train=rows, test=rows)
+    folder = folder_of(tmp_path, receivers=with_columns(RECEIVERS, "frequency_hz", "1e9", "2e9"), train=rows, test=rows)
     refusal(read_ble_folder, folder, r"train\.csv: line 1: frequency_hz is a column of receivers\.csv, too")
 
 
@@ -90,13 +99,8 @@ def test_ids_are_any_text_on_one_line(tmp_path: Path):
     assert_same(read_ble_folder(write_ble_folder(tmp_path / "again", record)), record, "name")
 
 
-def receivers_with(columns: str, *rows: str) -> str:
-    lines = RECEIVERS.splitlines()
-    return "\n".join([f"{lines[0]},{columns}", *(f"{line},{row}" for line, row in zip(lines[1:], rows, strict=True))])
-
-
 def read_with(folder: Path, columns: str, *rows: str) -> Record:
-    return read_ble_folder(folder_of(folder, receivers=receivers_with(columns, *rows), train=ROWS, test=ROWS))
+    return read_ble_folder(folder_of(folder, receivers=with_columns(RECEIVERS, columns, *rows), train=ROWS, test=ROWS))
 
 
 @settings(max_examples=50, deadline=None)
