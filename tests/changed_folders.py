@@ -36,6 +36,16 @@ def write(name: str, content: bytes | str) -> Change:
     return lambda folder: (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def replaced(name: str, old: str, new: str, message: str) -> tuple[Change, str, str]:
+    """A change by `text`, the file that is refused, and the message."""
+    return text(name, old, new), name, message
+
+
+def rewritten(name: str, content: bytes | str, message: str) -> tuple[Change, str, str]:
+    """Likewise by `write`."""
+    return write(name, content), name, message
+
+
 def append(name: str, line: str) -> Change:
     def change(folder: Path) -> None:
         with (folder / name).open("a", encoding="utf-8") as file:
@@ -48,11 +58,19 @@ def remove(name: str) -> Change:
     return lambda folder: (folder / name).unlink()
 
 
-def refusal(read: Callable[[Any], Any], given: Any, message: str) -> str:
-    """The error of a reader: one line with a remedy that matches."""
+def error_line(function: Callable[..., Any], *arguments: Any, **options: Any) -> str:
+    """The error of a function, one line; the last argument is the pattern that it matches."""
+    *passed, message = arguments
     with pytest.raises(InputError, match=message) as error:
-        read(given)
+        function(*passed, **options)
     line = str(error.value)
+    del error  # and its frames, which hold the sockets of downloads
     assert "\n" not in line
+    return line
+
+
+def refusal(function: Callable[..., Any], *arguments: Any, **options: Any) -> str:
+    """Likewise an error that states a remedy."""
+    line = error_line(function, *arguments, **options)
     assert ";" in line, "no remedy"
     return line

@@ -1,20 +1,20 @@
 """Rows of several carriers: refused by models of one, blended by carrier, traced at the carrier of each row."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from calling import call
+from changed_folders import refusal
 from made_channels import channels
 from scipy.constants import speed_of_light
 
-from wrf_mi.core import InputError, Record, Split
+from wrf_mi.core import Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.carriers import by_carrier
 from wrf_mi.datasets import load, write_ble_folder, write_nerf2_csi
@@ -48,16 +48,16 @@ def flat(flat_folder: Path) -> Record:
     return record.at_carriers(np.where(np.arange(len(record)) % 3 > 0, HIGH, LOW))
 
 
+SETTINGS = {"kriging": ["length_m=1", "noise=0.1", "heading_length=1"], "trees": ["trees=5"], "idw": [], "mri": []}
+
+
 def of(record: Record, carrier_hz: float) -> tuple[Record, Split]:
     """The rows of one carrier alone, with their official split."""
-    assert record.carriers_hz is not None
-    assert record.official is not None
     rows = np.flatnonzero(record.carriers_hz == carrier_hz)
     train_rows, test = (np.flatnonzero(np.isin(rows, part)) for part in record.official)
-    heading = None if record.tx_heading_rad is None else record.tx_heading_rad[rows]
+    heading, observation = record.tx_heading_rad[rows], record.observation[:, rows]
     own = replace(record.at_carrier(carrier_hz), tx_pos_m=record.tx_pos_m[rows], tx_heading_rad=heading, official=None)
-    own = replace(own, observation=record.observation[:, rows])
-    return own, Split("own", 0, train_rows, train_rows[:0], test)
+    return replace(own, observation=observation), Split("own", 0, train_rows, train_rows[:0], test)
 
 
 @pytest.mark.parametrize("name", [name for name in MODELS if not MODELS[name].several_carriers])
@@ -66,78 +66,62 @@ def test_models_of_one_carrier_refuse_several(name: str, flat: Record, one_gatew
     for record in (flat, several):
         model = MODELS[name]
         if model.serves(record.task) and model.uplink != "required":
-            with pytest.raises(InputError, match=rf"rows at 2 carriers, .* Hz; {re.escape(name)} serves one carrier"):
-                train(record, tmp_path / "run", name, seed=1)
+            message = rf"rows at 2 carriers, .* Hz; {re.escape(name)} serves one carrier"
+            refusal(train, record, tmp_path / "run", name, message, seed=1)
             assert not (tmp_path / "run").exists()
 
 
-def test_models_of_several_carriers_are_named(flat: Record) -> None:
-    with pytest.raises(
-        InputError, match=r"choose another model \(wrf-gs, wrf-gs\+, factorised, hybrid, idw, kriging, tre"
-    ):
-        plan_run(flat, RunRequest("nerf2"))
-
-
 def test_inconsistent_carriers_are_refused(flat: Record) -> None:
+    message = r"choose another model \(wrf-gs, wrf-gs\+, factorised, hybrid, idw, kriging, tre"
+    refusal(plan_run, flat, RunRequest("nerf2"), message)
     for change, message in (
         ({"carriers_hz": np.ones(3)}, r"carriers_hz \[3\]; give 30 positive"),
         ({"carriers_hz": np.zeros(len(flat))}, r"carriers_hz \[30\]; give 30 positive"),
         ({"frequencies_hz": np.ones(1)}, "set one of the two to None"),
     ):
-        with pytest.raises(InputError, match=message):
-            plan_run(replace(flat, **change), RunRequest("idw"))
-    record = channels()
-    with pytest.raises(InputError, match="carriers_hz belongs to spectra and signal strengths"):
-        plan_run(replace(record, frequencies_hz=None, carriers_hz=np.ones(len(record))), RunRequest("linear"))
+        refusal(plan_run, replace(flat, **change), RunRequest("idw"), message)
+    record = replace(channels(), frequencies_hz=None, carriers_hz=np.ones(30))
+    refusal(plan_run, record, RunRequest("linear"), "carriers_hz belongs to spectra and signal strengths")
 
 
-@pytest.mark.parametrize("name", ["idw", "kriging", "trees", "mri"])
+@pytest.mark.parametrize("name", SETTINGS)
 def test_carriers_are_interpolated_separately(name: str, flat: Record, tmp_path: Path) -> None:
-    settings = {"kriging": ["length_m=1", "noise=0.1", "heading_length=1"], "trees": ["trees=5"]}.get(name, [])
-    run = train(flat, tmp_path / "run", name, settings=settings)
+    run = train(flat, tmp_path / "run", name, settings=SETTINGS[name])
     read = read_run(run.folder)
-    assert flat.carriers_hz is not None
     carriers = flat.carriers_hz[read.row]
     for carrier in (LOW, HIGH):
         record, split = of(flat, carrier)
-        alone = read_run(train(record, tmp_path / f"{carrier}", name, split=split, settings=settings).folder)
+        alone = read_run(train(record, tmp_path / f"{carrier}", name, split=split, settings=SETTINGS[name]).folder)
         np.testing.assert_array_equal(read.prediction[:, carriers == carrier], alone.prediction)
         for key in alone.references:
             np.testing.assert_array_equal(read.references[key][:, carriers == carrier], alone.references[key])
     again = open_run(run.folder, flat)
-    heading = None if name in ("idw", "mri") or flat.tx_heading_rad is None else flat.tx_heading_rad[read.row]
+    heading = flat.tx_heading_rad[read.row] if name in ("kriging", "trees") else None
     found = again.predict(flat.tx_pos_m[read.row], 1, heading, carriers_hz=carriers).mean
     np.testing.assert_array_equal(found.astype(np.float32), read.prediction[1])
 
 
-def test_predictions_of_several_carriers_need_carriers(flat: Record, flat_folder: Path, tmp_path: Path) -> None:
+def test_predictions_of_several_carriers(flat: Record, flat_folder: Path, tmp_path: Path) -> None:
     run, place = train(flat, tmp_path / "run", "idw"), flat.tx_pos_m[:2]
-    with pytest.raises(
-        InputError, match=r"its data have rows at 2 carriers, .* Hz; give frequency_hz for each position"
-    ):
-        run.predict(place)
-    with pytest.raises(InputError, match=r"2 positions and carriers \(1,\); give one positive frequency_hz for each"):
-        run.predict(place, carriers_hz=LOW)
-    one = train(flat_folder, tmp_path / "one", "idw")
-    with pytest.raises(InputError, match="its data have one carrier; omit frequency_hz"):
-        one.predict(place, carriers_hz=[LOW, LOW])
-
-
-def test_between_carriers_methods_are_linear_in_the_logarithm_of_the_frequency(flat: Record, tmp_path: Path) -> None:
-    run, place = train(flat, tmp_path / "run", "idw"), flat.tx_pos_m[:2]
+    refusal(run.predict, place, r"its data have rows at 2 carriers, .* Hz; give frequency_hz for each position")
+    message = r"2 positions and carriers \(1,\); give one positive frequency_hz for each"
+    refusal(run.predict, place, message, carriers_hz=LOW)
+    # Between carriers the prediction is linear in the logarithm of the frequency, beyond them constant.
     low, high = (run.predict(place, carriers_hz=[carrier] * 2).mean for carrier in (LOW, HIGH))
     between = run.predict(place, carriers_hz=[np.sqrt(LOW * HIGH)] * 2).mean
     np.testing.assert_allclose(between, (low + high) / 2, rtol=1e-6)
     np.testing.assert_array_equal(run.predict(place, carriers_hz=[0.1 * LOW, 10 * HIGH]).mean, [low[0], high[1]])
+    one = train(flat_folder, tmp_path / "one", "idw")
+    refusal(one.predict, place, "its data have one carrier; omit frequency_hz", carriers_hz=[LOW, LOW])
 
 
-@pytest.mark.parametrize("name", ["idw", "kriging", "trees", "mri"])
+@pytest.mark.parametrize("name", SETTINGS)
 def test_a_carrier_is_predicted_from_the_others(name: str, flat: Record, tmp_path: Path) -> None:
     """Free-space loss grows by 20 dB a decade: half way between two carriers lies the mean of both."""
     n, middle = len(flat), float(np.sqrt(LOW * HIGH))
     carriers = np.repeat([LOW, middle, HIGH], n)
     loss = 20 * np.log10(carriers / LOW)
-    heading = None if flat.tx_heading_rad is None else np.tile(flat.tx_heading_rad, 3)
+    heading = np.tile(flat.tx_heading_rad, 3)
     three = replace(
         flat.at_carriers(carriers),
         tx_pos_m=np.tile(flat.tx_pos_m, (3, 1)),
@@ -145,14 +129,13 @@ def test_a_carrier_is_predicted_from_the_others(name: str, flat: Record, tmp_pat
         observation=(np.tile(flat.observation, 3) - loss).astype(np.float32),
         official=None,
     )
-    settings = {"kriging": ["length_m=1", "noise=0.1", "heading_length=1"], "trees": ["trees=5"]}.get(name, [])
-    found = read_run(train(three, tmp_path / "run", name, split="frequency-known:1", settings=settings).folder)
+    found = read_run(train(three, tmp_path / "run", name, split="frequency-known:1", settings=SETTINGS[name]).folder)
     assert (carriers[found.row] == middle).all()
     step = found.references[TASKS["rssi"].reference] - found.references[CARRIER]
     np.testing.assert_allclose(step, -20 * np.log10(middle / LOW), atol=FLOAT32_DB)  # the lower of two as near
     lowest = Split("lowest", 0, np.arange(n), np.zeros(0, np.int64), np.arange(2 * n, 3 * n))
-    low = train(three, tmp_path / "low", name, split=lowest, settings=settings)
-    turned = heading[found.row] if heading is not None and name in ("kriging", "trees") else None
+    low = train(three, tmp_path / "low", name, split=lowest, settings=SETTINGS[name])
+    turned = heading[found.row] if name in ("kriging", "trees") else None
     for receiver in range(len(flat.receivers)):
         known = low.predict(three.tx_pos_m[found.row], receiver, turned, carriers_hz=np.full(len(found.row), LOW)).mean
         expected = known - 20 * np.log10(middle / LOW)
@@ -177,7 +160,6 @@ def test_predictions_take_and_state_carriers(flat: Record, tmp_path: Path, capsy
         np.testing.assert_array_equal(stored["frequency_hz"], table[:, 3])
         np.testing.assert_allclose(stored["prediction"], expected, atol=FLOAT32_DB)
     with np.load(run.folder / "predictions.npz") as stored:
-        assert flat.carriers_hz is not None
         np.testing.assert_array_equal(stored["frequency_hz"], flat.carriers_hz[stored["row"]])
 
 
@@ -186,7 +168,6 @@ def test_direct_paths_have_the_free_space_loss_of_each_row(flat: Record, room: P
     rx = np.stack([receiver.position_m for receiver in flat.receivers])
     distance = np.linalg.norm(flat.tx_pos_m - rx[:, None], axis=-1)
     loss = 20 * np.log10(speed_of_light / flat.carriers_hz / (4 * np.pi * distance))
-    assert flat.official is not None
     known = flat.official[0]
     expected = loss + np.median((flat.observation - loss)[:, known], axis=1, keepdims=True)
     read = read_run(run.folder)
@@ -204,12 +185,9 @@ def spectra_of(record: Record) -> Record:
 
 
 @pytest.mark.parametrize("make", [lambda record: record, spectra_of])
-def test_reflections_equal_a_trace_at_the_rows_carrier(
-    make: Callable[[Record], Record], flat: Record, room: Path, tmp_path: Path
-) -> None:
+def test_reflections_equal_a_trace_at_the_carrier(make: Callable[[Record], Record], flat: Record, room: Path) -> None:
     record = make(flat)
     options, rows = TraceOptions(depth=2, transmission=True, rays=20000), np.arange(9)
-    assert record.carriers_hz is not None
     carriers, tx = record.carriers_hz[rows], record.tx_pos_m[rows]
     tracer = RayTracer(room, instrument_of(record.at_carrier(2.4e9)), options)
     traced = tracer.trace(tx, carriers_hz=carriers)
@@ -239,25 +217,20 @@ def test_stored_paths_keep_the_carriers(flat: Record, room: Path, tmp_path: Path
     stored = load_trace(run.folder / "paths.npz")
     np.testing.assert_array_equal(stored.carriers_hz, flat.carriers_hz)
     read, again = read_run(run.folder), open_run(run.folder, flat)
-    assert flat.carriers_hz is not None
     anew = again.predict(flat.tx_pos_m[read.row], 0, carriers_hz=flat.carriers_hz[read.row]).mean
     assert read.prediction[0] == pytest.approx(anew, abs=FLOAT32_DB)
 
 
-def test_target_error_refuses_carriers(flat: Record, room: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"rows at 2 carriers, .* target_error_db serves one carrier"):
-        train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=["target_error_db=1"])
-
-
-def test_unknown_material_at_a_carrier_is_refused(flat: Record, room: Path, tmp_path: Path) -> None:
-    far = flat.at_carriers(np.where(np.arange(len(flat)) % 2, LOW, 1e8))
-    with pytest.raises(InputError, match=r"not known at 0\.1 GHz"):
-        train(far, tmp_path / "run", "ray-tracing", scene=room)
+def test_one_target_error_and_unknown_materials_are_refused(flat: Record, room: Path, tmp_path: Path) -> None:
+    message = r"rows at 2 carriers, .* target_error_db serves one carrier"
+    options = {"scene": room, "settings": ["target_error_db=1"]}
+    refusal(train, flat, tmp_path / "run", "ray-tracing", message, **options)
+    unknown = flat.at_carriers(np.where(np.arange(len(flat)) % 2, LOW, 1e8))
+    refusal(train, unknown, tmp_path / "run", "ray-tracing", r"not known at 0\.1 GHz", scene=room)
     assert not (tmp_path / "run").exists()
 
 
 def test_reference_interpolates_rows_of_the_same_carrier(flat: Record) -> None:
-    assert flat.official is not None
     known, rows = flat.official
     key = TASKS["rssi"].reference
     split = Split("two", 0, known, known[:0], rows)
@@ -267,26 +240,21 @@ def test_reference_interpolates_rows_of_the_same_carrier(flat: Record) -> None:
     np.testing.assert_allclose(moved, [np.where(flat.carriers_hz[rows] == LOW, 30, 0)] * 2, atol=FLOAT32_DB)
 
 
-def test_data_command_shows_carriers_readings_and_noise(
-    flat: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_data_command_shows_carriers_readings_and_noise(flat: Record, tmp_path: Path, capsys: Any) -> None:
     shape = flat.observation.shape
     readings = np.ones(shape, np.int64)
     readings[:, ::2] = 5
     own = replace(flat, n_readings=readings, std=np.linspace(1, 3, readings.size).reshape(shape))
     # Runs are shown in the order of their first rows, as they are read: training rows first.
-    assert own.official is not None
     own = replace(own, runs=np.where(np.isin(np.arange(len(own)), own.official[1]), "early", "late"))
     folder = write_ble_folder(tmp_path / "flat", own)
     status, out, _ = call(["data", "info", folder, "--json"], capsys)
-    found = json.loads(out)
-    assert status == 0
-    assert found["carriers_hz"] == {str(LOW): 10, str(HIGH): 20}
-    assert list(found["runs"].items()) == [("late", 24), ("early", 6)]
-    assert (found["n_readings"], found["std_db"]) == ([1, 3, 5], pytest.approx([1, 2, 3]))
-    assert (found["receivers"], found["official"]) == ({"anchor1": 30, "anchor2": 30}, [24, 6])
-    status, out, _ = call(["data", "info", folder], capsys)
-    assert status == 0
+    shown = json.loads(out)
+    assert (status, shown["carriers_hz"]) == (0, {str(LOW): 10, str(HIGH): 20})
+    assert list(shown["runs"].items()) == [("late", 24), ("early", 6)]
+    assert (shown["n_readings"], shown["std_db"]) == ([1, 3, 5], pytest.approx([1, 2, 3]))
+    assert (shown["receivers"], shown["official"]) == ({"anchor1": 30, "anchor2": 30}, [24, 6])
+    _, out, _ = call(["data", "info", folder], capsys)
     assert "carrier:          1100000000 Hz in 10 rows, 5100000000 Hz in 20 rows\n" in out
     assert "runs:             late 24, early 6\n" in out
     assert "readings per row: 1 to 5, median 3\nnoise:            1 to 3 dB, median 2 dB\n" in out

@@ -4,8 +4,6 @@
 `made_scenarios.write_scenario` with each entry of `CHOSEN`; where the package is installed, it computes them again.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -65,9 +63,7 @@ def test_package_computes_the_stored_channels(tmp_path: Path, name: str) -> None
 
 
 @pytest.mark.parametrize("selected", [[0, 21, 42, 63], [0, 1, 5, 63]])
-def test_channels_of_several_base_stations_and_sets_of_users_equal_those_of_the_package(
-    tmp_path: Path, selected: list[int]
-) -> None:
+def test_channels_of_stations_and_sets_of_users_equal_those_of_the_package(tmp_path: Path, selected: list[int]) -> None:
     folder = scenario(tmp_path, stations=2, users=(60, 30))
     chosen = {**CHOSEN["array"], "ofdm": {**CHOSEN["array"]["ofdm"], "selected_subcarriers": selected}}
     record = read_deepmimo(folder, params={**chosen, "base_stations": "all"})
@@ -91,7 +87,6 @@ def test_record_has_users_base_station_and_subcarriers(tmp_path: Path) -> None:
     (receiver,) = record.receivers
     assert (receiver.name, receiver.antenna, receiver.array_m) == ("bs0", Antenna(), None)
     np.testing.assert_array_equal(receiver.position_m, [0, 5, 20])
-    assert record.official is not None
     assert [len(rows) for rows in record.official] == [8, 2]
     np.testing.assert_array_equal(np.sort(np.concatenate(record.official)), np.arange(1, 11))  # user 0 has no path
     (folder / "train_index.txt").write_text("5\n3\n")
@@ -121,7 +116,6 @@ def test_array_of_the_record_explains_the_phases_of_its_elements(tmp_path: Path)
     with np.load(folder / "aod_az_t000_tx000_r001.npz") as az, np.load(folder / "aod_el_t000_tx000_r001.npz") as el:
         azimuth, zenith = np.radians(az["aod_az"][1:, 0], dtype=float), np.radians(el["aod_el"][1:, 0], dtype=float)
     world = np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=1)
-    assert receiver.array_m is not None
     waves = array_response(receiver.array_m, world @ receiver.to_world, CARRIER_HZ)
     ratio = record.observation[0, 1:, :, 0] / record.observation[0, 1:, :1, 0]
     np.testing.assert_allclose(ratio, waves, atol=SINGLE)
@@ -160,30 +154,23 @@ def edited(**changes: Any) -> Change:
     return write(PARAMS, json.dumps(params() | changes))
 
 
-def stored(key: str, values: Any) -> Change:
-    return lambda folder: np.savez(folder / f"{key}_t000_tx000_r001.npz", **{key: values})
+def stored(key: str, values: Any, name: str = "") -> Change:
+    return lambda folder: np.savez(folder / f"{key}_t000_tx000_r001.npz", **{name or key: values})
 
 
 NO_STATION = {"txrx_set_1": params()["txrx_sets"]["txrx_set_1"]}
 NO_USERS = {"txrx_set_0": params()["txrx_sets"]["txrx_set_0"]}
+WORDS = {"txrx_set_0": {"is_tx": True, "id": 0, "num_points": "two"}}
+SEVERAL = r"base stations, 0 to .; choose in channel_params\.yml, base_stations: \[0\] or base_stations: all"
 WRONG: dict[str, tuple[Change, str]] = {
     "matrix missing": (remove("delay_t000_tx000_r001.npz"), r"delay_t000_tx000_r001: no \.mat, \.npz, \.npy file"),
     "damaged matrix": (write("power_t000_tx000_r001.npz", "no zip"), r"power_t000_tx000_r001\.npz: not readable"),
     "damaged .mat": (write("power_t000_tx000_r001.mat", "no mat"), r"power_t000_tx000_r001\.mat: not readable"),
-    "other array in the file": (
-        lambda folder: np.savez(folder / "phase_t000_tx000_r001.npz", angle=np.zeros((10, 5))),
-        r"phase_t000_tx000_r001\.npz: no array phase",
-    ),
+    "other array in the file": (stored("phase", np.zeros((10, 5)), "angle"), r"phase_t0.*1\.npz: no array phase"),
     "words": (stored("phase", np.full((10, 5), "a")), "phase holds <U1; give real numbers"),
     "pickled objects": (stored("phase", np.full((10, 5), None)), "not readable"),
-    "other number of users": (
-        stored("power", np.zeros((9, 5))),
-        r"power_.* has shape \[9, 5\], expected \[10, 5\]",
-    ),
-    "other number of paths": (
-        stored("aod_el", np.zeros((10, 4))),
-        r"aod_el_.* has shape \[10, 4\], expected \[10, 5\]",
-    ),
+    "other number of users": (stored("power", np.zeros((9, 5))), r"power_.* has shape \[9, 5\], expected \[10, 5\]"),
+    "other number of paths": (stored("aod_el", np.zeros((10, 4))), r"aod_el_.* shape \[10, 4\], expected \[10, 5\]"),
     "flat matrix": (stored("power", np.zeros(10)), r"power_t000_tx000_r001 has shape \[10\]"),
     "two positions of a base station": (stored("tx_pos", np.zeros((2, 3))), r"tx_pos_.* has shape \[2, 3\]"),
     "users in a plane": (stored("rx_pos", np.zeros((10, 2))), r"rx_pos_.* has shape \[10, 2\]"),
@@ -191,10 +178,7 @@ WRONG: dict[str, tuple[Change, str]] = {
     "NaN phase": (stored("phase", np.full((10, 5), np.nan)), r"user 1 \(from 0\) of t000_tx000_r001: power, phase"),
     "infinite power": (stored("power", np.full((10, 5), np.inf)), "user 0 .* is not finite"),
     "no paths": (stored("power", np.full((10, 5), np.nan)), r"0 of 10 users have a path to the base stations \[0\]"),
-    "delay beyond the symbol": (
-        stored("delay", np.full((10, 5), 1e-3)),
-        "a delay of 0.001 s, and a symbol .* 5.12e-05 s",
-    ),
+    "delay beyond the symbol": (stored("delay", np.full((10, 5), 1e-3)), "a delay of 0.001 s, and .* 5.12e-05 s"),
     "no version": (edited(version=None), "version None of DeepMIMO; give a scenario of version 4"),
     "other version": (edited(version="3.2.9"), "version '3.2.9' of DeepMIMO"),
     "parameters of another program": (write(PARAMS, "[1, 2]"), "scene is missing; give a scenario of DeepMIMO 4"),
@@ -205,41 +189,8 @@ WRONG: dict[str, tuple[Change, str]] = {
     "no sets": (edited(txrx_sets=None), "txrx_sets is missing"),
     "no base station": (edited(txrx_sets=NO_STATION), r"no base station \(is_tx\) in txrx_sets"),
     "no users": (edited(txrx_sets=NO_USERS), "no set of users"),
-    "points of words": (
-        edited(txrx_sets=NO_STATION | {"txrx_set_0": {"is_tx": True, "id": 0, "num_points": "two"}}),
-        "num_points is 'two'; give a whole number",
-    ),
-    "several base stations": (
-        edited(txrx_sets=params(3)["txrx_sets"]),
-        r"3 base stations, 0 to 2; choose in channel_params\.yml, base_stations: \[0\] or base_stations: all",
-    ),
-}
-
-
-WRONG_PARAMS: dict[str, tuple[dict[str, Any], str]] = {
-    "unknown key": ({"antenna": {}}, "setting antenna: unknown; known here: .*base_stations"),
-    "unknown part": ({"bs_antenna": {"fov": 90}}, r"bs_antenna\.fov: unknown; known here: bs_antenna\.shape"),
-    "part of words": ({"ofdm": "wide"}, "ofdm: expected a mapping, got 'wide'"),
-    "out of range": ({"base_stations": [1]}, "base station 1 is out of range; the scenario has 0 to 0"),
-    "names": ({"base_stations": ["roof"]}, "base_stations: expected int, got 'roof'"),
-    "twice": ({"base_stations": [0, 0]}, r"base_stations: \[0, 0\]; give a list of different whole numbers"),
-    "subcarrier out of range": ({"ofdm": {"selected_subcarriers": [512]}}, "different whole numbers from 0 to 511"),
-    "no subcarrier": ({"ofdm": {"selected_subcarriers": []}}, r"selected_subcarriers: \[\]; give a list"),
-    "half a subcarrier": ({"ofdm": {"subcarriers": 1.5}}, r"ofdm\.subcarriers: expected int, got 1\.5"),
-    "no bandwidth": ({"ofdm": {"bandwidth": 0}}, r"ofdm\.bandwidth: 0\.0 is out of range, choose more than 0"),
-    "flat array": ({"bs_antenna": {"shape": 8}}, r"bs_antenna\.shape: expected a list of 2 values, got 8"),
-    "no elements": ({"bs_antenna": {"shape": [4, 0]}}, r"bs_antenna\.shape: \[4, 0\]; give two whole numbers from 1"),
-    "no spacing": ({"bs_antenna": {"spacing": True}}, r"bs_antenna\.spacing: expected float, got True"),
-    "one angle": ({"bs_antenna": {"rotation": 90}}, r"bs_antenna\.rotation: expected a list of 3 values, got 90"),
-    "infinite angle": ({"bs_antenna": {"rotation": [0, 0, "1e99"]}}, "rotation, .* is too large; lower it"),
-    "pattern": ({"ue_antenna": {"radiation_pattern": "horn"}}, "radiation_pattern: 'horn'; choose from isotropic"),
-    "carrier phase": ({"add_carrier_phase": "yes"}, "add_carrier_phase: expected bool, got 'yes'"),
-}
-
-
-WRONG |= {
-    f"parameters: {name}": (write(CHANNEL_PARAMS, json.dumps(values)), rf"street/{CHANNEL_PARAMS}.*{message}")
-    for name, (values, message) in WRONG_PARAMS.items()
+    "points of words": (edited(txrx_sets=NO_STATION | WORDS), "num_points is 'two'; give a whole number"),
+    "several base stations": (edited(txrx_sets=params(3)["txrx_sets"]), f"3 {SEVERAL}"),
 }
 
 
@@ -277,6 +228,5 @@ def test_command_summarises_and_trains_on_a_scenario(tmp_path: Path, capsys: pyt
     assert (metrics["task"], metrics["n_test"]) == ("csi", 12)
     assert set(metrics["receivers"]) == {"bs0", "bs1"}
     assert np.isfinite(metrics["cea_db"]["median"])
-    status, out, err = call(["evaluate", tmp_path / "run", "--json"], capsys)
-    assert (status, err) == (0, "")
-    assert json.loads(out)["cea_db"] == metrics["cea_db"]
+    status, out, _ = call(["evaluate", tmp_path / "run", "--json"], capsys)
+    assert (status, json.loads(out)["cea_db"]) == (0, metrics["cea_db"])

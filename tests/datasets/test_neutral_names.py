@@ -1,8 +1,5 @@
 """Signal strengths in files with neutral names, and receivers with orientation, carrier and antenna."""
 
-from __future__ import annotations
-
-from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +7,12 @@ import pytest
 from changed_folders import refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from spectrum_records import assert_same
 
-from wrf_mi.core import Antenna, InputError, Record
+from wrf_mi.core import Antenna, Record
 from wrf_mi.core.angles import rotation_matrix
-from wrf_mi.core.antenna import DEVICE_TO_ARRAY, UPRIGHT
-from wrf_mi.datasets import load, make_splits, read_ble_folder, write_ble_folder
+from wrf_mi.core.antenna import DEVICE_TO_ARRAY, UPRIGHT, boresight_orientation
+from wrf_mi.datasets import load, make_splits, read_ble_folder, read_record_file, write_ble_folder, write_record_file
 
 ROUNDING = 1e-12
 """Rounding of rotations in double precision."""
@@ -29,71 +27,64 @@ def folder_of(folder: Path, **files: str) -> Path:
     return folder
 
 
-def with_split(*words: str) -> str:
-    header, *rows = ROWS.splitlines()
-    return "\n".join([f"{header},split", *(f"{row},{word}" for row, word in zip(rows, words, strict=True))]) + "\n"
-
-
-def assert_equal(left: Record, right: Record) -> None:
-    for each in fields(Record):
-        if each.name not in ("receivers", "source", "name"):
-            np.testing.assert_equal(getattr(left, each.name), getattr(right, each.name), each.name)
-    for one, other in zip(left.receivers, right.receivers, strict=True):
-        np.testing.assert_equal(vars(one), vars(other))
+def with_columns(table: str, columns: str, *fields: str) -> str:
+    header, *rows = table.splitlines()
+    return "\n".join([f"{header},{columns}", *(f"{row},{field}" for row, field in zip(rows, fields, strict=True))])
 
 
 def test_neutral_and_historic_names_give_equal_records(tmp_path: Path):
     neutral = read_ble_folder(folder_of(tmp_path / "a", receivers=RECEIVERS, train=ROWS, test=ROWS))
     historic = {"anchors": RECEIVERS, "calibration_df": ROWS, "test_robot_df": ROWS}
-    assert_equal(neutral, read_ble_folder(folder_of(tmp_path / "b", **historic)))
+    assert_same(read_ble_folder(folder_of(tmp_path / "b", **historic)), neutral, "name")
     assert load(tmp_path / "a").task == "rssi"
 
 
-def test_one_file_with_the_official_split(tmp_path: Path):
-    rows = with_split("train", " Test", "train")
-    record = read_ble_folder(folder_of(tmp_path, receivers=RECEIVERS, measurements=rows))
-    assert record.official is not None
-    assert [part.tolist() for part in record.official] == [[0, 2], [1]]
-    assert record.folds is None
+@pytest.mark.parametrize(
+    ("words", "official", "folds"),
+    [(("train", " Test", "train"), [[0, 2], [1]], None), (("2", "7", "2"), None, [0, 1, 0]), ((), None, None)],
+)
+def test_one_file_with_and_without_a_split(words: tuple, official: list | None, folds: list | None, tmp_path: Path):
+    files = {"receivers": RECEIVERS, "measurements": with_columns(ROWS, "split", *words) if words else ROWS}
+    record = read_ble_folder(folder_of(tmp_path, **files))
     np.testing.assert_array_equal(record.observation, [[-50, -51, np.nan], [-40, -41, -42]])
-
-
-def test_one_file_with_numbers_of_folds(tmp_path: Path):
-    record = read_ble_folder(folder_of(tmp_path, receivers=RECEIVERS, measurements=with_split("2", "7", "2")))
-    assert record.official is None
-    np.testing.assert_array_equal(record.folds, [0, 1, 0])
-    assert [split.test.tolist() for split in make_splits(record, "blocked")] == [[0, 2], [1]]
-    assert_equal(record, read_ble_folder(write_ble_folder(tmp_path / "again", record)))
-
-
-def test_one_file_without_a_split(tmp_path: Path):
-    record = read_ble_folder(folder_of(tmp_path, anchors=RECEIVERS, measurements=ROWS))
-    assert (record.official, record.folds) == (None, None)
-    again = write_ble_folder(tmp_path / "again", record)
-    assert sorted(file.name for file in again.iterdir()) == ["measurements.csv", "receivers.csv"]
-    assert_equal(record, read_ble_folder(again))
+    np.testing.assert_equal((record.official, record.folds), (official and tuple(map(np.array, official)), folds))
+    if folds:
+        assert [split.test.tolist() for split in make_splits(record, "blocked")] == [[0, 2], [1]]
+    if not official:
+        again = write_ble_folder(tmp_path / "again", record)
+        assert sorted(file.name for file in again.iterdir()) == ["measurements.csv", "receivers.csv"]
+        assert_same(read_ble_folder(again), record, "name")
 
 
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        (
-            {"anchors": RECEIVERS, "train": ROWS, "test": ROWS},
-            r"receivers\.csv and anchors\.csv state the same",
-        ),
+        ({"anchors": RECEIVERS, "train": ROWS, "test": ROWS}, r"receivers\.csv and anchors\.csv state the same"),
         ({"train": ROWS, "test": ROWS, "test_robot_df": ROWS}, r"test\.csv and test_robot_df\.csv state the same"),
         ({"measurements": ROWS, "train": ROWS}, r"measurements\.csv and train\.csv state the same; remove one"),
         ({"train": ROWS}, r"test\.csv: missing; give a file that exists"),
         (
-            {"measurements": with_split("train", "val", "test")},
+            {"measurements": with_columns(ROWS, "split", "train", "val", "test")},
             r"row 2: split is 'val'; give train or test",
         ),
-        ({"measurements": with_split("train", "train", "train")}, "all rows have train in the column split; mark"),
-        ({"measurements": with_split("train", "1", "test")}, "row 2: split is '1'; give train or test, or in all rows"),
+        (
+            {"measurements": with_columns(ROWS, "split", "train", "train", "train")},
+            "all rows have train in the column split; mark",
+        ),
+        (
+            {"measurements": with_columns(ROWS, "split", "train", "1", "test")},
+            "row 2: split is '1'; give train or test, or in all rows",
+        ),
     ],
 )
 def test_ambiguous_files_are_refused(files: dict[str, str], message: str, tmp_path: Path):
     refusal(read_ble_folder, folder_of(tmp_path, **{"receivers": RECEIVERS, **files}), message)
+
+
+def test_carriers_of_rows_beside_those_of_receivers_are_refused(tmp_path: Path):
+    rows = ROWS.replace("x,y,z", "x,y,frequency_hz")
+    folder = folder_of(tmp_path, receivers=with_columns(RECEIVERS, "frequency_hz", "1e9", "2e9"), train=rows, test=rows)
+    refusal(read_ble_folder, folder, r"train\.csv: line 1: frequency_hz is a column of receivers\.csv, too")
 
 
 def test_ids_are_any_text_on_one_line(tmp_path: Path):
@@ -105,23 +96,16 @@ def test_ids_are_any_text_on_one_line(tmp_path: Path):
     record = read_ble_folder(folder_of(tmp_path, receivers=receivers, train=rows, test=rows))
     assert [receiver.name for receiver in record.receivers] == ids
     np.testing.assert_array_equal(record.observation[:, 0], -40 - np.arange(len(ids)))
-    assert_equal(record, read_ble_folder(write_ble_folder(tmp_path / "again", record)))
-
-
-def receivers_with(columns: str, *rows: str) -> str:
-    lines = RECEIVERS.splitlines()
-    return "\n".join([f"{lines[0]},{columns}", *(f"{line},{row}" for line, row in zip(lines[1:], rows, strict=True))])
+    assert_same(read_ble_folder(write_ble_folder(tmp_path / "again", record)), record, "name")
 
 
 def read_with(folder: Path, columns: str, *rows: str) -> Record:
-    return read_ble_folder(folder_of(folder, receivers=receivers_with(columns, *rows), train=ROWS, test=ROWS))
+    return read_ble_folder(folder_of(folder, receivers=with_columns(RECEIVERS, columns, *rows), train=ROWS, test=ROWS))
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(-360, 360), st.floats(-90, 90))
 def test_azimuth_and_downtilt_are_yaw_and_pitch_of_sionna(azimuth: float, downtilt: float):
-    from wrf_mi.core.antenna import boresight_orientation
-
     yaw, pitch = np.radians([azimuth, downtilt])
     # Sionna RT: R_z(yaw) R_y(pitch) from a device's frame to the world's.
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
@@ -139,18 +123,14 @@ def test_orientations_carriers_and_antennas_are_read_and_written(tmp_path: Path)
     assert (first.antenna, second.antenna) == (Antenna("tr38901", frame="array"), Antenna())
     assert (second.orientation_xyzw.tolist(), first.frequency_hz, second.frequency_hz) == ([*UPRIGHT], 3.56e9, 3.69e9)
     np.testing.assert_array_equal(record.receiver_carriers_hz, [3.56e9, 3.69e9])
-    assert_equal(record, read_ble_folder(write_ble_folder(tmp_path / "again", record)))
-
-
-def test_a_quaternion_may_take_the_place_of_angles(tmp_path: Path):
+    assert_same(read_ble_folder(write_ble_folder(tmp_path / "again", record)), record, "name")
+    # A quaternion may take the place of angles.
     half = np.sqrt(0.5)
-    record = read_with(tmp_path, "qx,qy,qz,qw,frame", f"0,0,{half},{half},", "0,0,0,1,world")
+    record = read_with(tmp_path / "b", "qx,qy,qz,qw,frame", f"0,0,{half},{half},", "0,0,0,1,world")
     np.testing.assert_allclose(record.receivers[0].orientation_xyzw, [0, 0, half, half])
     assert [receiver.antenna.frame for receiver in record.receivers] == ["array", "world"]
-
-
-def test_equal_carriers_of_receivers_are_the_carrier_of_the_record(tmp_path: Path):
-    record = read_with(tmp_path, "frequency_hz", "868e6", "868e6")
+    # Equal carriers of receivers are the carrier of the record.
+    record = read_with(tmp_path / "c", "frequency_hz", "868e6", "868e6")
     assert record.receiver_carriers_hz is None
     np.testing.assert_array_equal(record.frequencies_hz, [868e6])
 
@@ -171,17 +151,8 @@ def test_wrong_columns_of_receivers_are_refused(columns: str, rows: tuple[str, s
     refusal(lambda folder: read_with(folder, columns, *rows), tmp_path, rf"receivers\.csv: {message}")
 
 
-def test_carriers_of_rows_beside_those_of_receivers_are_refused(tmp_path: Path):
-    rows = ROWS.replace("x,y,z", "x,y,frequency_hz")
-    files = {"receivers": receivers_with("frequency_hz", "1e9", "2e9"), "train": rows, "test": rows}
-    with pytest.raises(InputError, match=r"train\.csv: line 1: frequency_hz is a column of receivers\.csv, too"):
-        read_ble_folder(folder_of(tmp_path, **files))
-
-
-def test_a_record_file_keeps_carriers_of_receivers(tmp_path: Path):
-    from wrf_mi.datasets import read_record_file, write_record_file
-
-    record = read_with(tmp_path / "a", "frequency_hz", "1e9", "2e9")
-    assert_equal(record, read_record_file(write_record_file(tmp_path / "a.npz", record)))
-    plain = replace(record, receivers=tuple(replace(rx, frequency_hz=None) for rx in record.receivers))
-    assert_equal(plain, read_record_file(write_record_file(tmp_path / "b.npz", plain)))
+@pytest.mark.parametrize("second_hz", [None, "2e9"])
+def test_a_record_file_keeps_carriers_of_receivers(second_hz: str | None, tmp_path: Path):
+    columns = ("frequency_hz", "1e9", second_hz) if second_hz else ("pattern", "", "")
+    record = read_with(tmp_path / "a", *columns)
+    assert_same(read_record_file(write_record_file(tmp_path / "a.npz", record)), record)

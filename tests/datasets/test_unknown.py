@@ -1,15 +1,14 @@
 """Folders and files that are no data set are refused with what they hold and the layout that is wanted."""
 
-from __future__ import annotations
-
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from calling import call, refused
+from changed_folders import refusal
 from made_flat import write_flat
 
-from wrf_mi.core import InputError
 from wrf_mi.datasets import load
 from wrf_mi.datasets.unknown import long_columns
 
@@ -28,9 +27,7 @@ WANTED = r"columns x,y and rssi_<id> of each receiver, in train\.csv and test\.c
     ("asked", "separator"),
     [("file", ","), ("file", ";"), ("folder", ","), ("folder", "\t"), ("folder in the layout", ",")],
 )
-def test_a_table_of_readings_is_told_how_it_is_imported(
-    asked: str, separator: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_of_readings_is_told_its_import(asked: str, separator: str, tmp_path: Path, capsys: Any) -> None:
     pytest.importorskip("pandas")
     folder = tmp_path / "office"
     folder.mkdir()
@@ -51,10 +48,7 @@ def test_a_table_of_readings_is_told_how_it_is_imported(
 @pytest.mark.parametrize(
     ("header", "columns"),
     [
-        (
-            "timestamp,pos_x,pos_y,MAC address,RSSI (dBm)",
-            ("MAC address", "RSSI (dBm)"),
-        ),
+        ("timestamp,pos_x,pos_y,MAC address,RSSI (dBm)", ("MAC address", "RSSI (dBm)")),
         ("x,y,z,AP,level", ("AP", "level")),
         ("lat,lon,ssid,bssid,signal_dbm,channel", ("bssid", "signal_dbm")),
         ("scan,gateway_id,rsrp", ("gateway_id", "rsrp")),
@@ -92,13 +86,8 @@ def test_an_incomplete_layout_names_the_missing_file(tmp_path: Path) -> None:
     for name, missing in (("calibration_df.csv", "anchors.csv"), ("tx_pos.csv", "gateway_info.yml")):
         (tmp_path / name).mkdir()
         (tmp_path / name / name).write_text("x,y,z\n1,2,3\n")
-        with pytest.raises(InputError, match=f"{missing}: missing"):
-            load(tmp_path / name)
-
-
-def test_a_table_with_other_separators_is_told_so(tmp_path: Path) -> None:
+        refusal(load, tmp_path / name, f"{missing}: missing")
+    # A table with other separators is told so.
     folder = write_flat(tmp_path / "office")
-    file = folder / "calibration_df.csv"
-    file.write_text(file.read_text().replace(",", ";"))
-    with pytest.raises(InputError, match="the first line must name each column once, separated by commas"):
-        load(folder)
+    (folder / "calibration_df.csv").write_text((folder / "calibration_df.csv").read_text().replace(",", ";"))
+    refusal(load, folder, "the first line must name each column once, separated by commas")

@@ -1,7 +1,5 @@
 """Exported fields: PLY of 3D Gaussian splatting in other programs' readers, and files that give back the run."""
 
-from __future__ import annotations
-
 import csv
 import shutil
 import subprocess
@@ -13,15 +11,17 @@ import numpy as np
 import pytest
 import trimesh
 from calling import call, refused
+from changed_folders import error_line
 from small_fits import settings
 
-from wrf_mi.core import InputError, Record
+from wrf_mi.core import Record
 from wrf_mi.core.angles import rotation_matrix
 from wrf_mi.exports import ExportOptions, export
 from wrf_mi.exports.fields import RANGE_DB, import_field
 from wrf_mi.runs.api import train
 from wrf_mi.runs.run import open_run
 
+FIELDS = ("wrf-gs", "wrf-gs+", "factorised")
 TX_M = np.array([[-0.3, 0.2, 0.5]])
 SINGLE = 1e-5
 """Logarithms and logits are stored in single precision: 1e-7 of values up to 14."""
@@ -37,11 +37,7 @@ SPLAT_TRANSFORM = shutil.which("splat-transform") or shutil.which(
 def runs(two_gateways: Record, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A run of each field, after very few steps."""
     out = tmp_path_factory.mktemp("runs")
-    steps = "steps=4"
-    return {
-        name: train(folder, out / name, name, settings=settings(steps, model=name)).folder
-        for name in ("wrf-gs", "wrf-gs+", "factorised")
-    }
+    return {name: train(folder, out / name, name, settings=settings("steps=4", model=name)).folder for name in FIELDS}
 
 
 def gaussians(run: Path) -> Any:
@@ -56,12 +52,10 @@ def exported(run: Path, out: Path) -> np.ndarray:
     return stored
 
 
-@pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+", "factorised"])
-def test_ply_has_the_properties_of_3dgs_and_the_gaussians_of_the_field(
-    runs: dict[str, Path], tmp_path: Path, model: str
-) -> None:
+@pytest.mark.parametrize("model", FIELDS)
+def test_ply_has_the_properties_of_3dgs_and_the_gaussians(runs: dict[str, Path], tmp_path: Path, model: str) -> None:
     found, read = gaussians(runs[model]), exported(runs[model], tmp_path / "field.ply")
-    known = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    known = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     known += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     assert list(read.dtype.names)[: len(known)] == known
     for k, axis in enumerate("xyz"):
@@ -132,7 +126,7 @@ def test_splat_transform_converts_it_and_back(runs: dict[str, Path], tmp_path: P
     np.testing.assert_allclose(alpha[1][nearest.argmin(axis=1)], alpha[0], atol=1 / 255)
 
 
-@pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+", "factorised"])
+@pytest.mark.parametrize("model", FIELDS)
 def test_imported_field_predicts_the_same_bits(runs: dict[str, Path], tmp_path: Path, model: str) -> None:
     export(runs[model], "field", tmp_path / "field.npz")
     run = import_field(tmp_path / "field.npz", tmp_path / "run")
@@ -150,48 +144,42 @@ def test_imported_field_predicts_the_same_bits(runs: dict[str, Path], tmp_path: 
 
 def test_damaged_and_other_files_are_refused(runs: dict[str, Path], tmp_path: Path) -> None:
     file = tmp_path / "field.npz"
+    error_line(import_field, file, tmp_path / "run", "missing")
     export(runs["wrf-gs+"], "field", file)
     with np.load(file) as stored:
         arrays = dict(stored)
-    changes: list[tuple[dict[str, Any], str]] = [
+    for change, message in (
         ({"export/format": np.array(9)}, "format 9, this version reads 1"),
         ({"export/format": None}, "not written by export"),
         ({"export/config": None}, "incomplete"),
-    ]
-    for change, message in changes:
-        np.savez(file, **{key: v for key, v in (arrays | change).items() if v is not None})
-        with pytest.raises(InputError, match=message):
-            import_field(file, tmp_path / "run")
+    ):
+        np.savez(file, **{key: values for key, values in (arrays | change).items() if values is not None})
+        error_line(import_field, file, tmp_path / "run", message)
     file.write_bytes(b"no zip")
-    for path, message in ((file, "not readable"), (tmp_path / "none.npz", "missing")):
-        with pytest.raises(InputError, match=message):
-            import_field(path, tmp_path / "run")
+    error_line(import_field, file, tmp_path / "run", "not readable")
     assert not (tmp_path / "run").exists()
 
 
 def test_command_exports_and_imports(runs: dict[str, Path], tmp_path: Path, capsys: Any) -> None:
-    run = runs["wrf-gs+"]
+    run, exporting = runs["wrf-gs+"], ["export", runs["wrf-gs+"], "--format"]
     # A negative coordinate is no option.
-    status, out, _ = call(
-        ["export", run, "--format", "3dgs", "--tx", "-0.3,0.2,5e-1", "--out", tmp_path / "a.ply"], capsys
-    )
+    status, out, _ = call([*exporting, "3dgs", "--tx", "-0.3,0.2,5e-1", "--out", tmp_path / "a.ply"], capsys)
     assert (status, out) == (0, f"Gaussians 8, properties 19: {tmp_path / 'a.ply'}\n")
     stored = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
     np.testing.assert_array_equal(stored, exported(run, tmp_path / "b.ply"))
-    assert call(["export", run, "--format", "field", "--out", tmp_path / "f.npz"], capsys)[0] == 0
+    assert call([*exporting, "field", "--out", tmp_path / "f.npz"], capsys)[0] == 0
     status, out, _ = call(["import", tmp_path / "f.npz", "--out", tmp_path / "run"], capsys)
     assert (status, out.endswith(f": {tmp_path / 'run'}\n")) == (0, True)
-    status, _, _ = call(["evaluate", tmp_path / "run"], capsys)
-    assert status == 0
-    for arguments, message in (
-        (["--format", "3dgs", "--out", tmp_path / "c.ply"], "choose one by --tx X,Y,Z"),
-        (["--format", "3dgs", "--tx", "1,2", "--out", tmp_path / "c.ply"], "--tx 1,2: give three numbers"),
-        (["--format", "3dgs", "--tx", "1,2,3", "--frequency", "1e9", "--out", tmp_path / "c.ply"], "have one carrier"),
-        (["--format", "3dgs", "--tx", "1,2,3", "--out", tmp_path / "c.txt"], "format 3dgs is a file .ply"),
-        (["--format", "field", "--tx", "1,2,3", "--out", tmp_path / "c.npz"], "--tx does not belong to format field"),
-        (["--format", "paths", "--out", tmp_path / "c.csv"], "stores no paths"),
-        (["--format", "glb", "--out", tmp_path / "c.glb"], "without a scene"),
-        (["--format", "ble", "--out", tmp_path / "c"], "format ble takes a data set; choose from 3dgs, field, "),
+    assert call(["evaluate", tmp_path / "run"], capsys)[0] == 0
+    for words, suffix, message in (
+        ("3dgs", ".ply", "choose one by --tx X,Y,Z"),
+        ("3dgs --tx 1,2", ".ply", "--tx 1,2: give three numbers"),
+        ("3dgs --tx 1,2,3 --frequency 1e9", ".ply", "have one carrier"),
+        ("3dgs --tx 1,2,3", ".txt", "format 3dgs is a file .ply"),
+        ("field --tx 1,2,3", ".npz", "--tx does not belong to format field"),
+        ("paths", ".csv", "stores no paths"),
+        ("glb", ".glb", "without a scene"),
+        ("ble", "", "format ble takes a data set; choose from 3dgs, field, "),
     ):
-        refused(["export", run, *arguments], message, capsys)
+        refused([*exporting, *words.split(), "--out", tmp_path / f"c{suffix}"], message, capsys)
     refused(["import", tmp_path / "f.npz", "--out", tmp_path / "run"], "exists and is not empty", capsys)

@@ -1,7 +1,5 @@
 """Exported scenes: opened by plain Sionna RT, Mitsuba and trimesh."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -10,10 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 from calling import refused
+from changed_folders import error_line
 from traced_rooms import SHOEBOX, write_xml
 
 from wrf_mi import backend
-from wrf_mi.core import InputError
 from wrf_mi.exports import ExportOptions, export
 from wrf_mi.runs.api import train
 from wrf_mi.scene.folder import write_scene
@@ -34,29 +32,28 @@ LAW = {"conductivity_exponent": 0.8, "carrier_hz": 2.4e9}
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A shoebox with a thickness of its own, a material of its own with a law, and a perfect conductor."""
-    parts = [
-        Surface(name, "other", np.asarray(mesh.vertices), np.asarray(mesh.faces)) for name, (_, mesh) in SHOEBOX.items()
-    ]
-    materials = Materials(
-        surfaces={
-            **{name: material for name, (material, _) in SHOEBOX.items()},
-            "east": "panel",
-            "west": "perfect",
-        },
-        thickness_m={"itu_concrete": 0.37},
-        constants={"panel": OWN | LAW},
-    )
+    parts = [Surface(name, "other", np.asarray(mesh.vertices), mesh.faces) for name, (_, mesh) in SHOEBOX.items()]
+    surfaces = {name: material for name, (material, _) in SHOEBOX.items()} | {"east": "panel", "west": "perfect"}
+    materials = Materials(surfaces=surfaces, thickness_m={"itu_concrete": 0.37}, constants={"panel": OWN | LAW})
     return write_scene(tmp_path_factory.mktemp("scene") / "s", parts, frame="made", source="test", materials=materials)
 
 
 def constants(scene: Any) -> dict[str, list[float]]:
     """Permittivity, conductivity and thickness of each object's material."""
-    found = {}
-    for name, thing in scene.objects.items():
-        material = thing.radio_material
-        numbers = (material.relative_permittivity, material.conductivity, material.thickness)
-        found[name] = [float(np.ravel(number)[0]) for number in numbers]
-    return found
+    return {
+        name: [
+            float(np.ravel(getattr(thing.radio_material, constant))[0])
+            for constant in ("relative_permittivity", "conductivity", "thickness")
+        ]
+        for name, thing in scene.objects.items()
+    }
+
+
+def triangles(scene: Any) -> np.ndarray:
+    """Triangles [f, 3, 3] of an opened scene or of a mesh in an order that does not depend on the file's."""
+    corners = scene if isinstance(scene, np.ndarray) else scene_surfaces(scene).triangles
+    flat = np.round(np.sort(corners.reshape(len(corners), 9), axis=1), 5)
+    return flat[np.lexsort(flat.T)]
 
 
 @pytest.mark.parametrize("frequency_hz", [915e6, 2.4e9, 5.8e9])
@@ -89,20 +86,13 @@ def test_plain_sionna_has_the_same_materials_and_mesh(scene: Path, tmp_path: Pat
             assert constants(plain)[name] == pytest.approx(again[name], rel=SINGLE)
 
 
-def test_default_merging_of_sionna_opens_it(scene: Path, tmp_path: Path) -> None:
+def test_sionna_merging_shapes_and_mitsuba_without_sionna_open_it(scene: Path, tmp_path: Path) -> None:
+    import mitsuba as mi
     from sionna import rt
 
     export(scene, "sionna", tmp_path / "out", ExportOptions(frequency_hz=2.4e9))
     assert rt.load_scene(str(tmp_path / "out" / "scene.xml")).objects
-
-
-def test_mitsuba_opens_it_without_sionna(scene: Path, tmp_path: Path) -> None:
-    backend.init()
-    import mitsuba as mi
-
-    export(scene, "sionna", tmp_path / "out", ExportOptions(frequency_hz=2.4e9))
-    text = (tmp_path / "out" / "mitsuba.xml").read_text()
-    assert "radio-material" not in text
+    assert "radio-material" not in (tmp_path / "out" / "mitsuba.xml").read_text()
     box = mi.load_file(str(tmp_path / "out" / "mitsuba.xml")).bbox()
     np.testing.assert_allclose([np.array(box.min), np.array(box.max)], [[0, 0, 0], [6, 5, 3]])
     # After the import of Sionna RT, the scene file, too.
@@ -110,40 +100,23 @@ def test_mitsuba_opens_it_without_sionna(scene: Path, tmp_path: Path) -> None:
     assert sum(shape.face_count() for shape in shapes) == 2 * len(SHOEBOX)
 
 
-def turned_back(vertices: np.ndarray) -> np.ndarray:
-    """From glTF's y up to z up."""
-    x, y, z = vertices.T
-    return np.stack([x, -z, y], axis=-1)
-
-
-def corners(triangles: np.ndarray) -> np.ndarray:
-    """Triangles [f, 3, 3] in an order that does not depend on the file's."""
-    flat = np.round(np.sort(triangles.reshape(len(triangles), 9), axis=1), 5)
-    return flat[np.lexsort(flat.T)]
-
-
-def test_glb_has_named_surfaces_and_materials(scene: Path, tmp_path: Path) -> None:
+def test_glb_has_named_surfaces_and_materials_and_is_the_scene_again(scene: Path, tmp_path: Path) -> None:
+    """In its place and upright, as a bare mesh and as a scene folder."""
     export(scene, "glb", tmp_path / "scene.glb")
-    read = trimesh.load_scene(tmp_path / "scene.glb")
-    known = open_scene(scene, 2.4e9)
+    read, known = trimesh.load_scene(tmp_path / "scene.glb"), open_scene(scene, 2.4e9)
     assert set(read.geometry) == set(known.objects)
     surfaces = scene_surfaces(known)
     for index, name in enumerate(surfaces.names):
         mesh = read.geometry[name]
         assert mesh.visual.material.name == known.objects[name].radio_material.name
-        theirs = turned_back(mesh.vertices)[mesh.faces]
+        x, y, z = mesh.vertices.T
+        theirs = np.stack([x, -z, y], axis=-1)[mesh.faces]  # from glTF's y up to z up
         ours = surfaces.triangles[surfaces.first_face[index] : surfaces.first_face[index + 1]]
-        np.testing.assert_array_equal(corners(theirs), corners(ours))
-
-
-def test_glb_is_the_scene_again(scene: Path, tmp_path: Path) -> None:
-    """In its place and upright, as a bare mesh and as a scene folder."""
-    export(scene, "glb", tmp_path / "scene.glb")
-    known = corners(scene_surfaces(open_scene(scene, 2.4e9)).triangles)
+        np.testing.assert_array_equal(triangles(theirs), triangles(ours))
     bare = open_scene(tmp_path / "scene.glb", 2.4e9, material="concrete")
-    np.testing.assert_array_equal(corners(scene_surfaces(bare).triangles), known)
     again = open_scene(make_scene(tmp_path / "scene.glb", tmp_path / "again").folder, 2.4e9)
-    np.testing.assert_array_equal(corners(scene_surfaces(again).triangles), known)
+    np.testing.assert_array_equal(triangles(bare), triangles(known))
+    np.testing.assert_array_equal(triangles(again), triangles(known))
 
 
 def test_ply_has_colours_materials_and_is_a_scene_again(scene: Path, tmp_path: Path) -> None:
@@ -160,9 +133,9 @@ def test_ply_has_colours_materials_and_is_a_scene_again(scene: Path, tmp_path: P
     for surface, material in zip(stored["surface"].ravel(), stored["material"].ravel(), strict=True):
         assert names["material"][material] == known.objects[names["surface"][surface]].radio_material.name
     assert mesh.visual.face_colors[0][:3].tolist() == [115, 115, 115]  # concrete
-    np.testing.assert_array_equal(corners(mesh.triangles), corners(scene_surfaces(known).triangles))
+    np.testing.assert_array_equal(triangles(np.array(mesh.triangles)), triangles(known))
     again = open_scene(make_scene(tmp_path / "scene.ply", tmp_path / "again").folder, 2.4e9)
-    np.testing.assert_array_equal(corners(scene_surfaces(again).triangles), corners(scene_surfaces(known).triangles))
+    np.testing.assert_array_equal(triangles(again), triangles(known))
 
 
 def test_corrected_scene_of_a_run_is_exported(flat_folder: Path, room: Path, tmp_path: Path) -> None:
@@ -187,13 +160,16 @@ def test_bare_mesh_needs_a_material_and_a_scene_a_carrier(tmp_path: Path, capsys
     mesh = tmp_path / "box.stl"
     trimesh.creation.box((4, 3, 2.5)).export(mesh)
     out = tmp_path / "x"
-    refused(["export", mesh, "--format", "glb", "--out", f"{out}.glb"], "a mesh has no radio material", capsys)
+    for source, layout, message in (
+        (mesh, "glb", "a mesh has no radio material"),
+        (write_xml(tmp_path, SHOEBOX), "sionna", "by --frequency HZ"),
+        (mesh, "npz", "a scene; format npz takes a data set"),
+        ("no-such", "glb", "no such file or name"),
+    ):
+        suffix = "" if layout == "sionna" else f".{layout}"
+        refused(["export", source, "--format", layout, "--out", f"{out}{suffix}"], message, capsys)
     assert export(mesh, "glb", f"{out}.glb", ExportOptions(material="brick"))["materials"] == 1
-    refused(["export", write_xml(tmp_path, SHOEBOX), "--format", "sionna", "--out", out], "by --frequency HZ", capsys)
-    refused(["export", mesh, "--format", "npz", "--out", f"{out}.npz"], "a scene; format npz takes a data set", capsys)
-    refused(["export", "no-such", "--format", "glb", "--out", f"{out}.glb"], "no such file or name", capsys)
-    with pytest.raises(InputError, match="unknown; choose from 3dgs"):
-        export(mesh, "obj", out)
+    error_line(export, mesh, "obj", out, "unknown; choose from 3dgs")
 
 
 @pytest.mark.parametrize("frequency_hz", [2.4e9, 0.9e9])

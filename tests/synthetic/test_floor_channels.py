@@ -1,15 +1,17 @@
 """Channels between a base station and walking users: made once, right at each antenna and frequency, noisy as told."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from changed_folders import refusal
 from scipy.constants import speed_of_light
 from scipy.spatial import cKDTree
+from spectrum_records import assert_same
+from trimesh.sample import sample_surface
 from wrf_mi_scenes.furnished import measured_parts
 from wrf_mi_scenes.mitsuba_xml import write_scene
 
@@ -34,54 +36,42 @@ that differ by 0.015 rad at most."""
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("walked") / "flat"
+def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    return walked_channels("flat", tmp_path_factory.mktemp("walked") / "flat", SMALL)
 
 
-@pytest.fixture(scope="module")
-def record(folder: Path) -> Record:
-    return walked_channels("flat", folder, SMALL)
-
-
-def test_data_are_stored_and_reproducible(folder: Path, record: Record, tmp_path: Path) -> None:
-    before = (folder / "csidata.npy").stat().st_mtime_ns
-    again = walked_channels("flat", folder, SMALL)
-    assert (folder / "csidata.npy").stat().st_mtime_ns == before
-    np.testing.assert_array_equal(again.observation, record.observation)
+def test_data_are_stored_and_reproducible(record: Record, tmp_path: Path) -> None:
+    file = Path(record.source, "csidata.npy")
+    before = file.stat().st_mtime_ns
+    assert_same(walked_channels("flat", record.source, SMALL), record)
+    assert file.stat().st_mtime_ns == before
     moved = walked_channels("flat", tmp_path / "moved", replace(SMALL, seed=2))
     assert not np.array_equal(record.tx_pos_m, moved.tx_pos_m)
     walked_channels("flat", tmp_path / "moved", SMALL)
-    back = read_nerf2_csi(tmp_path / "moved")
-    for key in ("observation", "uplink", "scored"):
-        np.testing.assert_array_equal(getattr(back, key), getattr(record, key))
+    assert_same(read_nerf2_csi(tmp_path / "moved"), record, "name")
 
 
 def test_record_has_the_stated_shapes_and_splits(record: Record) -> None:
     rows = len(PLACES["flat"]().routes) * SMALL.places
     assert (record.name, record.task, len(record)) == ("traced-csi-flat", "csi", rows)
-    assert record.truth is not None
-    assert record.observation.shape == record.truth.shape == (1, rows, 6, 26)
-    assert record.uplink is not None
-    assert record.uplink.shape == (rows, 6, 26)
+    assert record.observation.shape == record.truth.shape == (1, *record.uplink.shape) == (1, rows, 6, 26)
     assert record.has_positions
     assert np.abs(record.truth).max(axis=(0, 2, 3)).min() > 0
     np.testing.assert_array_equal(record.uplink_hz, UPLINK_HZ)
     np.testing.assert_array_equal(record.frequencies_hz, DOWNLINK_HZ)
-    assert record.official is not None
     assert [len(part) for part in record.official] == [16, 4]
     np.testing.assert_allclose(record.receivers[0].position_m, PLACES["flat"]().station_m)
     np.testing.assert_allclose(record.receivers[0].to_world[:, 2], [1, 0, 0], atol=FLOAT64)
     for rule in ("official", "random", "blocked", "trajectory"):
-        for split in make_splits(record, rule, n_train=5):
-            assert len(split.all_train) == 5
+        assert {len(split.all_train) for split in make_splits(record, rule, n_train=5)} == {5}
 
 
 def test_scores_compare_with_the_channel_without_noise(record: Record) -> None:
     (split,) = make_splits(record, "official")
-    assert record.truth is not None
-    truth, observed = record.truth, record.observation
-    exact, _ = evaluate(record, split, lambda rows, receiver: truth[receiver, rows])
-    noisy, _ = evaluate(record, split, lambda rows, receiver: observed[receiver, rows])
+    exact, noisy = (
+        evaluate(record, split, lambda rows, receiver, reported=reported: reported[receiver, rows])[0]
+        for reported in (record.truth, record.observation)
+    )
     assert exact["cea_db"]["median"] > 100
     # At one antenna, which may receive less than the mean over them.
     assert SMALL.snr_db - 6 < noisy["cea_db"]["median"] < SMALL.snr_db + 3
@@ -99,12 +89,14 @@ def test_noise_has_the_stated_snr() -> None:
     assert abs((real * imaginary).mean()) < 0.1 * real.var()
 
 
-def bare_room(tmp_path: Path) -> tuple[object, Receiver, np.ndarray, np.ndarray]:
+@pytest.fixture(scope="module")
+def bare_room(tmp_path_factory: pytest.TempPathFactory) -> tuple[object, Receiver, np.ndarray, np.ndarray]:
     """An empty room with an array, its elements, and users in it."""
-    write_scene(tmp_path, measured_parts(0.0, 0), "test")
+    folder = tmp_path_factory.mktemp("bare")
+    write_scene(folder, measured_parts(0.0, 0), "test")
     receiver = Receiver("array", np.array([1.5, 3.2, 1.7]), np.array([0.5, 0.5, 0.5, 0.5]))
     users = np.array([[4.2, 3.0, 1.2], [4.5, 1.6, 1.7], [3.0, 5.0, 1.0]])
-    return open_scene(tmp_path, CARRIER_HZ), receiver, planar_array(2, 4, speed_of_light / CARRIER_HZ / 2), users
+    return open_scene(folder, CARRIER_HZ), receiver, planar_array(2, 4, speed_of_light / CARRIER_HZ / 2), users
 
 
 def ends_of(users: np.ndarray) -> list[Receiver]:
@@ -114,8 +106,8 @@ def ends_of(users: np.ndarray) -> list[Receiver]:
 OPTIONS = TraceOptions(depth=2, rays=1 << 14)
 
 
-def test_specular_channels_are_reciprocal(tmp_path: Path) -> None:
-    scene, receiver, array_m, users = bare_room(tmp_path)
+def test_specular_channels_are_reciprocal(bare_room: tuple) -> None:
+    scene, receiver, array_m, users = bare_room
     frequencies = np.concatenate([UPLINK_HZ[::5], DOWNLINK_HZ[::5]])
     there = trace_paths(scene, users, receiver, OPTIONS).paths
     back = trace_paths(scene, receiver.position_m, ends_of(users), OPTIONS, search_from="transmitters").paths
@@ -126,8 +118,8 @@ def test_specular_channels_are_reciprocal(tmp_path: Path) -> None:
     assert np.abs(found - parts).max() < FLOAT64 * np.abs(found).max()
 
 
-def test_channels_are_those_traced_to_each_element(tmp_path: Path) -> None:
-    scene, receiver, array_m, users = bare_room(tmp_path)
+def test_channels_are_those_traced_to_each_element(bare_room: tuple) -> None:
+    scene, receiver, array_m, users = bare_room
     frequencies = np.array([UPLINK_HZ[0], DOWNLINK_HZ[-1]])
     places = receiver.position_m + array_m @ receiver.to_world.T
     expected = csi(trace_paths(scene, users, ends_of(places), OPTIONS).paths, frequencies).swapaxes(0, 1)
@@ -147,48 +139,52 @@ def test_ray_tracing_of_the_same_floor_explains_most_of_the_channel(record: Reco
     assert np.median(cea_db(reported, record.scored)) > 12
     with pytest.raises(InputError, match="positions unknown, so there is nothing to trace between"):
         instrument_of(replace(record, tx_pos_m=np.full_like(record.tx_pos_m, np.nan)))
-    with pytest.raises(InputError, match=r"state frequencies_hz in base-station\.yml"):
-        instrument_of(replace(record, frequencies_hz=None))
+    refusal(instrument_of, replace(record, frequencies_hz=None), r"state frequencies_hz in base-station\.yml")
 
 
-def crossings(triangles: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Which segments [n] meet a triangle: Moeller and Trumbore's test."""
-    corner, edges = triangles[:, 0], (triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    met = np.zeros(len(start), bool)
-    for row, (origin, way) in enumerate(zip(start, end - start, strict=True)):
-        across = np.cross(way, edges[1])
-        volume = (edges[0] * across).sum(axis=1)
-        crossed = np.abs(volume) > 1e-12
-        scale, off = 1 / np.where(crossed, volume, 1), origin - corner
-        turned = np.cross(off, edges[0])
-        u, v = (off * across).sum(axis=1) * scale, (turned * way).sum(axis=1) * scale
-        t = (edges[1] * turned).sum(axis=1) * scale
-        met[row] = (crossed & (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)).any()
-    return met
+def crossed(scene: Any, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Which segments [n] meet a surface."""
+    import mitsuba as mi
+
+    origin, way = mi.Point3f(start.T.astype(np.float32)), mi.Vector3f((end - start).T.astype(np.float32))
+    return np.array(scene.mi_scene.ray_test(mi.Ray3f(origin, way, 1.0, 0.0, [])))
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_users_walk_in_the_open_and_through_doors(place: str) -> None:
+def test_users_walk_in_the_open_and_through_doors(place: str, tmp_path: Path) -> None:
     plan, walk, rng = PLACES[place](), Walk(), np.random.default_rng(0)
+    write_scene(tmp_path, plan.parts, "test")
+    scene = open_scene(tmp_path, CARRIER_HZ)
     mesh = trimesh.util.concatenate([mesh for _, mesh in plan.parts.values()])
-    tree = cKDTree(trimesh.sample.sample_surface(mesh, int(mesh.area / 1e-3), seed=1)[0])
+    tree = cKDTree(sample_surface(mesh, int(mesh.area / 1e-3), seed=1)[0])
     for route in plan.routes:
         way = users_way(route, walk, rng)
         assert way.shape == (walk.places, 3)
         assert tree.query(way)[0].min() > 0.15  # a person's half width
-        assert not crossings(mesh.triangles, way, np.roll(way, -1, axis=0)).any()
+        assert not crossed(scene, way, np.roll(way, -1, axis=0)).any()
         steps = np.linalg.norm(way - np.roll(way, 1, axis=0), axis=1)
         assert steps.max() < 2 * np.median(steps)
-    wall = crossings(mesh.triangles, np.array([[1.0, 1.0, 1.2]]), np.array([[1.0, -1.0, 1.2]]))
-    assert wall.all()
+    assert crossed(scene, np.array([[1.0, 1.0, 1.2]]), np.array([[1.0, -1.0, 1.2]])).all()  # a wall
     assert tree.query([plan.station_m])[0] > 0.15
 
 
-def test_names_are_known(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+NAMES = {
+    "traced-csi-flat": ("walked_channels", ("flat",)),
+    "traced-csi-office": ("walked_channels", ("office",)),
+    "traced-floor-receivers": ("traced_floor_strengths", ()),
+    "traced-floor-receivers-csi": ("traced_floor_channels", ()),
+    "traced-room-bands": ("traced_room_bands", ()),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_of_synthetic_data_are_known(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    function, arguments = NAMES[name]
     asked = []
-    monkeypatch.setattr("wrf_mi.synthetic.walked_channels", lambda place, progress: asked.append(place))
-    load_record("traced-csi-flat")
-    load_record("traced-csi-office")
-    assert asked == ["flat", "office"]
-    with pytest.raises(InputError, match="place 'garden': unknown; give one of flat, office"):
-        walked_channels("garden", tmp_path)
+    monkeypatch.setattr(f"wrf_mi.synthetic.{function}", lambda *place, progress: asked.append((place, progress)))
+    load_record(name, progress=True)
+    assert asked == [(arguments, True)]
+
+
+def test_unknown_places_are_refused(tmp_path: Path) -> None:
+    refusal(walked_channels, "garden", tmp_path, "place 'garden': unknown; give one of flat, office")

@@ -1,19 +1,18 @@
 """Receivers on an office floor: where they are, what they receive, and that both data sets have the same paths."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from spectrum_records import assert_same
 from wrf_mi_scenes import floor_plans
 from wrf_mi_scenes.mitsuba_xml import write_scene
 
 from wrf_mi.core import Record
-from wrf_mi.datasets import load, make_splits
+from wrf_mi.datasets import load
 from wrf_mi.receivers.channel import csi, rssi_dbm
-from wrf_mi.synthetic import load_record, traced_floor_channels, traced_floor_strengths
+from wrf_mi.synthetic import traced_floor_channels, traced_floor_strengths
 from wrf_mi.synthetic.floor_receivers import (
     CARRIER_HZ,
     DEFAULT,
@@ -34,13 +33,8 @@ SINGLE = 1e-5
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("floor")
-
-
-@pytest.fixture(scope="module")
-def record(folder: Path) -> Record:
-    return traced_floor_strengths(folder / "rssi", SMALL)
+def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    return traced_floor_strengths(tmp_path_factory.mktemp("floor") / "rssi", SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -55,24 +49,22 @@ def traced(scene_folder: Path) -> TraceResult:
     return trace_floor(scene_folder, floor_plans.office(), SMALL)
 
 
-def test_record_has_the_stated_rows_and_receivers(record: Record, folder: Path) -> None:
+def test_record_has_the_stated_rows_and_receivers(record: Record) -> None:
     assert (record.name, record.task) == ("traced-floor-receivers", "rssi")
     assert record.observation.shape == (6, 12)
     assert [receiver.name for receiver in record.receivers] == [f"anchor{k}" for k in range(1, 7)]
     np.testing.assert_array_equal(record.frequencies_hz, [CARRIER_HZ])
-    assert record.official is not None
     assert [part.tolist() for part in record.official] == [list(range(8)), list(range(8, 12))]
     assert np.nanmin(record.observation) >= SMALL.sensitivity_dbm
-    assert (folder / "rssi" / SCAN).is_file()
-    assert len(open_scene(folder / "rssi" / "floor", CARRIER_HZ).objects) == len(floor_plans.office().bare)
+    assert Path(record.source, SCAN).is_file()
+    assert len(open_scene(Path(record.source, "floor"), CARRIER_HZ).objects) == len(floor_plans.office().bare)
 
 
-def test_data_are_stored_and_reproducible(record: Record, traced: TraceResult, folder: Path) -> None:
-    file = folder / "rssi" / "train.csv"
+def test_data_are_stored_and_reproducible(record: Record, traced: TraceResult) -> None:
+    file = Path(record.source, "train.csv")
     before = file.stat().st_mtime_ns
-    again = traced_floor_strengths(folder / "rssi", SMALL)
+    assert_same(traced_floor_strengths(record.source, SMALL), record)
     assert file.stat().st_mtime_ns == before
-    np.testing.assert_array_equal(again.observation, record.observation)
     np.testing.assert_array_equal(traced.tx_pos_m, record.tx_pos_m)
     np.testing.assert_array_equal(strengths_of(traced, SMALL).observation, record.observation)
 
@@ -101,16 +93,14 @@ def test_strengths_are_the_power_of_all_paths(traced: TraceResult) -> None:
     assert 8 not in kinds
 
 
-def test_offsets_and_noise_have_the_stated_deviations(traced: TraceResult) -> None:
+def test_offsets_noise_and_sensitivity_are_the_stated_ones(traced: TraceResult) -> None:
     quiet = strengths_of(traced, QUIET).observation
     offset = strengths_of(traced, replace(QUIET, offset_db=3.0)).observation - quiet
     assert (np.nanmax(offset, axis=1) - np.nanmin(offset, axis=1)).max() < FLOAT32_DB
     assert 1 < np.nanmedian(offset, axis=1).std() < 6
     noise = strengths_of(traced, replace(QUIET, noise_db=2.0)).observation - quiet
     assert np.nanstd(noise) == pytest.approx(2, rel=0.3)  # three standard deviations of the estimate from 70 values
-
-
-def test_strengths_below_the_sensitivity_are_not_received(traced: TraceResult) -> None:
+    # Strengths below the sensitivity are not received.
     all_received = strengths_of(traced, replace(SMALL, sensitivity_dbm=-500.0)).observation
     ordered = np.sort(all_received[np.isfinite(all_received)])
     limit = float(ordered[len(ordered) // 2 :][:2].mean())
@@ -129,41 +119,17 @@ def test_specular_paths_are_those_of_a_search_without_scattering(traced: TraceRe
     np.testing.assert_allclose(np.abs(specular.gain), np.abs(alone.gain) * kept, rtol=1e-4, atol=1e-12)
 
 
-def test_channels_have_the_same_paths(traced: TraceResult, folder: Path) -> None:
-    record = traced_floor_channels(folder / "csi", SMALL)
+def test_channels_have_the_same_paths(traced: TraceResult, tmp_path: Path) -> None:
+    record = traced_floor_channels(tmp_path, SMALL)
     assert (record.name, record.task) == ("traced-floor-receivers-csi", "csi")
     assert record.observation.shape == (6, 12, 16)
-    assert record.frequencies_hz is not None
     np.testing.assert_allclose(record.frequencies_hz, CARRIER_HZ + np.arange(16) * 1.25e6)
     np.testing.assert_allclose(record.tx_pos_m, traced.tx_pos_m, rtol=1e-6)
     expected = csi(traced.paths, record.frequencies_hz)
     assert np.nanmax(np.abs(record.observation - expected)) < SINGLE * np.abs(expected).max()
     np.testing.assert_array_equal(np.isnan(record.observation), expected == 0)
-    assert record.official is not None
     assert [len(part) for part in record.official] == [8, 4]
-    before = (folder / "csi" / "params.json").stat().st_mtime_ns
-    np.testing.assert_array_equal(traced_floor_channels(folder / "csi", SMALL).observation, record.observation)
-    assert (folder / "csi" / "params.json").stat().st_mtime_ns == before
-    assert load(folder / "csi").observation.shape == (6, 12, 16)
-
-
-def test_splits_hold_out_receivers(record: Record) -> None:
-    splits = make_splits(record, "receiver")
-    assert [split.held_receivers for split in splits] == [(k,) for k in range(6)]
-    many = replace(
-        record,
-        receivers=tuple(replace(record.receivers[0], name=f"anchor{k}") for k in range(16)),
-        observation=np.zeros((16, 12), np.float32),
-    )
-    held = [split.held_receivers for split in make_splits(many, "receiver")]
-    assert sorted(sum(held, ())) == list(range(16))
-    assert [len(part) for part in held] == [4] * 4
-
-
-def test_names_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-    for kind in ("strengths", "channels"):
-        monkeypatch.setattr(f"wrf_mi.synthetic.traced_floor_{kind}", lambda progress, kind=kind: asked.append(kind))
-    load_record("traced-floor-receivers")
-    load_record("traced-floor-receivers-csi")
-    assert asked == ["strengths", "channels"]
+    before = (tmp_path / "params.json").stat().st_mtime_ns
+    assert_same(traced_floor_channels(tmp_path, SMALL), record)
+    assert (tmp_path / "params.json").stat().st_mtime_ns == before
+    assert load(tmp_path).observation.shape == (6, 12, 16)

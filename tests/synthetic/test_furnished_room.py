@@ -1,7 +1,5 @@
 """The furnished room at one carrier and at several: what is in it, rows and splits, and what a model is given."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.constants import speed_of_light
+from spectrum_records import assert_same
 from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.furnished import furnished_parts, measured_parts
 from wrf_mi_scenes.mitsuba_xml import write_scene
@@ -18,18 +17,7 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers import antenna_csi
 from wrf_mi.receivers.channel import array_channels, received_power
-from wrf_mi.synthetic import load_record, traced_room_bands
-from wrf_mi.synthetic.furnished_room import (
-    DEFAULT_BANDS,
-    MEASURED,
-    RECEIVERS,
-    RoomBands,
-    TracedRoom,
-    channels_at_carriers,
-    opaque_parts,
-    traced_room,
-    transmitters,
-)
+from wrf_mi.synthetic import furnished_room as furnished
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER
 from wrf_mi.synthetic.searches import searched_paths, set_scattering, trace_channels
 from wrf_mi.synthetic.stored import SCAN
@@ -38,51 +26,39 @@ from wrf_mi.tracing.paths.result import recompute
 from wrf_mi.tracing.search.devices import solid_around
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 
-SMALL = TracedRoom(train=6, test=2, rays=1 << 10, scattered_rays=1 << 8, depth=2, reflections=1)
+SMALL = furnished.TracedRoom(train=6, test=2, rays=1 << 10, scattered_rays=1 << 8, depth=2, reflections=1)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("room") / "data"
-    traced_room(folder, SMALL)
-    return folder
-
-
-def test_data_are_stored_and_reproducible(made: Path) -> None:
-    before = (made / "tx_pos.csv").stat().st_mtime_ns
-    record = traced_room(made, SMALL)
-    assert (made / "tx_pos.csv").stat().st_mtime_ns == before
-    assert record.official is not None
+def test_data_are_stored_and_reproducible(tmp_path: Path) -> None:
+    record = furnished.traced_room(tmp_path, SMALL)
+    before = (tmp_path / "tx_pos.csv").stat().st_mtime_ns
+    assert_same(furnished.traced_room(tmp_path, SMALL), record)
+    assert (tmp_path / "tx_pos.csv").stat().st_mtime_ns == before
     assert [len(part) for part in record.official] == [6, 2]
     assert record.observation.shape == (1, 8, 90, 360)
-    assert record.observation.min() == 0
-    assert record.observation.max() == 1
-    assert open_scene(made / MEASURED, FREQUENCY_HZ).objects.keys() == measured_parts(0.02, 1).keys()
-    moved = traced_room(made, replace(SMALL, seed=2))
-    assert not np.array_equal(record.tx_pos_m, moved.tx_pos_m)
-    back = traced_room(made, SMALL)
-    assert np.array_equal(record.observation, back.observation)
+    assert (record.observation.min(), record.observation.max()) == (0, 1)
+    measured = open_scene(tmp_path / furnished.MEASURED, FREQUENCY_HZ)
+    assert measured.objects.keys() == measured_parts(0.02, 1).keys()
+    assert not np.array_equal(record.tx_pos_m, furnished.traced_room(tmp_path, replace(SMALL, seed=2)).tx_pos_m)
+    assert_same(furnished.traced_room(tmp_path, SMALL), record)
 
 
 def test_measured_room_lacks_furniture_and_has_errors() -> None:
     full, bare = furnished_parts(), measured_parts(0.02, 1)
     assert {material for material, _ in bare.values()} == {"itu_concrete"}
     assert len({material for material, _ in full.values()}) > 5
-    off = [
-        bare[name][1].bounds[0, axis] - full[name][1].bounds[0, axis]
-        for name, axis in (("floor", 2), ("ceiling", 2), ("wall_west", 0), ("wall_north", 1))
-    ]
-    assert all(0 < abs(one) < 0.08 for one in off)  # four deviations
+    for name, axis in (("floor", 2), ("ceiling", 2), ("wall_west", 0), ("wall_north", 1)):
+        error_m = bare[name][1].bounds[0, axis] - full[name][1].bounds[0, axis]
+        assert 0 < abs(error_m) < 0.08  # four deviations
 
 
 def test_transmitters_are_clear_of_surfaces(room: Path) -> None:
     scene = open_scene(room, FREQUENCY_HZ)
-    positions, surfaces = transmitters(scene, TracedRoom(train=300, test=100)), scene_surfaces(scene)
+    positions = furnished.transmitters(scene, furnished.TracedRoom(train=300, test=100))
     assert positions.shape == (400, 3)
-    assert (positions[:, 2] >= 0.5).all()
-    assert (positions[:, 2] <= 2.0).all()
+    assert 0.5 <= positions[:, 2].min() < positions[:, 2].max() <= 2.0
     assert np.linalg.norm(positions - RECEIVER.position_m, axis=1).min() > 0.5
-    assert (solid_around(surfaces, positions) < 0).all()
+    assert (solid_around(scene_surfaces(scene), positions) < 0).all()
 
 
 @pytest.fixture(scope="module")
@@ -123,32 +99,16 @@ def test_scattered_waves_come_from_their_last_point(bare: Any) -> None:
     assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()  # vertices are float32
 
 
-SMALL_BANDS = RoomBands(
-    train=4,
-    test=2,
-    carriers_hz=(0.9e9, 5.8e9),
-    rows=2,
-    columns=3,
-    height=9,
-    width=36,
-    rays=1 << 10,
-    scattered_rays=1 << 8,
-    depth=2,
-    reflections=1,
-)
+SIZE = {"carriers_hz": (0.9e9, 5.8e9), "rows": 2, "columns": 3, "height": 9, "width": 36}
+SMALL_BANDS = furnished.RoomBands(**SIZE, train=4, test=2, rays=1 << 10, scattered_rays=1 << 8, depth=2, reflections=1)
 POSITIONS = np.array([[2.0, 3.0, 1.2], [4.5, 1.0, 1.7], [3.0, 5.2, 1.0], [7.6, 6.0, 1.3]])
 SINGLE = 1e-4
 """Gains are computed in single precision, once in the search and again at each carrier."""
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("bands") / "data"
-
-
-@pytest.fixture(scope="module")
-def record(folder: Path) -> Record:
-    return traced_room_bands(folder, SMALL_BANDS)
+def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    return furnished.traced_room_bands(tmp_path_factory.mktemp("bands") / "data", SMALL_BANDS)
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +118,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return work
 
 
-def test_rows_are_positions_times_carriers(record: Record, folder: Path) -> None:
+def test_rows_are_positions_times_carriers(record: Record) -> None:
     assert (record.name, record.task) == ("traced-room-bands", "spectrum")
     assert record.observation.shape == (2, 12, 9, 36)
     assert record.observation.min(axis=(2, 3)).max() == 0
@@ -168,72 +128,54 @@ def test_rows_are_positions_times_carriers(record: Record, folder: Path) -> None
     np.testing.assert_array_equal(record.tx_pos_m[::2], record.tx_pos_m[1::2])
     assert len(np.unique(record.tx_pos_m, axis=0)) == 6
     assert [len(receiver.array_m) for receiver in record.receivers] == [6, 6]
-    assert (folder / SCAN).is_file()
-    assert len(open_scene(folder / "room", 2.4e9).objects) == 8
-
-
-def test_arrays_face_the_room_and_have_no_grating_lobes() -> None:
-    ceiling, wall = (receiver.to_world for receiver in RECEIVERS)
-    np.testing.assert_allclose(ceiling[:, 2], [0, 0, -1], atol=1e-12)
-    np.testing.assert_allclose(wall[:, 1:], np.array([[0, 0, 1], [-1, 0, 0]]).T, atol=1e-12)
-    assert DEFAULT_BANDS.spacing_m < speed_of_light / max(DEFAULT_BANDS.carriers_hz) / 2
-
-
-def test_data_are_stored(record: Record, folder: Path) -> None:
-    before = (folder / "tx_pos.csv").stat().st_mtime_ns
-    again = traced_room_bands(folder, SMALL_BANDS)
-    assert (folder / "tx_pos.csv").stat().st_mtime_ns == before
-    np.testing.assert_array_equal(again.observation, record.observation)
-
-
-def test_splits_keep_positions_and_carriers_apart(record: Record) -> None:
-    assert record.carriers_hz is not None
+    assert Path(record.source, SCAN).is_file()
+    assert len(open_scene(Path(record.source, "room"), 2.4e9).objects) == 8
+    # No position is in both parts of the official split.
     (official,) = make_splits(record, "official", validation_fraction=0)
     places = [set(map(tuple, record.tx_pos_m[rows])) for rows in (official.all_train, official.test)]
     assert [len(part) for part in places] == [4, 2]
     assert not places[0] & places[1]
-    for split, carrier_hz in zip(make_splits(record, "frequency"), SMALL_BANDS.carriers_hz, strict=True):
-        assert (record.carriers_hz[split.test] == carrier_hz).all()
-        assert carrier_hz not in record.carriers_hz[split.all_train]
-        assert set(map(tuple, record.tx_pos_m[split.test])) == places[1]
-    assert [split.held_receivers for split in make_splits(record, "receiver")] == [(0,), (1,)]
+
+
+def test_arrays_face_the_room_and_have_no_grating_lobes() -> None:
+    ceiling, wall = (receiver.to_world for receiver in furnished.RECEIVERS)
+    np.testing.assert_allclose(ceiling[:, 2], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(wall[:, 1:], np.array([[0, 0, 1], [-1, 0, 0]]).T, atol=1e-12)
+    assert furnished.DEFAULT_BANDS.spacing_m < speed_of_light / max(furnished.DEFAULT_BANDS.carriers_hz) / 2
+
+
+def test_bands_are_stored(record: Record) -> None:
+    file = Path(record.source, "tx_pos.csv")
+    before = file.stat().st_mtime_ns
+    assert_same(furnished.traced_room_bands(record.source, SMALL_BANDS), record)
+    assert file.stat().st_mtime_ns == before
 
 
 def test_spectra_of_a_carrier_are_those_made_at_it_alone(record: Record, tmp_path: Path) -> None:
-    for number, carrier_hz in enumerate(SMALL_BANDS.carriers_hz):
-        alone = traced_room_bands(tmp_path / str(number), replace(SMALL_BANDS, carriers_hz=(carrier_hz,)))
-        np.testing.assert_array_equal(alone.frequencies_hz, [carrier_hz])
-        np.testing.assert_array_equal(alone.tx_pos_m, record.tx_pos_m[number::2])
-        np.testing.assert_array_equal(alone.observation, record.observation[:, number::2])
+    alone = furnished.traced_room_bands(tmp_path / "alone", replace(SMALL_BANDS, carriers_hz=(5.8e9,)))
+    np.testing.assert_array_equal(alone.frequencies_hz, [5.8e9])
+    np.testing.assert_array_equal(alone.tx_pos_m, record.tx_pos_m[1::2])
+    np.testing.assert_array_equal(alone.observation, record.observation[:, 1::2])
     assert not np.array_equal(record.observation[:, ::2], record.observation[:, 1::2])
-
-
-def channels(room: Path, searched_hz: float, carriers_hz: tuple[float, ...], options: tuple[Any, ...]) -> np.ndarray:
-    receiver = replace(RECEIVERS[1], array_m=planar_array(2, 2, 0.025))
-    scenes = [open_scene(room, hz) for hz in (searched_hz, *carriers_hz)]
-    return channels_at_carriers(scenes[1:], receiver, POSITIONS, scenes[0], options, opaque_parts())
 
 
 def test_channels_are_those_of_a_search_at_the_carrier(room: Path) -> None:
     """All kinds of path at the carrier of the search; at another one those that are not drawn at random."""
-    exact, rough = replace(SMALL_BANDS, depth=3, reflections=2).options(diffraction=True)
-    receiver, opaque = replace(RECEIVERS[1], array_m=planar_array(2, 2, 0.025)), opaque_parts()
-
-    def alone(carrier_hz: float, options: tuple[Any, ...]) -> np.ndarray:
-        scene = open_scene(room, carrier_hz)
-        return trace_channels(scene, receiver, POSITIONS, np.array([carrier_hz]), options, opaque)[..., 0]
-
-    for options, carrier_hz in (((exact, rough), 2.4e9), ((replace(exact, diffraction=False),), 5.8e9)):
-        found = channels(room, 2.4e9, (carrier_hz,), options)[..., 0]
-        expected = alone(carrier_hz, options)
-        assert np.abs(found - expected).max() < SINGLE * np.abs(expected).max()
+    exact, rough = SMALL_BANDS.options(diffraction=True)
+    receiver, opaque = replace(furnished.RECEIVERS[1], array_m=planar_array(2, 2, 0.025)), furnished.opaque_parts()
+    searched_at = open_scene(room, 2.4e9)
+    for options, hz in (((exact, rough), 2.4e9), ((replace(exact, diffraction=False),), 5.8e9)):
+        at_carrier = open_scene(room, hz)
+        reported = furnished.channels_at_carriers([at_carrier], receiver, POSITIONS, searched_at, options, opaque)
+        expected = trace_channels(at_carrier, receiver, POSITIONS, np.array([hz]), options, opaque)
+        assert np.abs(reported - expected).max() < SINGLE * np.abs(expected).max()
 
 
 def test_scattered_power_does_not_depend_on_the_carrier_of_the_search(tmp_path: Path) -> None:
     """A pane is nearly transparent at 5.8 GHz, so that a search there draws few of its scattered paths."""
     write_scene(tmp_path, {"pane": ("itu_glass", sheet(0, 0.0, (0.0, 6.0), (0.0, 3.0)))}, "test")
     carriers, options = (2.4e9, 5.8e9), TraceOptions(scattering=True, transmission=True, depth=1, rays=1 << 17)
-    receiver = replace(RECEIVERS[1], position_m=np.array([2.0, 3.0, 1.5]))
+    receiver = replace(furnished.RECEIVERS[1], position_m=np.array([2.0, 3.0, 1.5]))
     scenes = [open_scene(tmp_path, carrier_hz) for carrier_hz in carriers]
     power_db, counts = np.empty((2, 2)), []  # [search, carrier]
     for search, searched_at in enumerate(scenes):
@@ -245,10 +187,3 @@ def test_scattered_power_does_not_depend_on_the_carrier_of_the_search(tmp_path: 
     assert counts[0] > 2 * counts[1]
     # Sums of several hundred random paths of unequal power; without the probabilities of the draw 5.2 dB.
     assert np.abs(power_db[0] - power_db[1]).max() < 1
-
-
-def test_name_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-    monkeypatch.setattr("wrf_mi.synthetic.traced_room_bands", lambda progress: asked.append(progress))
-    load_record("traced-room-bands", progress=True)
-    assert asked == [True]

@@ -1,12 +1,10 @@
 """Meanings of columns, with the headers of public data sets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
+from changed_folders import refusal
 
-from wrf_mi.core import InputError
 from wrf_mi.datasets.tables.columns import Columns, find_columns, parsed_columns, unit_of
 from wrf_mi.datasets.tables.files import read_table
 
@@ -62,14 +60,11 @@ def test_ranges_belong_to_receivers_and_other_columns_are_kept(tmp_path: Path) -
     assert columns.kept == ["LOS APs"]
 
 
-def test_stated_columns_replace_guesses(tmp_path: Path) -> None:
+def test_stated_columns_and_patterns_replace_guesses(tmp_path: Path) -> None:
     header, row = "t,u,v,x,beacon,value", "0,1,2,3,b1,-60"
     columns = columns_of(tmp_path, header, row, "x=u,y=v,id=beacon,rssi=value,time=-")
     assert columns.of == {"x": "u", "y": "v", "id": "beacon", "rssi": "value"}
     assert columns.kept == ["t", "x"]
-
-
-def test_patterns_select_columns_of_strengths(tmp_path: Path) -> None:
     columns = columns_of(tmp_path, "x,y,A [dBm],B [dBm],noise_dbm", "0,1,-60,-70,-95", receivers=("? [dBm]",))
     assert columns.strengths == {"A [dBm]": "A", "B [dBm]": "B"}
 
@@ -85,14 +80,8 @@ def test_units_stand_at_the_end_of_names() -> None:
         ("x=east", (), r"line 1: no column east \(columns: x, y, p\); correct --columns"),
         ("", ("AP*",), r"no column of signal strengths among x, y, p; name it by"),
         ("", (), r"no column of signal strengths"),
+        *((text, (), r"--columns: .* give MEANING=COLUMN") for text in ("place=x", "x", "x=")),
     ],
 )
-def test_missing_columns_are_refused(stated: str, receivers: tuple[str, ...], message: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=message):
-        columns_of(tmp_path, "x,y,p", "0,1,55", stated, receivers)
-
-
-@pytest.mark.parametrize("text", ["place=x", "x", "x="])
-def test_meanings_that_are_unknown_are_refused(text: str) -> None:
-    with pytest.raises(InputError, match=r"--columns: .* give MEANING=COLUMN"):
-        parsed_columns(text)
+def test_other_columns_are_refused(stated: str, receivers: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    refusal(columns_of, tmp_path, "x,y,p", "0,1,55", stated, receivers, message)

@@ -1,13 +1,11 @@
 """Positions in metres of a local frame, headings, and rows of one place."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+from changed_folders import refusal
 
-from wrf_mi.core import InputError
 from wrf_mi.datasets.tables.places import find_frame, headings_rad, place_numbers, unit_scale
 
 pyproj = pytest.importorskip("pyproj")
@@ -48,20 +46,20 @@ def test_local_distances_are_those_on_the_ellipsoid(case: str) -> None:
     assert frame.facts()["local_crs"].startswith("+proj=aeqd +lon_0=-78.9")
 
 
-def test_latitude_before_longitude_is_swapped() -> None:
-    swapped = np.array([[40.7, -111.84], [40.701, -111.841]])
+def test_frames_are_told_from_the_numbers() -> None:
+    swapped = np.array([[40.7, -111.84], [40.701, -111.841]])  # latitude before longitude
     frame, _ = find_frame(swapped, False, "", 1.0, "")
     plain, _ = find_frame(swapped[:, ::-1], True, "", 1.0, "")
     np.testing.assert_allclose(frame.local_m(swapped), plain.local_m(swapped[:, ::-1]))
-
-
-def test_metres_of_a_map_projection_are_shifted() -> None:
-    utm = np.array([[684_321.5, 3_985_678.25], [684_400.5, 3_985_700.25]])
+    utm = np.array([[684_321.5, 3_985_678.25], [684_400.5, 3_985_700.25]])  # metres of a map projection
     frame, notes = find_frame(utm, False, "", 1.0, "")
     np.testing.assert_array_equal(frame.local_m(utm), [[1.5, 8.25], [80.5, 30.25]])
     assert "shifted by 684320, 3985670 m" in notes[0]
-    _, notes = find_frame(utm, True, "", 1.0, "")
-    assert "EPSG:3857" in notes[0]
+    assert "EPSG:3857" in find_frame(utm, True, "", 1.0, "")[1][0]
+    rng = np.random.default_rng(0)
+    for origin in ([0, 0], [5, 5], [15, 3], [-8, 2]):  # metres of a room
+        frame, _ = find_frame(rng.uniform(0, 3, (50, 2)) + origin, False, "", 1.0, "")
+        assert frame.crs == ""
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("mm", 0.001), ("ft", 0.3048), ("cm", 0.01), ("", 1.0)])
@@ -72,18 +70,9 @@ def test_units_and_plans_in_metres(unit: str, metres: float) -> None:
     assert notes == []
 
 
-def test_room_in_metres_is_not_taken_for_degrees() -> None:
-    rng = np.random.default_rng(0)
-    for origin in ([0, 0], [5, 5], [15, 3], [-8, 2]):
-        frame, _ = find_frame(rng.uniform(0, 3, (50, 2)) + origin, False, "", 1.0, "")
-        assert frame.crs == ""
-
-
 def test_unknown_units_and_systems_are_refused() -> None:
-    with pytest.raises(InputError, match="--units 'yard' is unknown; give one of m, mm"):
-        unit_scale("yard", "--units")
-    with pytest.raises(InputError, match="--crs: 'EPSG:0' is no coordinate reference system"):
-        find_frame(PLACE, False, "", 1.0, "EPSG:0")
+    refusal(unit_scale, "yard", "--units", "--units 'yard' is unknown; give one of m, mm")
+    refusal(find_frame, PLACE, False, "", 1.0, "EPSG:0", "--crs: 'EPSG:0' is no coordinate reference system")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Means of readings and their noise, numbers for "not heard", and networks of one radio."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -70,30 +68,22 @@ def test_numbers_for_not_heard_are_found(mark: float) -> None:
     assert notes == [f"{mark:g} is not heard: {np.count_nonzero(silent)} readings are empty fields"]
 
 
-def test_clipped_strengths_are_kept_and_named() -> None:
+def test_other_numbers_that_pile_up_are_kept() -> None:
     rng = np.random.default_rng(3)
-    dbm = np.maximum(np.round(rng.normal(-80, 8, (1000, 1))), -87)
-    part, notes, numbers = without_not_heard(readings(dbm), None)
+    clipped = np.maximum(np.round(rng.normal(-80, 8, (1000, 1))), -87)
+    part, notes, numbers = without_not_heard(readings(clipped), None)
     assert (len(part.dbm), numbers) == (1000, [])
     assert "--not-heard -87 leaves it out" in notes[0]
-    assert len(without_not_heard(readings(dbm), [-87.0])[0].dbm) == np.count_nonzero(dbm > -87)
-
-
-def test_strengths_of_one_receiver_that_pile_up_at_a_customary_number_are_kept() -> None:
-    rng = np.random.default_rng(6)
+    assert len(without_not_heard(readings(clipped), [-87.0])[0].dbm) == np.count_nonzero(clipped > -87)
+    # A customary number that one receiver of several has often, and measured strengths.
     weak = np.concatenate([np.full(50, -100.0), np.repeat(np.arange(-99.0, -89), 9)])
     dbm = np.concatenate([weak, np.round(rng.normal(-70, 5, 3000))])
     both = Readings(("weak", "strong"), np.arange(len(dbm)), np.repeat([0, 1], [len(weak), 3000]), dbm)
     alone = Readings(("weak",), np.arange(len(weak)), np.zeros(len(weak), int), weak)
     assert without_not_heard(alone, None)[2] == [-100]
     assert without_not_heard(both, None)[2] == []
-
-
-def test_measured_strengths_have_no_such_number() -> None:
-    rng = np.random.default_rng(4)
     for _ in range(20):
-        dbm = np.round(rng.normal(-70, 9, (200, 4)))
-        assert without_not_heard(readings(dbm, 4), None)[2] == []
+        assert without_not_heard(readings(np.round(rng.normal(-70, 9, (200, 4))), 4), None)[2] == []
 
 
 def test_networks_of_one_radio_are_found_and_merged() -> None:
