@@ -1,4 +1,4 @@
-"""Drawings of the stage pages: the graph of the package with one stage marked, and what that stage does.
+"""Drawings of ``docs/pipeline.md``: the graph of the stages with one stage marked, and the steps of that stage.
 
 ``python docs/_extensions/stage_drawings.py`` writes ``docs/images/stages/*.svg``; a test compares them with this file.
 """
