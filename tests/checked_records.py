@@ -1,7 +1,5 @@
 """Made-up records with what `wrf_mi.checking` looks for: lines of sight, distance laws, headings along a path."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -14,59 +12,43 @@ UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 WALL = np.array([0.5, 0.5, 0.5, 0.5])
 """Orientation of an array on the wall x = 0: its normal, z, is the world's x axis."""
 SIZE = (30, 120)
+CARRIER_HZ = np.array([2.44e9])
 
 
-def spectra(
-    rows: int = 200,
-    seed: int = 0,
-    direct: float = 1.0,
-    reflectors: int = 2,
-    spread_m: float = 4.0,
-    orientation: np.ndarray = WALL,
-) -> Record:
+def spectra(rows=200, seed=0, direct=1.0, reflectors=2, spread_m=4.0, orientation=WALL) -> Record:
     """Spectra of a 4 x 4 array on the wall of a hall: the direct path, and paths of reflectors that do not move."""
     rng = np.random.default_rng(seed)
     receiver = Receiver("gateway1", np.array([0.0, 4.0, 1.5]), orientation)
     tx = rng.uniform([1.0, 4.0 - spread_m, 0.3], [1.0 + 2 * spread_m, 4.0 + spread_m, 2.5], (rows, 3))
     to_tx = (tx - receiver.position_m) @ receiver.to_world
-    to_tx /= np.linalg.norm(to_tx, axis=1, keepdims=True)
     fixed = rng.normal(size=(reflectors, 3))
-    fixed *= np.sign(fixed[:, 2:]) / np.linalg.norm(fixed, axis=1, keepdims=True)
-    # Half a wavelength between the elements.
-    steering = np.exp(1j * np.pi * _elements() @ _plane(pixel_directions(*SIZE).reshape(-1, 3)))
-    images = []
-    for way in to_tx:
-        phases = np.exp(2j * np.pi * rng.uniform(size=1 + reflectors))
-        gains = np.concatenate([[direct], rng.uniform(0.2, 0.5, reflectors)]) * phases
-        signals = np.exp(1j * np.pi * _elements() @ _plane(np.concatenate([way[None], fixed]))) @ gains
-        image = np.abs(steering.conj().T @ signals).reshape(SIZE)
-        images.append((image - image.min()) / np.ptp(image))
-    return Record(
-        name="hall",
-        task="spectrum",
-        tx_pos_m=tx,
-        receivers=(receiver,),
-        observation=np.array(images, np.float32)[None],
-        official=(np.arange(rows - 20), np.arange(rows - 20, rows)),
-        frequencies_hz=np.array([2.44e9]),
-    )
+    fixed *= np.sign(fixed[:, 2:])
+    ways = np.concatenate([to_tx[:, None], np.broadcast_to(fixed, (rows, reflectors, 3))], axis=1)
+    phases = np.exp(2j * np.pi * rng.uniform(size=(rows, 1 + reflectors)))
+    gains = np.column_stack([np.full(rows, direct), rng.uniform(0.2, 0.5, (rows, reflectors))]) * phases
+    signals = (_steering(ways) * gains[..., None]).sum(axis=1)
+    images = np.abs(signals @ _steering(pixel_directions(*SIZE).reshape(-1, 3)).conj().T)
+    images = (images - images.min(axis=1, keepdims=True)) / np.ptp(images, axis=1, keepdims=True)
+    observed = images.astype(np.float32).reshape(1, rows, *SIZE)
+    return Record("hall", "spectrum", tx, (receiver,), observed, official=_split(rows), frequencies_hz=CARRIER_HZ)
 
 
-def _elements() -> np.ndarray:
-    return np.array([np.ravel(axis) for axis in np.mgrid[:4, :4]]).T
+def _split(rows: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.arange(rows - 20), np.arange(rows - 20, rows)
 
 
-def _plane(directions: np.ndarray) -> np.ndarray:
-    """Components [2, n] of directions in the plane of the array."""
-    return directions[:, :2].T
+def _steering(directions: np.ndarray) -> np.ndarray:
+    """Phase factors [..., 16] of elements half a wavelength apart, of directions in the array's frame."""
+    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    elements = np.array([np.ravel(axis) for axis in np.mgrid[:4, :4]])
+    return np.exp(1j * np.pi * directions[..., :2] @ elements)
 
 
-def with_images(record: Record, change: Callable[[np.ndarray], np.ndarray]) -> Record:
-    """The record with changed observations."""
+def with_images(record: Record, change: Callable) -> Record:
     return replace(record, observation=np.ascontiguousarray(change(record.observation)))
 
 
-def with_orientations(record: Record, change: Callable[[np.ndarray], np.ndarray]) -> Record:
+def with_orientations(record: Record, change: Callable) -> Record:
     """The record with changed orientations of its receivers."""
     turned = (replace(receiver, orientation_xyzw=change(receiver.orientation_xyzw)) for receiver in record.receivers)
     return replace(record, receivers=tuple(turned))
@@ -81,16 +63,9 @@ def strengths(rows: int = 120, receivers: int = 4, seed: int = 0, noise_db: floa
     way = np.diff(tx, axis=0, append=tx[-1:] + (tx[-1:] - tx[-2:-1]))
     distance = np.linalg.norm(tx[None] - places[:, None], axis=-1)
     levels = -40 - 20 * np.log10(distance) + rng.normal(0, noise_db, distance.shape)
-    return Record(
-        name="walk",
-        task="rssi",
-        tx_pos_m=tx,
-        receivers=tuple(Receiver(f"anchor{k + 1}", place, UPRIGHT) for k, place in enumerate(places)),
-        observation=levels.astype(np.float32),
-        official=(np.arange(rows - 20), np.arange(rows - 20, rows)),
-        frequencies_hz=np.array([2.44e9]),
-        tx_heading_rad=np.arctan2(way[:, 1], way[:, 0]),
-    )
+    anchors = tuple(Receiver(f"anchor{k + 1}", place, UPRIGHT) for k, place in enumerate(places))
+    facts = {"official": _split(rows), "frequencies_hz": CARRIER_HZ, "tx_heading_rad": np.arctan2(way[:, 1], way[:, 0])}
+    return Record("walk", "rssi", tx, anchors, levels.astype(np.float32), **facts)
 
 
 def channels(rows: int = 60, seed: int = 0) -> Record:
@@ -101,11 +76,5 @@ def channels(rows: int = 60, seed: int = 0) -> Record:
     distance = np.linalg.norm(tx - receiver.position_m, axis=1)
     noise = 0.1 * (rng.normal(size=rows) + 1j * rng.normal(size=rows))
     values = 0.01 / distance * (np.exp(-50j * distance) + noise)
-    return Record(
-        name="room",
-        task="csi",
-        tx_pos_m=tx,
-        receivers=(receiver,),
-        observation=values.astype(np.complex64)[None, :, None],
-        frequencies_hz=np.array([2.4e9]),
-    )
+    observed = values.astype(np.complex64)[None, :, None]
+    return Record("room", "csi", tx, (receiver,), observed, frequencies_hz=np.array([2.4e9]))

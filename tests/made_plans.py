@@ -1,7 +1,5 @@
 """A storey with known walls, and what a robot with a LiDAR would see of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import shapely
 
@@ -11,26 +9,19 @@ WIDTH_M, DEPTH_M, INNER_M = 6.0, 4.0, 3.5
 DOOR_M = (1.0, 1.9)
 """Along y, in the wall between the two rooms."""
 
-TWO_ROOMS_M = np.array(
-    [
-        [[0, 0], [WIDTH_M, 0]],
-        [[WIDTH_M, 0], [WIDTH_M, DEPTH_M]],
-        [[WIDTH_M, DEPTH_M], [0, DEPTH_M]],
-        [[0, DEPTH_M], [0, 0]],
-        [[INNER_M, 0], [INNER_M, DOOR_M[0]]],
-        [[INNER_M, DOOR_M[1]], [INNER_M, DEPTH_M]],
-    ],
-    float,
-)
 L_ROOM_M = np.array([[0, 0], [5, 0], [5, 2], [2.5, 2], [2.5, 4.5], [0, 4.5], [0, 0]], float)
 """Vertices of a room without any symmetry."""
 POSES_M = np.array([[1.0, 1.0], [2.5, 3.0], [4.5, 1.4], [5.0, 3.0]])
 
 
 def box(x, y, width, depth):
-    """The four sides of a box [4, 2, 2], a piece of furniture."""
+    """The four sides of a box [4, 2, 2], a piece of furniture or a storey."""
     corners = np.array([[x, y], [x + width, y], [x + width, y + depth], [x, y + depth], [x, y]], float)
     return np.stack([corners[:-1], corners[1:]], axis=1)
+
+
+INNER_WALL_M = [[[INNER_M, 0], [INNER_M, DOOR_M[0]]], [[INNER_M, DOOR_M[1]], [INNER_M, DEPTH_M]]]
+TWO_ROOMS_M = np.concatenate([box(0, 0, WIDTH_M, DEPTH_M), INNER_WALL_M])
 
 
 def turn(points_m, degrees, shift_m=(0.0, 0.0)):

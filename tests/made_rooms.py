@@ -1,13 +1,13 @@
 """Small rooms of known planes, and points on them as a scanner would see or measure them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 import trimesh
 from wrf_mi_scenes.build_laboratory import box, sheet, wall
+from wrf_mi_scenes.mitsuba_xml import scene_xml
 
 Mesh = trimesh.Trimesh
 
@@ -21,16 +21,13 @@ def l_shape(z: float = 2.7) -> list[Mesh]:
     """A room of 6 x 5 m less a quarter of 3 x 2.5 m."""
     flat = [(0.0, 6.0), (0.0, 2.5)], [(0.0, 3.0), (2.5, 5.0)]
     parts = [sheet(2, h, *span) for h in (0.0, z) for span in flat]
-    up = (0.0, z)
-    parts += [
-        sheet(0, 0.0, (0.0, 5.0), up),
-        sheet(1, 0.0, (0.0, 6.0), up),
-        sheet(0, 6.0, (0.0, 2.5), up),
-        sheet(1, 2.5, (3.0, 6.0), up),
-        sheet(0, 3.0, (2.5, 5.0), up),
-        sheet(1, 5.0, (0.0, 3.0), up),
+    across_x, across_y = (
+        {0.0: (0.0, 5.0), 6.0: (0.0, 2.5), 3.0: (2.5, 5.0)},
+        {0.0: (0.0, 6.0), 2.5: (3.0, 6.0), 5.0: (0.0, 3.0)},
+    )
+    return parts + [
+        sheet(k, at, span, (0.0, z)) for k, of in enumerate((across_x, across_y)) for at, span in of.items()
     ]
-    return parts
 
 
 def attic(x: float = 5.0, y: float = 4.0, low: float = 2.2, high: float = 3.4) -> list[Mesh]:
@@ -70,14 +67,23 @@ def sampled(
 
 def scene_file(folder: Path, parts: list[Mesh]) -> Path:
     """The parts as a Mitsuba scene file."""
-    from wrf_mi_scenes.mitsuba_xml import scene_xml
-
     (folder / "meshes").mkdir(parents=True, exist_ok=True)
     names = [f"part_{i}" for i in range(len(parts))]
     for name, mesh in zip(names, parts, strict=True):
         mesh.export(folder / "meshes" / f"{name}.ply", vertex_normal=False)
     (folder / "room.xml").write_text(scene_xml(dict.fromkeys(names, "itu_concrete")), encoding="utf-8")
     return folder / "room.xml"
+
+
+def write_las(file: Path, points: np.ndarray, scale: float = 1e-3, vlrs: Any = (), **version: Any) -> Path:
+    """Points in steps of a scale, with records on their coordinates."""
+    header = laspy.LasHeader(**({"point_format": 0, "version": "1.2"} | version))
+    header.scales, header.offsets = np.full(3, scale), np.floor(points.min(axis=0))
+    header.vlrs.extend(vlrs)
+    cloud = laspy.LasData(header)
+    cloud.xyz = points
+    cloud.write(file)
+    return file
 
 
 def by_kind(surfaces: list[Any]) -> dict[str, list[Any]]:

@@ -1,7 +1,5 @@
 """The report of a data set: faults by kind, suspicions by name, and data of every form."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -21,11 +19,11 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     return write_spectrum_folder(tmp_path / "made-up", make_record())
 
 
-def test_correct_data(folder: Path, tmp_path: Path, one_gateway: Record, two_gateways: Record) -> None:
+def test_correct_data(folder, tmp_path, one_gateway, two_gateways):
     for dataset in (folder, str(folder), write_flat(tmp_path / "a"), write_plain_flat(tmp_path / "b")):
         report = check_data(dataset)
         assert (report.ok, report.faults, report.suspicions) == (True, (), ())
@@ -36,7 +34,7 @@ def test_correct_data(folder: Path, tmp_path: Path, one_gateway: Record, two_gat
         assert (report.suspicions, report.record) == ((), record)
 
 
-def test_faults_are_named_by_file_and_row_and_counted(folder: Path) -> None:
+def test_faults_are_named_by_file_and_row_and_counted(folder):
     lines = (folder / "tx_pos.csv").read_text().splitlines()
     (folder / "tx_pos.csv").write_text("\n".join([lines[0], *(f"here,{line}" for line in lines[1:])]))
     (folder / "train_index.txt").write_text("1\n2\nthree\n")
@@ -45,29 +43,22 @@ def test_faults_are_named_by_file_and_row_and_counted(folder: Path) -> None:
     report = check_data(folder)
     assert (report.ok, report.record, report.suspicions) == (False, None, ())
     assert len(report.faults) == 12 + 2 + 1
+    text = "4 fields, but the header has 3; correct or remove the row"
+    image = "missing (10 images for 12 rows of tx_pos.csv); add the image or remove the row"
     assert report.lines() == [
-        *(
-            f"fault: tx_pos.csv, row {row}: 4 fields, but the header has 3; correct or remove the row"
-            for row in range(1, 11)
-        ),
+        *(f"fault: tx_pos.csv, row {row}: {text}" for row in range(1, 11)),
         "fault: tx_pos.csv: 2 more of this kind, up to row 12; correct or remove the row",
-        *(
-            f"fault: spectrum/{row:05d}.png, row {row}: missing (10 images for 12 rows of tx_pos.csv); "
-            "add the image or remove the row"
-            for row in (3, 4)
-        ),
+        *(f"fault: spectrum/{row:05d}.png, row {row}: {image}" for row in (3, 4)),
         "fault: train_index.txt, line 3: 'three' is not a whole number; correct it",
         f"{folder}: 15 faults; suspicions are looked for when there is none",
     ]
-    assert len(report.lines(most=2)) == 2 + 1 + 2 + 1 + 1
-    assert len(report.lines(most=100)) == 15 + 1
+    assert [len(report.lines(most=most)) for most in (2, 100)] == [2 + 1 + 2 + 1 + 1, 15 + 1]
     plain = report.as_dict()
     assert (plain["ok"], plain["rows"], len(plain["faults"])) == (False, None, 15)
-    text = "4 fields, but the header has 3; correct or remove the row"
     assert plain["faults"][1] == {"file": str(folder / "tx_pos.csv"), "place": "row 2", "row": 2, "text": text}
 
 
-def test_images_of_one_kind_are_counted_together(folder: Path) -> None:
+def test_images_of_one_kind_are_counted_together(folder):
     for image in (folder / "spectrum").iterdir():
         image.write_bytes(b"no image")
     *lines, summary = check_data(folder).lines()
@@ -77,40 +68,41 @@ def test_images_of_one_kind_are_counted_together(folder: Path) -> None:
     assert "12 faults" in summary
 
 
-def test_parts_that_do_not_fit_are_faults() -> None:
+def test_faults_of_parts_and_files_are_named_from_the_folder_of_the_data(tmp_path):
     record = strengths()
     report = check_data(replace(record, std=np.ones(3)))
     assert not report.ok
     assert "give one for each receiver and row" in report.lines()[0]
     assert report.as_dict()["faults"][0]["file"] is None
+    faults = (DataFault(tmp_path / "a" / "b.csv", "x; y", row=1), DataFault(tmp_path / "c.png", "x; z"))
+    lines = DataReport("set", str(tmp_path), None, faults, ()).lines()
+    assert lines[:2] == ["fault: a/b.csv, row 1: x; y", "fault: c.png: x; z"]
+    (tmp_path / "a").mkdir()
+    lines = DataReport("set", str(tmp_path / "a"), None, faults, ()).lines()
+    assert lines[1] == f"fault: {tmp_path}/c.png: x; z"
 
 
-def test_suspicions_have_names_and_can_be_ignored() -> None:
+def test_suspicions_have_names_and_can_be_ignored():
     record = strengths()
     wrong = replace(record, observation=-record.observation, tx_pos_m=1000 * record.tx_pos_m)
     report = check_data(wrong)
-    assert [one.name for one in report.suspicions] == ["strengths", "positions"]
-    assert [line.partition(":")[0] for line in report.lines()] == [
-        "suspicion strengths",
-        "suspicion positions",
-        "walk",
-    ]
+    names = ["strengths", "positions"]
+    assert [one.name for one in report.suspicions] == [one["name"] for one in report.as_dict()["suspicions"]] == names
+    assert [line.partition(":")[0] for line in report.lines()] == [*(f"suspicion {name}" for name in names), "walk"]
     assert report.lines()[-1] == "walk: no fault, 2 suspicions"
-    assert [one["name"] for one in report.as_dict()["suspicions"]] == ["strengths", "positions"]
     assert [one.name for one in check_data(wrong, ignore=["strengths"]).suspicions] == ["positions"]
     with pytest.raises(InputError, match=r"suspicion 'strength': unknown; known are headings, positions, "):
         check_data(wrong, ignore=["strength"])
-
-
-def test_a_wrong_unit_hides_what_follows_from_it() -> None:
-    """Directions and distances mean nothing where transmitters alone are in millimetres."""
-    hall = spectra()
+    hall = spectra()  # directions and distances mean nothing where transmitters alone are in millimetres
     wrong = replace(hall, tx_pos_m=1000 * (hall.tx_pos_m - [20, 0, 0]))
     assert [one.name for one in check_data(wrong).suspicions] == ["positions"]
     assert [one.name for one in check_data(wrong, ignore=["positions"]).suspicions] == ["orientation"]
+    text = (CHECKOUT / "docs" / "data.md").read_text(encoding="utf-8")
+    section = text.partition("## Checks")[2].partition("\n## ")[0]
+    assert re.findall(r"^\| `([a-z-]+)` \|", section, re.MULTILINE) == list(SUSPICIONS)
 
 
-def test_data_sets_that_do_not_exist_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_sets_that_do_not_exist_are_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("WRF_MI_DATA", str(tmp_path / "nothing"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "nothing"))
     for name, message in (
@@ -153,22 +145,7 @@ def odd_records() -> dict[str, Record]:
 
 
 @pytest.mark.parametrize("case", odd_records())
-def test_odd_data_are_checked_without_an_error(case: str) -> None:
+def test_odd_data_are_checked_without_an_error(case):
     report = check_data(odd_records()[case])
     assert isinstance(report, DataReport)
     assert {one.name for one in report.suspicions} <= set(SUSPICIONS)
-
-
-def test_the_document_has_a_row_for_each_suspicion() -> None:
-    text = (CHECKOUT / "docs" / "data.md").read_text(encoding="utf-8")
-    section = text.partition("## Checks")[2].partition("\n## ")[0]
-    assert re.findall(r"^\| `([a-z-]+)` \|", section, re.MULTILINE) == list(SUSPICIONS)
-
-
-def test_files_are_named_from_the_folder_of_the_data(tmp_path: Path) -> None:
-    faults = (DataFault(tmp_path / "a" / "b.csv", "x; y", row=1), DataFault(tmp_path / "c.png", "x; z"))
-    lines = DataReport("set", str(tmp_path), None, faults, ()).lines()
-    assert lines[:2] == ["fault: a/b.csv, row 1: x; y", "fault: c.png: x; z"]
-    (tmp_path / "a").mkdir()
-    lines = DataReport("set", str(tmp_path / "a"), None, faults, ()).lines()
-    assert lines[1] == f"fault: {tmp_path}/c.png: x; z"

@@ -1,10 +1,7 @@
-"""Numbers for "not heard", zeros and nearly silent receivers are suspected, measured strengths are not."""
-
-from __future__ import annotations
+"""Repeated rows, numbers for "not heard" and nearly silent receivers are suspected, measured strengths are not."""
 
 import logging
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,11 +13,108 @@ from made_building import TRAINED, building, silent_in
 from scipy.stats import truncnorm
 
 from wrf_mi.checking import check_data
-from wrf_mi.checking.rows import few_rows, not_heard
+from wrf_mi.checking.rows import (
+    constant_observations,
+    few_rows,
+    named_rows,
+    not_heard,
+    repeated_observations,
+    repeated_rows,
+    single_position,
+)
 from wrf_mi.core import Record
 from wrf_mi.datasets import write_ble_folder
 from wrf_mi.datasets.sentinels import suspicious_values
 from wrf_mi.runs.api import train
+
+
+def taken(record: Record, rows: np.ndarray) -> Record:
+    """The record with some of its rows; the official split stays that of the numbers."""
+    heading = None if record.tx_heading_rad is None else record.tx_heading_rad[rows]
+    return replace(
+        record, tx_pos_m=record.tx_pos_m[rows], observation=record.observation[:, rows], tx_heading_rad=heading
+    )
+
+
+def test_repeated_rows_are_named():
+    for record in (strengths(), channels(), spectra(60)):
+        for check in (repeated_rows, repeated_observations, constant_observations, single_position):
+            assert list(check(record)) == []
+        rows = np.arange(len(record))
+        rows[[7, 9, 30]] = [2, 2, 29]
+        ((name, text),) = repeated_rows(taken(record, rows))
+        assert name == "repeated-rows"
+        assert text.startswith(f"3 of {len(record)} rows repeat an earlier row, observation included: rows 8, 10, 31;")
+    assert named_rows(np.array([0])) == "row 1"
+    assert named_rows(np.arange(13)) == "rows 1, 2, 3, 4, 5, 6, 7, 8, 9, 10 and 3 more"
+
+
+def test_rows_at_one_place_and_few_strengths_in_whole_decibels_are_no_repetition():
+    """A robot that stands still, or turns."""
+    record = strengths()
+    rows = np.arange(len(record)) // 3 * 3
+    still = replace(record, tx_pos_m=record.tx_pos_m[rows])
+    assert list(repeated_rows(still)) == []
+    turning = taken(record, rows)
+    assert [name for name, _ in repeated_rows(turning)] == ["train-test", "repeated-rows"]
+    assert list(repeated_rows(replace(turning, tx_heading_rad=np.arange(len(record)) * 0.01))) == []
+    record = taken(strengths(receivers=3), np.arange(120) // 2 * 2)
+    assert list(repeated_rows(record)) == []
+    four = taken(strengths(receivers=4), np.arange(120) // 2 * 2)
+    assert list(repeated_rows(four)) != []
+    observation = four.observation.copy()
+    observation[0] = np.nan  # three that received
+    assert list(repeated_rows(replace(four, observation=observation))) == []
+
+
+def test_test_rows_among_training_rows_are_named_once():
+    record = strengths()
+    rows = np.arange(len(record))
+    rows[[105, 119]] = [3, 50]
+    ((name, text),) = repeated_rows(taken(record, rows))
+    assert name == "train-test"
+    again = "2 of 20 test rows are training rows too, observation included: rows 106, 120"
+    assert text == f"{again}; remove them from one of the two"
+    rows[8] = 7
+    assert [name for name, _ in repeated_rows(taken(record, rows))] == ["train-test", "repeated-rows"]
+    rows = np.arange(len(record))
+    rows[119] = 110  # within the test rows
+    assert [name for name, _ in repeated_rows(taken(record, rows))] == ["repeated-rows"]
+
+
+def test_copies_of_observations_are_named():
+    for record in (channels(), spectra(60)):
+        observation = record.observation.copy()
+        observation[:, [4, 5]] = observation[:, [1]]
+        ((name, text),) = repeated_observations(replace(record, observation=observation))
+        assert name == "repeated-observations"
+        assert "2 of 60 rows have the observation of an earlier row at another position: rows 5, 6;" in text
+    observation = strengths().observation.copy()
+    observation[:, 4] = observation[:, 1]
+    assert list(repeated_observations(replace(strengths(), observation=observation))) == []
+
+
+def test_constant_receivers_blank_spectra_and_single_positions_are_named():
+    record = strengths()
+    observation = record.observation.copy()
+    observation[2] = -70
+    observation[2, :5] = np.nan
+    ((name, text),) = constant_observations(replace(record, observation=observation))
+    assert (name, text.partition(":")[0]) == ("constant", "receiver anchor3")
+    images = spectra(40)
+    same = replace(images, observation=np.repeat(images.observation[:, :1], 40, axis=1))
+    assert [name for name, _ in constant_observations(same)] == ["constant"]
+    assert list(repeated_observations(same)) == []  # reported as constant
+    blank = images.observation.copy()
+    blank[0, [3, 8]] = 0.5
+    ((_, text),) = constant_observations(replace(images, observation=blank))
+    assert "spectra of a single grey value in rows 4, 9;" in text
+    still = replace(record, tx_pos_m=np.repeat(record.tx_pos_m[3:4], len(record), axis=0))
+    ((name, text),) = single_position(still)
+    assert name == "single-position"
+    assert text.startswith("all 120 transmitters are at (")
+    assert list(single_position(replace(record, tx_pos_m=np.full((120, 3), np.nan)))) == []
+
 
 DRAWS = np.random.default_rng(0)
 SENTINELS = (-999.0, -200.0, -127.0, -110.0, -101.0, -100.0, -1.0, 0.0, 1.0, 100.0, 127.0)
@@ -39,9 +133,7 @@ def marked(share: float, mark: float, *receivers: int, whole_db: bool = True) ->
 @pytest.mark.parametrize("share", [0.04, 0.3, 0.6, 0.9])
 @pytest.mark.parametrize("mark", SENTINELS)
 @pytest.mark.parametrize("whole_db", [True, False])
-def test_numbers_for_not_heard_are_named_with_receiver_share_and_rows(
-    mark: float, share: float, whole_db: bool
-) -> None:
+def test_numbers_for_not_heard_are_named_with_receiver_share_and_rows(mark, share, whole_db):
     record = marked(share, mark, 1, whole_db=whole_db)
     rows, count = len(record), int((record.observation[1] == mark).sum())
     ((name, text),) = list(not_heard(record))
@@ -50,48 +142,47 @@ def test_numbers_for_not_heard_are_named_with_receiver_share_and_rows(
     assert f": stairs {100 * count / rows:.2g} % ({count} of {rows} rows); leave the field empty" in text
 
 
-def test_a_number_that_each_receiver_has_once_shows_in_all_together() -> None:
-    record = building()
+def test_numbers_of_several_receivers_are_named_together_and_several_numbers_each():
+    once = building()
     for receiver in range(3):
-        record.observation[receiver, 7 * receiver] = -100
-    ((_, text),) = list(not_heard(record))
+        once.observation[receiver, 7 * receiver] = -100
+    ((_, text),) = list(not_heard(once))
     assert text.startswith("-100 dBm, apart from")
     assert "hall 1.9 % (1 of 52 rows), stairs 1.9 % (1 of 52 rows), lab 1.9 % (1 of 52 rows)" in text
-
-
-@pytest.mark.parametrize("mark", [-200, 0, 100])
-def test_a_receiver_that_states_it_in_every_row_is_named_with_the_others(mark: float) -> None:
-    record = marked(0.3, mark, 0)
-    record.observation[2] = mark
-    ((_, text),) = list(not_heard(record))
-    assert "hall 31 % (16 of 52 rows), lab 100 % (52 of 52 rows)" in text
-
-
-def test_several_numbers_are_named_each() -> None:
+    for mark in (-200, 0, 100):
+        record = marked(0.3, mark, 0)
+        record.observation[2] = mark  # in every row
+        ((_, text),) = list(not_heard(record))
+        assert "hall 31 % (16 of 52 rows), lab 100 % (52 of 52 rows)" in text
     record = marked(0.2, -200, 0)
     record.observation[1, :9] = 100
     record.observation[2, ::5] = 0
-    texts = [text.partition(" dBm")[0] for _, text in not_heard(record)]
-    assert texts == ["-200", "0", "100"]
+    assert [text.partition(" dBm")[0] for _, text in not_heard(record)] == ["-200", "0", "100"]
 
 
-def test_strengths_clipped_at_the_sensitivity_are_told_from_marks() -> None:
+def test_strengths_clipped_at_the_sensitivity_and_nearly_silent_receivers_are_named():
     record = building()
     observed = np.round(record.observation)
     floor_dbm = np.sort(observed[0])[25]
     observed[0] = np.maximum(observed[0], floor_dbm)
     ((name, text),) = list(not_heard(replace(record, observation=observed)))
     assert name == "not-heard"
-    assert text.startswith(
-        f"{floor_dbm:g} dBm, far more often than the strengths next to it: clipped at the sensitivity"
-    )
-    assert "hall" in text
-    assert "stairs" not in text
+    begin = f"{floor_dbm:g} dBm, far more often than the strengths next to it: clipped at the sensitivity"
+    assert text.startswith(begin)
+    assert ("hall" in text, "stairs" in text) == (True, False)
+    without_sign = replace(record, observation=-record.observation)  # a suspicion of its own
+    assert list(not_heard(without_sign)) == []
+    assert list(few_rows(building(attic=(1, 2, 3, 4, 5)))) == []
+    ((name, text),) = list(few_rows(building(attic=(3, 45, 46), cellar=())))
+    assert name == "few-rows"
+    assert text.startswith("fewer than 5 training rows were received by attic (1), cellar (0): fits predict these")
+    ((_, text),) = list(few_rows(silent_in(building(), list(range(TRAINED)), "hall", "stairs", "lab")))
+    assert "nothing was received in the training rows by any receiver" in text
 
 
 @settings(deadline=None, max_examples=150)
 @given(st.integers(0, 10**6), st.floats(2, 12), st.sampled_from([0.0, 0.1, 0.5, 1.0]), st.sampled_from([60, 300, 2000]))
-def test_quantised_strengths_are_seldom_suspected(seed: int, spread_db: float, step_db: float, rows: int) -> None:
+def test_quantised_strengths_are_seldom_suspected(seed, spread_db, step_db, rows):
     """Of twenty receivers, which a whole building may have, none or one."""
     values = np.random.default_rng(seed).normal(-65, spread_db, (20, rows))
     values = step_db * np.round(values / step_db) if step_db else values
@@ -108,41 +199,22 @@ def test_quantised_strengths_are_seldom_suspected(seed: int, spread_db: float, s
     ],
     ids=["standing still", "empty below the sensitivity", "path-loss law", "fading"],
 )
-def test_measured_strengths_are_not_suspected(values: np.ndarray) -> None:
+def test_measured_strengths_are_not_suspected(values):
     assert suspicious_values(values) == []
 
 
-def test_strengths_without_sign_are_of_another_scale() -> None:
-    record = building()
-    assert list(not_heard(replace(record, observation=-record.observation))) == []
-
-
-def test_channels_and_spectra_of_zeros_are_named() -> None:
+def test_channels_and_spectra_of_zeros_are_named():
     for record, what in ((channels(), "channels"), (spectra(rows=30), "spectra")):
         assert list(not_heard(record)) == []
         observation = record.observation.copy()
         observation[0, [2, 5, 9]] = 0
-        silent = replace(record, observation=observation)
-        ((name, text),) = list(not_heard(silent))
+        ((name, text),) = list(not_heard(replace(record, observation=observation)))
         share = f"{300 / len(record):.2g} % of the rows (3 of {len(record)}): rows 3, 6, 10"
-        assert (name, text.partition(";")[0]) == (
-            "not-heard",
-            f"receiver {record.receivers[0].name}: {what} of zeros in {share}",
-        )
+        assert name == "not-heard"
+        assert text.startswith(f"receiver {record.receivers[0].name}: {what} of zeros in {share};")
 
 
-def test_nearly_silent_receivers_are_named() -> None:
-    assert list(few_rows(building(attic=(1, 2, 3, 4, 5)))) == []
-    ((name, text),) = list(few_rows(building(attic=(3, 45, 46), cellar=())))
-    assert name == "few-rows"
-    assert text.startswith("fewer than 5 training rows were received by attic (1), cellar (0): fits predict these")
-    ((_, text),) = list(few_rows(silent_in(building(), list(range(TRAINED)), "hall", "stairs", "lab")))
-    assert "nothing was received in the training rows by any receiver" in text
-
-
-def test_fits_warn_of_them(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fits_warn_of_them(tmp_path, caplog, capsys):
     folder = write_ble_folder(tmp_path / "office", marked(0.3, -101, 0, 1, 2))
     (suspicion,) = check_data(folder).suspicions
     with caplog.at_level(logging.WARNING):

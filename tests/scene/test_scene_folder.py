@@ -1,23 +1,29 @@
-"""Scene folders: written whole, opened by both tracers, materials that follow one file, paths as in the real room."""
+"""Scene folders: written whole, opened by both tracers, materials that follow one file; pictures of scenes."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from calling import contents
+from made_plans import L_ROOM_M
 from made_rooms import closed_box, sampled, scene_file
+from matplotlib.collections import LineCollection, PolyCollection
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from PIL import Image
 from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from wrf_mi import backend
 from wrf_mi.core import InputError
+from wrf_mi.core.files import write_figure
+from wrf_mi.core.paths import Paths
 from wrf_mi.scene.folder import read_scene_folder, write_scene
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.materials import Materials, read_materials
 from wrf_mi.scene.mesh.surfaces import Surface, number_names
+from wrf_mi.scene.plan.storey import plan_surfaces
+from wrf_mi.scene.preview import GaussianCloud, draw_scene
 from wrf_mi.scene.scan import simulate_scan
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.sionna.materials import perfect_reflector
@@ -31,41 +37,32 @@ def surface(name: str, kind: Any, z: float) -> Surface:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     surfaces = [surface("floor", "floor", 0.0), surface("ceiling", "ceiling", 2.5), surface("table", "other", 0.7)]
     return write_scene(tmp_path / "scene", surfaces, frame="made up", source="test", counts={"points": 7})
 
 
-def test_a_folder_is_read_as_written(folder: Path) -> None:
+def test_a_folder_is_read_as_written_and_opened_by_mitsuba_and_sionna(folder):
     read = read_scene_folder(folder)
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "materials.yml",
-        "meshes",
-        "preview.png",
-        "scene.xml",
-        "scene.yml",
-    ]
+    assert contents(folder) == {"materials.yml", "meshes", "preview.png", "scene.xml", "scene.yml"}
     facts = yaml.safe_load((folder / "scene.yml").read_text())
     assert (facts["frame"], facts["source"], facts["registration"]) == ("made up", "test", None)
     assert read.counts == {"surfaces": 3, "faces": 6, "points": 7}
     assert read.materials.of("table", "other") == "itu_wood"
     assert read.materials.thickness_m["itu_concrete"] == THICKNESS_M["itu_concrete"]
-
-
-def test_mitsuba_and_sionna_open_it(folder: Path) -> None:
     backend.init()
     import mitsuba as mi
     from sionna import rt
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
-    low_high = [[0, 0, 0], [4, 3, 2.5]]
-    box = mi.load_file(str(folder / "scene.xml")).bbox()
-    np.testing.assert_allclose([np.array(box.min), np.array(box.max)], low_high)
+    assert bounds(mi.load_file(str(folder / "scene.xml"))) == pytest.approx(np.array([[0, 0, 0], [4, 3, 2.5]]))
     scene = rt.load_scene(str(folder / "scene.xml"), merge_shapes=False)
     materials = {name: one.radio_material.name for name, one in scene.objects.items()}
     assert materials == {"floor": "itu_concrete", "ceiling": "itu_ceiling_board", "table": "itu_wood"}
+    assert {name.removeprefix("itu_") for name in THICKNESS_M} == set(ITU_MATERIALS_PROPERTIES)
 
 
-def test_editing_the_materials_changes_the_scene(folder: Path) -> None:
+def test_editing_the_materials_changes_the_scene(folder):
     facts = yaml.safe_load((folder / "materials.yml").read_text())
     facts["rules"]["floor"] = "itu_marble"
     facts["surfaces"]["table"] = "itu_metal"
@@ -73,11 +70,8 @@ def test_editing_the_materials_changes_the_scene(folder: Path) -> None:
     (folder / "materials.yml").write_text(yaml.safe_dump(facts))
     scene = open_scene(folder, FREQUENCY_HZ)
     materials = {name: one.radio_material for name, one in scene.objects.items()}
-    assert {name: one.name for name, one in materials.items()} == {
-        "floor": "itu_marble",
-        "ceiling": "itu_ceiling_board",
-        "table": "itu_metal",
-    }
+    names = {name: one.name for name, one in materials.items()}
+    assert names == {"floor": "itu_marble", "ceiling": "itu_ceiling_board", "table": "itu_metal"}
     assert float(materials["table"].thickness[0]) == pytest.approx(0.005)
     assert float(materials["floor"].thickness[0]) == pytest.approx(THICKNESS_M["itu_marble"])
     before = (folder / "scene.xml").stat().st_mtime_ns
@@ -85,21 +79,20 @@ def test_editing_the_materials_changes_the_scene(folder: Path) -> None:
     assert (folder / "scene.xml").stat().st_mtime_ns == before
 
 
-def test_a_perfect_conductor_is_a_material_of_a_scene_folder(folder: Path) -> None:
+def test_a_perfect_conductor_is_a_material_of_a_scene_folder(folder):
     """As ``--material perfect`` is of a bare mesh; Sionna RT opens the scene file by itself, too."""
+    from sionna import rt
+
     facts = yaml.safe_load((folder / "materials.yml").read_text())
     facts["rules"]["floor"] = facts["surfaces"]["table"] = "perfect"
     facts["thickness_m"] = {"perfect": 0.3}
     (folder / "materials.yml").write_text(yaml.safe_dump(facts))
-    scene = open_scene(folder, FREQUENCY_HZ)
-    of = {name: one.radio_material for name, one in scene.objects.items()}
+    of = {name: one.radio_material for name, one in open_scene(folder, FREQUENCY_HZ).objects.items()}
     assert [of[name].name for name in ("floor", "table", "ceiling")] == ["perfect", "perfect", "itu_ceiling_board"]
     expected = perfect_reflector()
     for key in ("relative_permittivity", "conductivity"):
         assert float(getattr(of["floor"], key)[0]) == float(getattr(expected, key)[0])
     assert float(of["floor"].thickness[0]) == pytest.approx(0.3)
-    from sionna import rt
-
     assert len(rt.load_scene(str(folder / "scene.xml"), merge_shapes=False).objects) == 3
 
 
@@ -109,26 +102,20 @@ PANEL = "constants: {{panel: {{relative_permittivity: 2.9, conductivity: 0.01, t
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "rules: {floor: marble}",
-            r"floor: unknown material 'marble'; known are itu_vacuum, .*itu_wet_ground, perfect",
-        ),
-        ("rules: {roof: itu_wood}", r"rules: no kind 'roof'; known are floor, ceiling, wall, other"),
-        ("surfaces: {table: iron}", r"surfaces: table: unknown material 'iron'; known are floor, .*itu_metal"),
-        ("thickness_m: {itu_wood: -1}", r"thickness_m: itu_wood is -1; give metres above 0"),
-        ("thickness_m: {itu_wood: thin}", r"thickness_m: itu_wood is 'thin'; give metres above 0"),
-        ("walls: {}", r"give the keys rules, surfaces, thickness_m, constants, no others"),
-        ("rules: itu_wood", r"rules must be a mapping"),
-        ("rules: {", r"not YAML"),
-        (
-            PANEL.format("conductivity_exponent: 1"),
-            r"panel: give relative_permittivity, .* with",
-        ),
-        (PANEL.format("conductivity_exponent: 9, carrier_hz: 1.0e+9"), r"conductivity_exponent is 9; give -5 to 5"),
-        (PANEL.format("conductivity_exponent: 1, carrier_hz: 0"), r"carrier_hz is 0; give a number from 0 upwards"),
+        ("rules: {floor: marble}", "floor: unknown material 'marble'; known are itu_vacuum, .*itu_wet_ground, perfect"),
+        ("rules: {roof: itu_wood}", "rules: no kind 'roof'; known are floor, ceiling, wall, other"),
+        ("surfaces: {table: iron}", "surfaces: table: unknown material 'iron'; known are floor, .*itu_metal"),
+        ("thickness_m: {itu_wood: -1}", "thickness_m: itu_wood is -1; give metres above 0"),
+        ("thickness_m: {itu_wood: thin}", "thickness_m: itu_wood is 'thin'; give metres above 0"),
+        ("walls: {}", "give the keys rules, surfaces, thickness_m, constants, no others"),
+        ("rules: itu_wood", "rules must be a mapping"),
+        ("rules: {", "not YAML"),
+        (PANEL.format("conductivity_exponent: 1"), "panel: give relative_permittivity, .* with"),
+        (PANEL.format("conductivity_exponent: 9, carrier_hz: 1.0e+9"), "conductivity_exponent is 9; give -5 to 5"),
+        (PANEL.format("conductivity_exponent: 1, carrier_hz: 0"), "carrier_hz is 0; give a number from 0 upwards"),
     ],
 )
-def test_unusable_materials_are_refused(text: str, message: str, folder: Path) -> None:
+def test_unusable_materials_are_refused(text, message, folder):
     (folder / "materials.yml").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
         read_scene_folder(folder)
@@ -136,26 +123,19 @@ def test_unusable_materials_are_refused(text: str, message: str, folder: Path) -
     assert "materials.yml" in str(caught.value)
 
 
-def test_every_material_is_known_to_sionna() -> None:
-    backend.init()
-    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
-
-    assert {name.removeprefix("itu_") for name in THICKNESS_M} == set(ITU_MATERIALS_PROPERTIES)
-
-
-def test_incomplete_folders_are_refused(folder: Path) -> None:
-    (folder / "meshes" / "table.ply").unlink()
-    with pytest.raises(InputError, match=r"surface 'table' has no mesh"):
-        read_scene_folder(folder)
-    (folder / "scene.yml").write_text("frame: x\n")
-    with pytest.raises(InputError, match=r"scene.yml: no xml in it"):
-        read_scene_folder(folder)
-    (folder / "scene.yml").unlink()
-    with pytest.raises(InputError, match=r"scene.yml: missing"):
-        read_scene_folder(folder)
+def test_incomplete_folders_are_refused(folder):
+    facts = folder / "scene.yml"
+    for damage, message in (
+        ((folder / "meshes" / "table.ply").unlink, "surface 'table' has no mesh"),
+        (lambda: facts.write_text("frame: x\n"), "scene.yml: no xml in it"),
+        (facts.unlink, "scene.yml: missing"),
+    ):
+        damage()
+        with pytest.raises(InputError, match=message):
+            read_scene_folder(folder)
 
 
-def test_scene_folder_is_written_atomically(tmp_path: Path) -> None:
+def test_scene_folder_is_written_atomically(tmp_path):
     out = tmp_path / "scene"
     with pytest.raises(InputError, match=r"no surface was found"):
         write_scene(out, [], frame="", source="scan.ply")
@@ -168,58 +148,46 @@ def test_scene_folder_is_written_atomically(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_names() -> None:
-    assert number_names(["wall", "floor", "wall"]) == ["wall_01", "floor", "wall_02"]
-
-
-def test_a_scan_becomes_a_folder_in_a_registered_frame(tmp_path: Path) -> None:
+def test_a_scan_becomes_a_folder_in_a_registered_frame(tmp_path):
     np.savez(tmp_path / "scan.npz", points=1000 * sampled(closed_box(), 20_000))
     (tmp_path / "mine.yml").write_text("rules: {wall: itu_brick}\nthickness_m: {itu_brick: 0.12}\n")
     quarter = np.array([[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 1], [0, 0, 0, 1.0]])
-    made = make_scene(
-        tmp_path / "scan.npz",
-        tmp_path / "out",
-        units="mm",
-        materials=tmp_path / "mine.yml",
-        registration=quarter,
-    )
+    options = {"units": "mm", "materials": tmp_path / "mine.yml", "registration": quarter}
+    made = make_scene(tmp_path / "scan.npz", tmp_path / "out", **options)
     assert made.counts == {"surfaces": 6, "faces": 12, "points": 20_200}
     np.testing.assert_array_equal(yaml.safe_load((made.folder / "scene.yml").read_text())["registration"], quarter)
     assert made.materials.of("wall_01", "wall") == "itu_brick"
     assert made.materials.thickness_m["itu_brick"] == 0.12
-    scene = open_scene(made.folder, FREQUENCY_HZ)
-    box = scene.mi_scene.bbox()
-    np.testing.assert_allclose([np.array(box.min), np.array(box.max)], [[6, 20, 1], [10, 25, 3.8]], atol=0.01)
+    scene = open_scene(made.folder, FREQUENCY_HZ).mi_scene
+    np.testing.assert_allclose(bounds(scene), [[6, 20, 1], [10, 25, 3.8]], atol=0.01)
     read_materials(made.folder)  # a folder stands for its file
 
 
-def test_a_mesh_becomes_a_folder(tmp_path: Path) -> None:
+def test_a_mesh_and_a_layout_become_folders(tmp_path):
     closed_box()[0].export(tmp_path / "room.stl")
-    made = make_scene(tmp_path / "room.stl", tmp_path / "out")
-    assert made.counts == {"surfaces": 6, "faces": 12}
-    assert made.materials.surfaces == {"floor": "floor", "ceiling": "ceiling"} | {
-        f"wall_0{i}": "wall" for i in range(1, 5)
-    }
-
-
-def test_a_layout_becomes_a_folder(tmp_path: Path) -> None:
     (tmp_path / "layout.csv").write_text("x,y\n0,0\n5,0\n5,4\n0,4\n0,0\n")
-    made = make_scene(tmp_path / "layout.csv", tmp_path / "out", height_m=2.5, floor_m=1.0)
-    assert made.counts == {"surfaces": 6, "faces": 12}
-    box = open_scene(made.folder, FREQUENCY_HZ).mi_scene.bbox()
-    np.testing.assert_allclose([np.array(box.min), np.array(box.max)], [[0, 0, 1], [5, 4, 3.5]], atol=1e-6)
+    mesh = make_scene(tmp_path / "room.stl", tmp_path / "mesh")
+    walls = {f"wall_0{i}": "wall" for i in range(1, 5)}
+    assert mesh.materials.surfaces == {"floor": "floor", "ceiling": "ceiling"} | walls
+    layout = make_scene(tmp_path / "layout.csv", tmp_path / "layout", height_m=2.5, floor_m=1.0)
+    assert mesh.counts == layout.counts == {"surfaces": 6, "faces": 12}
+    scene = open_scene(layout.folder, FREQUENCY_HZ).mi_scene
+    np.testing.assert_allclose(bounds(scene), [[0, 0, 1], [5, 4, 3.5]], atol=1e-6)
+    assert number_names(["wall", "floor", "wall"]) == ["wall_01", "floor", "wall_02"]
 
 
-def test_simulated_scan_has_the_stated_noise_and_strays(tmp_path: Path) -> None:
-    xml = scene_file(tmp_path, closed_box())
-    pose = np.array([2.0, 1.5, 1.3])
-    points = simulate_scan(xml, pose, rays_per_pose=20_000, seed=3)
-    again = simulate_scan(xml, pose, rays_per_pose=20_000, seed=3)
+def bounds(scene):
+    """Lowest and highest corner of a scene of Mitsuba."""
+    return np.array([scene.bbox().min, scene.bbox().max])
+
+
+def test_simulated_scan_has_the_stated_noise_and_strays(tmp_path):
+    xml, pose = scene_file(tmp_path, closed_box()), np.array([2.0, 1.5, 1.3])
+    points, again = (simulate_scan(xml, pose, rays_per_pose=20_000, seed=3) for _ in range(2))
     np.testing.assert_array_equal(points, again)
     assert len(points) == 20_000
-    direction = points - pose
-    distance = np.linalg.norm(direction, axis=1)
-    direction /= distance[:, None]
+    distance = np.linalg.norm(points - pose, axis=1)
+    direction = (points - pose) / distance[:, None]
     # Along each ray the box's nearest face in closed form.
     with np.errstate(divide="ignore"):
         to_walls = np.where(direction > 0, ([5, 4, 2.8] - pose) / direction, -pose / direction)
@@ -230,3 +198,82 @@ def test_simulated_scan_has_the_stated_noise_and_strays(tmp_path: Path) -> None:
     assert error[near].std() == pytest.approx(0.02, rel=0.05)
     with pytest.raises(InputError, match="no ray met the scene"):
         simulate_scan(scene_file(tmp_path / "sheet", [sheet(2, 0.0, (0, 1), (0, 1))]), [9.0, 9.0, 9.0], rays_per_pose=9)
+
+
+def room():
+    return plan_surfaces(L_ROOM_M, height_m=2.5)
+
+
+def cloud(n=5):
+    rng = np.random.default_rng(0)
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    return GaussianCloud(rng.uniform(0, 4, (n, 3)), np.tile([0.3, 0.2, 0.1], (n, 1)), still, np.linspace(-60, -20, n))
+
+
+def one_path():
+    end = {"tx": np.array([0]), "rx": np.array([0]), "n_tx": 1, "n_rx": 1}
+    way = dict.fromkeys(("departure", "arrival"), np.array([[1.0, 0, 0]]))
+    met = {"interactions": np.array([[1, 0]], np.uint8), "objects": np.array([[0, -1]], np.int32)}
+    vertices_m = np.array([[[3.0, 0.0, 1.0], [np.nan] * 3]])
+    gain, length_m = np.array([1e-3 + 0j]), np.array([5.0])
+    return Paths(gain=gain, length_m=length_m, vertices_m=vertices_m, object_names=("wall",), **end, **way, **met)
+
+
+def test_preview_is_written_whole(tmp_path):
+    figure = draw_scene(room(), points_m=np.random.default_rng(0).uniform(0, 4, (100, 3)))
+    path = write_figure(tmp_path / "preview.png", figure)
+    with Image.open(path) as picture:
+        assert picture.size[0] > 1000
+        grey = np.asarray(picture.convert("L"))
+    assert grey.std() > 20
+    assert [p.name for p in tmp_path.iterdir()] == ["preview.png"]
+
+
+def test_plan_shows_the_walls_where_they_are():
+    plan = draw_scene(room()).axes[1]
+    cuts = [c for c in plan.collections if isinstance(c, LineCollection)]
+    shown = np.concatenate([segment for c in cuts for segment in c.get_segments()])
+    assert [*shown.min(axis=0), *shown.max(axis=0)] == pytest.approx([0, 0, 5, 4.5])
+    assert len(cuts) == len(L_ROOM_M) - 1
+    high = [Surface(s.name, s.kind, s.vertices_m + np.array([0, 0, 412.0]), s.faces) for s in room()]
+    assert 412.0 < float(draw_scene(high).axes[1].get_title().split()[-2]) < 414.5
+
+
+def faces_drawn(surfaces):
+    """How many faces the slanted view shows: each has a colour of its own."""
+    slant = draw_scene(surfaces).axes[0]
+    return sum(len(c.get_facecolor()) for c in slant.collections if isinstance(c, Poly3DCollection))
+
+
+def test_ceiling_is_taken_off_and_floor_stays():
+    floor, ceiling, *walls = room()
+    assert {s.kind for s in walls} == {"wall"}
+    assert faces_drawn([floor]) == len(floor.faces)
+    assert faces_drawn([ceiling]) == 0
+    assert faces_drawn(room()) == len(floor.faces) + 2 * len(walls)
+    vertices = np.array([[x, y, z] for z in (0, 2) for y in (0, 3) for x in (0, 4)], float)
+    faces = np.array([[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4]])
+    assert faces_drawn([Surface("mesh", "other", vertices, faces)]) == 4  # two are level, near the top
+
+
+def test_paths_gaussians_and_devices_are_in_both_views():
+    ends = {"transmitters_m": np.array([[1.0, 1, 1]]), "receivers_m": np.array([[5.0, 1, 1]])}
+    figure = draw_scene(room(), points_m=np.zeros((3, 2)), paths=one_path(), gaussians=cloud(), title="all", **ends)
+    slant, plan = figure.axes[:2]
+    bounced = [c.get_segments()[0] for c in plan.collections if isinstance(c, LineCollection) and c.zorder == 6]
+    assert np.allclose(bounced[0], [[1, 1], [3, 0], [5, 1]])
+    ellipses = next(c for c in plan.collections if isinstance(c, PolyCollection) and c.zorder == 4).get_paths()
+    # The strongest is drawn last; seen from above it spans its standard deviations.
+    outline = ellipses[-1].vertices - cloud().position_m[-1, :2]
+    assert np.abs(outline).max(axis=0) == pytest.approx([0.3, 0.2], rel=0.02)
+    assert len(ellipses) == 5
+    assert {c.zorder for c in slant.collections} >= {1, 2, 5, 6}
+    assert [t.get_text() for t in figure.legends[0].get_texts()] == ["floor", "wall", "transmitter", "receiver"]
+    assert {axes.get_ylabel() for axes in figure.axes[2:]} == {"gain of a path (dB)", "signal of a Gaussian (dB)"}
+
+
+def test_scenes_without_surfaces_or_path_ends_are_refused():
+    with pytest.raises(ValueError, match="no surface"):
+        draw_scene([])
+    with pytest.raises(ValueError, match="paths need"):
+        draw_scene(plan_surfaces(L_ROOM_M, height_m=2), paths=one_path())
