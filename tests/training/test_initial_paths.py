@@ -1,32 +1,36 @@
 """Gaussians that start from traced paths or from a mesh."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 from traced_rooms import FREQUENCY_HZ, HEIGHT, LENGTH, SHOEBOX, WIDTH, inside, receiver, room, write_xml
 
-from wrf_mi.core import InputError, Paths, Record
+from wrf_mi.core import InputError, Record
 from wrf_mi.core.settings import with_settings
 from wrf_mi.gaussians import WrfGsPlus
 from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.training.config import InitialConfig, TrainConfig
 from wrf_mi.training.initial import gaussians_from_mesh, gaussians_from_paths, initial_gaussians
 
+STATION = receiver([3.0, 2.0, 1.0])
+
 
 @pytest.fixture(scope="module")
-def traced(tmp_path_factory: pytest.TempPathFactory) -> tuple[Paths, np.ndarray]:
+def traced(tmp_path_factory):
+    """Paths, and the rest of the arguments of `gaussians_from_paths` but the number of Gaussians."""
     scene, tx = room(tmp_path_factory.mktemp("scene")), inside(12)
-    return trace_paths(scene, tx, receiver([3.0, 2.0, 1.0]), TraceOptions(depth=1, rays=1 << 12)).paths, tx
+    return trace_paths(scene, tx, STATION, TraceOptions(depth=1, rays=1 << 12)).paths, tx
 
 
-def test_gaussians_start_at_sources_of_paths(traced: tuple[Paths, np.ndarray]) -> None:
+def start_from(paths, tx, count):
+    return gaussians_from_paths(paths, tx, (STATION,), count, np.random.default_rng(0))
+
+
+def test_gaussians_start_at_sources_of_paths(traced):
     paths, tx = traced
-    start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 40, np.random.default_rng(0))
+    start = start_from(paths, tx, 40)
     assert start.count == 40
     # Clusters mix points of one wall; in a convex room their means are inside it.
     assert (start.position_m > -0.3).all()
@@ -40,9 +44,9 @@ def test_gaussians_start_at_sources_of_paths(traced: tuple[Paths, np.ndarray]) -
     assert np.isclose(np.abs(start.signals).max(), 0.3)
 
 
-def test_field_starts_with_signals_of_paths(traced: tuple[Paths, np.ndarray]) -> None:
+def test_field_starts_with_signals_of_paths(traced):
     paths, tx = traced
-    start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 20, np.random.default_rng(0))
+    start = start_from(paths, tx, 20)
     weights = WrfGsPlus(layers=2, width=8, skip=1).init(start, np.random.default_rng(0))
     assert weights["opacity"].shape == (1, 20)
     assert np.array_equal(weights["signal"][0] + 1j * weights["signal"][1], start.signals.astype(np.complex64))
@@ -50,16 +54,14 @@ def test_field_starts_with_signals_of_paths(traced: tuple[Paths, np.ndarray]) ->
     assert np.ptp(weights["opacity"]) > 0
 
 
-def test_more_gaussians_than_clusters_are_jittered(traced: tuple[Paths, np.ndarray]) -> None:
+def test_more_gaussians_than_clusters_are_jittered(traced):
     paths, tx = traced
-    one = paths.select(np.arange(2))
-    start = gaussians_from_paths(one, tx, (receiver([3.0, 2.0, 1.0]),), 9, np.random.default_rng(0))
-    assert len(np.unique(start.position_m, axis=0)) == 9
+    assert len(np.unique(start_from(paths.select(np.arange(2)), tx, 9).position_m, axis=0)) == 9
     with pytest.raises(InputError, match="no path"):
-        gaussians_from_paths(paths.select(np.arange(0)), tx, (receiver([3.0, 2.0, 1.0]),), 4, np.random.default_rng(0))
+        start_from(paths.select(np.arange(0)), tx, 4)
 
 
-def test_gaussians_on_a_mesh_are_distributed_by_area(tmp_path: Path) -> None:
+def test_gaussians_on_a_mesh_are_distributed_by_area(tmp_path):
     triangles = np.concatenate([mesh.triangles for _, mesh in SHOEBOX.values()])
     start = gaussians_from_mesh(triangles, 2000, np.random.default_rng(0))
     floor = np.abs(start.position_m[:, 2]) < 1e-9
@@ -69,16 +71,16 @@ def test_gaussians_on_a_mesh_are_distributed_by_area(tmp_path: Path) -> None:
         gaussians_from_mesh(np.zeros((1, 3, 3)), 4, np.random.default_rng(0))
 
 
-def test_gaussians_start_from_the_source_in_the_settings(tmp_path: Path) -> None:
+def test_gaussians_start_from_the_source_in_the_settings(tmp_path):
     scene, tx = str(write_xml(tmp_path, SHOEBOX)), inside(40)
     own = receiver([3.0, 2.0, 1.0])
     record = Record("room", "spectrum", tx, (own,), np.zeros((1, 40, 2, 4)), frequencies_hz=np.array([FREQUENCY_HZ]))
     rows = np.flatnonzero(tx[:, 0] < LENGTH / 2)
 
-    def start(config: InitialConfig, record: Record = record) -> np.ndarray:
+    def start(config, record=record):
         return initial_gaussians(config, record, rows, np.random.default_rng(0)).position_m
 
-    def from_a_wall(position: np.ndarray) -> np.ndarray:
+    def from_a_wall(position):
         return np.minimum(np.abs(position), np.abs(position - [LENGTH, WIDTH, HEIGHT])).min(axis=1)
 
     assert from_a_wall(start(InitialConfig(40, mesh=scene))).max() < 1e-5  # float32 of some metres
