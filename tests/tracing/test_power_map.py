@@ -8,7 +8,7 @@ import trimesh
 from traced_rooms import FREQUENCY_HZ, SHOEBOX, inside, receiver, room
 from wrf_mi_scenes.build_laboratory import box, sheet
 
-from wrf_mi.core import Antenna, Receiver, Record
+from wrf_mi.core import Antenna, Record
 from wrf_mi.receivers import rssi_dbm
 from wrf_mi.tracing import TraceOptions, open_scene, power_map, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
@@ -50,11 +50,10 @@ def test_traced_power_asks_for_each_position_once_and_falls_back_to_the_local_me
 
 def test_map_excludes_points_inside_closed_solids(tmp_path, caplog):
     """A column of 0.9 m holds points of the map's grid, whose antennas nobody has stated: no error and no warning."""
-    column = box((2.6, 2.4, 0), (3.5, 3.3, 3.0))
-    trimesh.util.concatenate([sheet(2, 0.0, (0.0, 6.0), (0.0, 6.0)), column]).export(tmp_path / "room.ply")
+    parts = sheet(2, 0.0, (0.0, 6.0), (0.0, 6.0)), box((2.6, 2.4, 0), (3.5, 3.3, 3.0))
+    trimesh.util.concatenate(parts).export(tmp_path / "room.ply")
     scene = open_scene(tmp_path / "room.ply", FREQUENCY_HZ, material="concrete")
-    places = [(0, 0, 2), (6, 1, 2), (2, 5, 2)]
-    receivers = tuple(Receiver(f"r{k}", np.array(at, float), np.array([0.0, 0, 0, 1])) for k, at in enumerate(places))
+    receivers = tuple(receiver(at, f"r{k}") for k, at in enumerate([(0, 0, 2), (6, 1, 2), (2, 5, 2)]))
     position = np.array([[0.5, 0.5, 1.3], [5.5, 5.5, 1.3], [0.5, 5.5, 1.3]])
     record = Record("made", "rssi", position, receivers, np.zeros((3, 3), np.float32))
     for smooth_m in (0.0, 0.3):
@@ -93,11 +92,10 @@ def test_kept_powers_are_those_traced(shoebox, cache, monkeypatch):
 
 
 def test_another_scene_position_antenna_or_depth_is_traced(shoebox, tmp_path, cache):
-    powers(shoebox)
+    shorter = {"options": replace(OPTIONS, reflections=0)}
+    for changed in ({}, {"tx_antenna": Antenna("dipole")}, shorter, {"receivers": [receiver(CENTRE, "other")]}):
+        powers(shoebox, **changed)
     powers(shoebox, POSITIONS[:4])
-    powers(shoebox, tx_antenna=Antenna("dipole"))
-    powers(shoebox, options=replace(OPTIONS, reflections=0))
-    powers(shoebox, receivers=[receiver(CENTRE, "other")])
     higher = {name: (kind, mesh.copy().apply_translation([0, 0, 1e-3])) for name, (kind, mesh) in SHOEBOX.items()}
     softer = {name: ("itu_wood", mesh) for name, (_, mesh) in SHOEBOX.items()}
     for name, parts in {"higher": higher, "softer": softer}.items():

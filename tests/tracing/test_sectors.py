@@ -14,13 +14,11 @@ from wrf_mi.models.checks import check_parts
 from wrf_mi.models.model import Problem
 from wrf_mi.models.ray_tracing import MODEL, TracingSettings
 from wrf_mi.tasks import instrument_of
-from wrf_mi.tracing import TraceOptions, load_trace, open_scene, trace_paths
-from wrf_mi.tracing.paths.result import recompute, save_trace
+from wrf_mi.tracing import RayTracer, TraceOptions, load_trace, open_scene, recompute, save_trace, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions, traced_fields
 from wrf_mi.tracing.search import chains as search_module
 from wrf_mi.tracing.sionna.materials import CONSTANTS, at_frequency
-from wrf_mi.tracing.tracer import RayTracer
 
 POWER_DB = 0.01  # Gains and lengths of Sionna RT are in single precision
 SINGLE = 2e-6  # Of the strongest path: constants of materials and gains in single precision

@@ -26,12 +26,12 @@ ARRAY_M = planar_array(4, 4, 0.16)
 STANDING = Rotation.from_matrix([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])  # boresight -x, the array's y axis up
 
 
+WARNING = "try --rx-polarization H or --rx-frame world"
+
+
 @pytest.fixture(scope="module")
 def polar(shoebox_xml):
     return open_scene(shoebox_xml, HZ)
-
-
-WARNING = "try --rx-polarization H or --rx-frame world"
 
 
 def array(turn_deg, antenna):
@@ -88,9 +88,9 @@ def test_cross_polarised_data_warn_and_name_the_option(shoebox_xml, turned_folde
             "1",
             "--rays",
             "4096",
-            *words,
             "--out",
             tmp_path / name,
+            *words,
         ]
         status, _, err = call(asked, capsys)
         assert status == 0, err

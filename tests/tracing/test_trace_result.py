@@ -63,9 +63,9 @@ def test_settings_of_every_model_with_a_scene_state_the_same_search():
 def test_former_names_of_depth_and_reflections_are_read():
     """Traces and runs of earlier versions state them, and so do scripts."""
     stated = {"max_depth": 6, "max_reflections": 2, "transmission": True}
+    as_text = with_settings(TraceOptions(), [f"{name}={value}" for name, value in stated.items()])
     expected = TraceOptions(depth=6, reflections=2, transmission=True)
-    assert settings_from(TraceOptions, stated, "paths.npz") == expected
-    assert with_settings(TraceOptions(), [f"{name}={value}" for name, value in stated.items()]) == expected
+    assert settings_from(TraceOptions, stated, "paths.npz") == as_text == expected
 
 
 def test_selected_transmitters_have_the_paths_of_their_own_trace(traced, scene):
@@ -77,10 +77,10 @@ def test_selected_transmitters_have_the_paths_of_their_own_trace(traced, scene):
         np.testing.assert_array_equal(getattr(found.paths, name), getattr(expected.paths, name))
     np.testing.assert_array_equal(found.primitives, expected.primitives)
     np.testing.assert_array_equal(found.tx_pos_m, inside(5)[which])
-    np.testing.assert_array_equal(found.carriers_hz, [3, 1, 3])
+    np.testing.assert_array_equal(found.carriers_hz, which)
+    assert not len(traced.of_transmitters(which[:0]).paths)
     close(found.paths.gain, expected.paths.gain)
     close(found.paths.length_m, expected.paths.length_m)
-    assert len(traced.of_transmitters(which[:0]).paths) == 0
 
 
 def test_wrong_files_are_refused(traced, tmp_path):
@@ -164,9 +164,8 @@ def test_derivatives_by_materials_are_central_differences(traced, scene):
     import drjit as dr
     import mitsuba as mi
 
-    surfaces = scene_surfaces(scene)
+    surfaces, material = scene_surfaces(scene), scene.radio_materials["itu_brick"]
     buffer = to_buffer(traced.legs(surfaces), surfaces)
-    material = scene.radio_materials["itu_brick"]
     material.frequency_update_callback = None
     names = "relative_permittivity", "conductivity", "thickness"
     stated = {name: float(np.ravel(getattr(material, name))[0]) for name in names}

@@ -24,10 +24,9 @@ from wrf_mi.scene.edit import Move, edit_scene
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import read_materials
 from wrf_mi.scene.mesh.surfaces import Surface
-from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+from wrf_mi.tracing import RayTracer, TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.search.devices import before_surfaces, check_devices, clear_m, winding_number
 from wrf_mi.tracing.search.surfaces import find_planes, scene_surfaces
-from wrf_mi.tracing.tracer import RayTracer
 
 
 def refused(words, source, frequency_hz=FREQUENCY_HZ, **how):

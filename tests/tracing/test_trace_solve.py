@@ -100,13 +100,12 @@ def test_gains_over_a_perfect_ground_are_those_of_two_rays(tmp_path):
     from sionna import rt
 
     scene = room(tmp_path, {"ground": ("itu_metal", sheet(2, 0.0, (-300.0, 300.0), (-300.0, 300.0)))})
-    scene.objects["ground"].radio_material = perfect_reflector()
-    assert isinstance(scene.objects["ground"].radio_material, rt.RadioMaterial)
-    paths = traced(scene, [[200.0, 0, 1.5]], receiver([0, 0, 2.0]))
-    lengths = np.hypot(200, [0.5, 3.5])
+    ground = scene.objects["ground"]
+    ground.radio_material = perfect_reflector()
+    assert (type(ground.radio_material), ground.radio_material.name) == (rt.RadioMaterial, PERFECT)
+    paths, lengths = traced(scene, [[200.0, 0, 1.5]], receiver([0, 0, 2.0])), np.hypot(200, [0.5, 3.5])
     np.testing.assert_allclose(paths.length_m, lengths, atol=EXACT_M)
     np.testing.assert_allclose(paths.gain, WAVELENGTH_M / (4 * np.pi * lengths), rtol=10 * SINGLE)
-    assert scene.objects["ground"].radio_material.name == PERFECT
 
 
 def slab(thickness_m, permittivity, conductivity):
@@ -195,8 +194,7 @@ def test_kinds_that_are_off_are_not_searched(shoebox, empty, monkeypatch):
 
 def test_rays_are_shot_once_for_a_geometry(shoebox, divided, monkeypatch):
     """Another trace of equal surfaces shoots none; another receiver, seed or geometry does; memory is bounded."""
-    shots = list[object]()
-    shoot = search_module._shoot
+    shots, shoot = [], search_module._shoot
     monkeypatch.setattr(search_module, "_shoot", lambda *given: shots.append(given) or shoot(*given))
     tx, rx = inside(3), receiver([1.3, 0.8, 1.2])
 

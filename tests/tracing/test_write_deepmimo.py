@@ -14,7 +14,6 @@ from traced_rooms import FREQUENCY_HZ, THICKNESS_M, inside, receiver
 from wrf_mi.core import InputError
 from wrf_mi.datasets import load, read_deepmimo
 from wrf_mi.receivers.channel import csi
-from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions, load_trace, open_scene, trace_paths, write_deepmimo
 
 OFDM = {"bandwidth": 20e6, "subcarriers": 64, "selected_subcarriers": [0, 21, 42, 63]}
@@ -67,11 +66,9 @@ def test_channels_read_back_are_those_of_the_paths(traced, scenario):
 
 def test_package_computes_the_channels_of_the_paths(traced, scenario):
     most = int(np.bincount(traced.paths.tx + 5 * traced.paths.rx).max())
-    expected, scale = csi(traced.paths, FREQUENCIES_HZ), amplitudes(traced.paths)
-    dataset = package_dataset(scenario, max_paths=most)
-    for station in range(2):
-        channels = package_channels(dataset[station], {"ofdm": OFDM}, num_paths=most)[:, 0]
-        assert (np.abs(channels - expected[station]) / scale[station]).max() < PACKAGE
+    dataset, expected = package_dataset(scenario, max_paths=most), csi(traced.paths, FREQUENCIES_HZ)
+    channels = [package_channels(dataset[k], {"ofdm": OFDM}, num_paths=most)[:, 0] for k in range(2)]
+    assert (np.abs(channels - expected) / amplitudes(traced.paths)).max() < PACKAGE
 
 
 def test_package_reads_angles_delays_interactions_and_positions(traced, scenario):
@@ -117,38 +114,34 @@ def test_users_without_a_path_and_long_chains_of_interactions(traced, tmp_path):
 
 def test_more_paths_than_deepmimo_reads_are_warned_of(traced, tmp_path, caplog):
     write_deepmimo(tmp_path / "all", traced)
-    (warning,) = caplog.records
-    assert "of which DeepMIMO uses 25 by default; load with max_paths=" in warning.getMessage()
+    (warning,) = caplog.messages
+    assert "of which DeepMIMO uses 25 by default; load with max_paths=" in warning
 
 
-@pytest.mark.parametrize(
-    ("name", "changes", "message"),
-    [
-        ("Street", {}, "'Street' as name of a scenario, which deepmimo.load turns into lower case; choose small"),
-        ("a:b", {}, "choose small letters"),
-        ("there", {}, "exists; remove it or choose another folder"),
-        ("none", {"paths": None}, "no path from 5 users to 2 base stations"),
-        ("two", {"carriers_hz": np.array([1e9, 2e9, 1e9, 1e9, 1e9])}, "several carriers"),
-    ],
-)
-def test_what_cannot_be_written_is_refused(traced, tmp_path, name, changes, message):
+def test_what_cannot_be_written_is_refused(traced, tmp_path):
     (tmp_path / "there").mkdir()
-    if "paths" in changes:
-        changes = {"paths": traced.paths.select(np.zeros(len(traced.paths), bool))}
-    with pytest.raises(InputError, match=message) as error:
-        write_deepmimo(tmp_path / name, replace(traced, **changes))
-    assert "\n" not in str(error.value)
+    capital = "'Street' as name of a scenario, which deepmimo.load turns into lower case; choose small"
+    none = {"paths": traced.paths.select(np.zeros(len(traced.paths), bool))}
+    for name, changes, message in (
+        *(("Street", {}, capital), ("a:b", {}, "choose small letters")),
+        ("there", {}, "exists; remove it or choose another folder"),
+        ("none", none, "no path from 5 users to 2 base stations"),
+        ("two", {"carriers_hz": np.array([1e9, 2e9, 1e9, 1e9, 1e9])}, "several carriers"),
+    ):
+        with pytest.raises(InputError, match=message) as error:
+            write_deepmimo(tmp_path / name, replace(traced, **changes))
+        assert "\n" not in str(error.value)
     assert {path.name for path in tmp_path.iterdir()} == {"there"}
 
 
-def test_command_writes_the_traced_paths(flat_folder, tmp_path, capsys):
-    scene = make_scene(flat_folder / "layout.csv", tmp_path / "scene", height_m=2.7).folder
-    asked = ["trace", scene, flat_folder, "--depth", "1", "--rays", "1024", "--json"]
-    refused([*asked, "--out", tmp_path / "run", "--deepmimo", tmp_path / "Flat"], "choose small letters", capsys)
-    calibrated = [*asked, "--out", tmp_path / "run", "--calibrate", "gain", "--deepmimo", tmp_path / "flat"]
-    refused(calibrated, "--calibrate trains paths and stores none; omit it, or --deepmimo", capsys)
+def test_command_writes_the_traced_paths(room, flat_folder, tmp_path, capsys):
+    asked = ["trace", room, flat_folder, "--depth", "1", "--rays", "1024", "--json", "--out", tmp_path / "run"]
+    refused([*asked, "--deepmimo", tmp_path / "Flat"], "choose small letters", capsys)
+    asked += ["--deepmimo", tmp_path / "flat"]
+    message = "--calibrate trains paths and stores none; omit it, or --deepmimo"
+    refused([*asked, "--calibrate", "gain"], message, capsys)
     assert not (tmp_path / "run").exists()
-    status, _, err = call([*asked, "--out", tmp_path / "run", "--deepmimo", tmp_path / "flat"], capsys)
+    status, _, err = call(asked, capsys)
     assert status == 0, err
     traced = load_trace(tmp_path / "run" / "paths.npz")
     record = read_deepmimo(tmp_path / "flat", params={"base_stations": "all"})

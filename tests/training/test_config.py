@@ -95,16 +95,11 @@ def test_missing_settings_keep_their_defaults_and_the_last_of_several_counts():
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        *(
-            ("steps=2000", 2000),
-            ("deterministic=true", True),
-            ("deterministic=no", False),
-            (" model =wrf-gs", "wrf-gs"),
-        ),
+        *(("steps=2000", 2000), ("deterministic=true", True), ("deterministic=no", False)),
         *((f"optimiser.network={text}", 0.001) for text in ("1e-3", "1.0e-3")),  # YAML 1.1 reads the first as text
         *(("optimiser.network=.5", 0.5), ("optimiser.position=1", 1.0)),  # a whole number where a float is due
         *(("initial.farthest_m=2e1", 20.0), ("initial.points=cloud.ply", "cloud.ply")),
-        *(("initial.points=", ""), ("initial.points=a=b.ply", "a=b.ply")),
+        *((" model =wrf-gs", "wrf-gs"), ("initial.points=", ""), ("initial.points=a=b.ply", "a=b.ply")),
     ],
 )
 def test_setting_changes_one_value_and_keeps_its_type(setting, value):
@@ -114,10 +109,8 @@ def test_setting_changes_one_value_and_keeps_its_type(setting, value):
 
 
 WRONG_TYPES = [
-    *(
-        ("steps", "int", text, got)
-        for text, got in {"1.5": 1.5, "true": True, "many": "many", "": "", "1e3": "1e3"}.items()
-    ),
+    *(("steps", "int", text, text) for text in ("many", "", "1e3")),
+    *(("steps", "int", "1.5", 1.5), ("steps", "int", "true", True)),
     *(("optimiser.network", "float", text, got) for text, got in {"fast": "fast", "true": True, "null": None}.items()),
     *(("deterministic", "bool", "1", 1), ("initial.points", "string", "3", 3)),
 ]

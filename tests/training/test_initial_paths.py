@@ -19,7 +19,7 @@ STATION = receiver([3.0, 2.0, 1.0])
 
 @pytest.fixture(scope="module")
 def traced(tmp_path_factory):
-    """Paths, and the rest of the arguments of `gaussians_from_paths` but the number of Gaussians."""
+    """Paths and positions of transmitters."""
     scene, tx = room(tmp_path_factory.mktemp("scene")), inside(12)
     return trace_paths(scene, tx, STATION, TraceOptions(depth=1, rays=1 << 12)).paths, tx
 
@@ -45,8 +45,7 @@ def test_gaussians_start_at_sources_of_paths(traced):
 
 
 def test_field_starts_with_signals_of_paths(traced):
-    paths, tx = traced
-    start = start_from(paths, tx, 20)
+    start = start_from(*traced, 20)
     weights = WrfGsPlus(layers=2, width=8, skip=1).init(start, np.random.default_rng(0))
     assert weights["opacity"].shape == (1, 20)
     assert np.array_equal(weights["signal"][0] + 1j * weights["signal"][1], start.signals.astype(np.complex64))
@@ -72,29 +71,27 @@ def test_gaussians_on_a_mesh_are_distributed_by_area(tmp_path):
 
 
 def test_gaussians_start_from_the_source_in_the_settings(tmp_path):
-    scene, tx = str(write_xml(tmp_path, SHOEBOX)), inside(40)
-    own = receiver([3.0, 2.0, 1.0])
-    record = Record("room", "spectrum", tx, (own,), np.zeros((1, 40, 2, 4)), frequencies_hz=np.array([FREQUENCY_HZ]))
+    scene, tx, hz = str(write_xml(tmp_path, SHOEBOX)), inside(40), np.array([FREQUENCY_HZ])
+    record = Record("room", "spectrum", tx, (STATION,), np.zeros((1, 40, 2, 4)), frequencies_hz=hz)
     rows = np.flatnonzero(tx[:, 0] < LENGTH / 2)
 
-    def start(config, record=record):
-        return initial_gaussians(config, record, rows, np.random.default_rng(0)).position_m
+    def start(record=record, count=40, **source):
+        """Positions, and their distances from a wall."""
+        config = InitialConfig(count, **source)
+        position = initial_gaussians(config, record, rows, np.random.default_rng(0)).position_m
+        return position, np.minimum(np.abs(position), np.abs(position - [LENGTH, WIDTH, HEIGHT])).min(axis=1)
 
-    def from_a_wall(position):
-        return np.minimum(np.abs(position), np.abs(position - [LENGTH, WIDTH, HEIGHT])).min(axis=1)
-
-    assert from_a_wall(start(InitialConfig(40, mesh=scene))).max() < 1e-5  # float32 of some metres
-    # A mesh without materials has surfaces as well.
-    assert from_a_wall(start(InitialConfig(40, mesh=str(tmp_path / "floor.ply")))).max() < 1e-5
-    found = start(InitialConfig(200, paths=scene))
+    for mesh in (scene, str(tmp_path / "floor.ply")):  # a mesh without materials has surfaces as well
+        assert start(mesh=mesh)[1].max() < 1e-5  # float32 of some metres
+    position, from_a_wall = start(count=200, paths=scene)
     # Direct paths begin at transmitters: at those of the training rows, and at none of the others.
-    standing = found[from_a_wall(found) > 0.25]
+    standing = position[from_a_wall > 0.25]
     assert len(standing) > 5
     assert cdist(standing, tx[rows]).min(axis=1).max() < 0.5
     assert standing[:, 0].max() < LENGTH / 2
     with pytest.raises(InputError, match="room states no carrier frequency"):
-        start(InitialConfig(paths=scene), replace(record, frequencies_hz=None))
+        start(replace(record, frequencies_hz=None), paths=scene)
     with pytest.raises(InputError, match=r"is a mesh without radio materials; .*wrf-mi mesh room.ply --out DIR"):
-        start(InitialConfig(paths="room.ply"))
+        start(paths="room.ply")
     with pytest.raises(InputError, match="Gaussians start from one"):
         with_settings(TrainConfig(), ["initial.mesh=a", "initial.paths=b"])

@@ -99,7 +99,7 @@ def recover(model, steps, rows, **size):
     return before, score(), float(np.median(ssim(blend, truth)))
 
 
-@pytest.mark.parametrize(("model", "steps"), [("wrf-gs", 400), ("wrf-gs+", 700)])
+@pytest.mark.parametrize(("model", "steps"), [("wrf-gs", 500), ("wrf-gs+", 1200)])
 def test_field_is_recovered_from_its_spectra(model, steps):
     """The parameters are recovered where interpolation of spectra does not suffice."""
     before, after, blend = recover(model, steps=steps, rows=94)

@@ -50,13 +50,8 @@ def trainer_of(record, *own, model="wrf-gs+", **parts):
 
 def rounds(every, stop, growth, *own):
     """Settings of density control from the first step on."""
-    return (
-        f"density.every={every}",
-        "density.start=0",
-        f"density.stop={stop}",
-        f"density.growth_fraction={growth}",
-        *own,
-    )
+    schedule = f"density.every={every}", "density.start=0", f"density.stop={stop}"
+    return *schedule, f"density.growth_fraction={growth}", *own
 
 
 def test_density_rounds_within_a_run(one_gateway):
