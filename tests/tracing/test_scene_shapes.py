@@ -25,20 +25,9 @@ CHAIN = (
     '<transform name="to_world"><scale x="2" y="2" z="2"/><rotate x="0.6" y="0.8" angle="40"/>'
     '<translate x="1" y="-2" z="3"/></transform>'
 )
-PLY = """ply
-format ascii 1.0
-element vertex 4
-property float x
-property float y
-property float z
-element face {faces}
-property list uchar int vertex_indices
-end_header
-0 0 0
-4 0 0
-4 3 0
-0 3 0
-"""
+HEAD = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+FACES = "element face {count}\nproperty list uchar int vertex_indices\nend_header\n"
+CORNERS = "0 0 0\n4 0 0\n4 3 0\n0 3 0\n"
 CYLINDER = (
     '<point name="p0" value="1, 0, 2"/><point name="p1" value="1, 3, 2"/><float name="radius" value="0.5"/>'
     '<boolean name="flip_normals" value="true"/>'
@@ -49,13 +38,10 @@ L_SHAPE = "v 1 4 0\nv 0 4 0\nv 0 0 0\nv 4 0 0\nv 4 1 0\nv 1 1 0\nf 1 2 3 4 5 6\n
 
 def scene_file(folder, shapes):
     """A scene of a metal and some shapes, with mesh files that they may name."""
-    meshes, faces = (
-        folder / "meshes",
-        {"quad": "4 0 1 2 3\n", "triangle": "3 0 1 2\n", "empty": "", "outside": "3 0 1 9\n"},
-    )
+    meshes = folder / "meshes"
     meshes.mkdir(parents=True, exist_ok=True)
-    for name, face in faces.items():
-        (meshes / f"{name}.ply").write_text(PLY.format(faces=int(face != "")) + face)
+    for name, face in {"quad": "4 0 1 2 3\n", "triangle": "3 0 1 2\n", "empty": "", "outside": "3 0 1 9\n"}.items():
+        (meshes / f"{name}.ply").write_text(HEAD + FACES.format(count=int(face != "")) + CORNERS + face)
     (meshes / "negative.obj").write_text(NEGATIVE)
     (meshes / "concave.obj").write_text(L_SHAPE)
     (folder / "scene.xml").write_text(f'<scene version="3.0.0">{METAL}{shapes}</scene>')

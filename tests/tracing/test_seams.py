@@ -309,6 +309,5 @@ def test_reflections_in_edges_of_turned_rooms_count_once(tmp_path):
     scene = room(tmp_path, {"room": ("itu_metal", box.apply_transform(matrix))})
     for pair in (([1, 1, 0.75], [3, 1, 0.75]), ([1, 1, 0.75], [2, 2, 1.5]), ([2, 1, 1.5], [3, 2, 1.5])):
         source, target = trimesh.transform_points(np.array(pair, float), matrix)
-        assert len(trace_paths(scene, [source], receiver(target), replace(OPAQUE, depth=3), gains=False).paths) == 63, (
-            pair
-        )
+        paths = trace_paths(scene, [source], receiver(target), replace(OPAQUE, depth=3), gains=False).paths
+        assert len(paths) == 63, pair

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.constants import epsilon_0, speed_of_light
 from scipy.optimize import linear_sum_assignment
+from sionna_reference import sionna_paths
 from traced_rooms import (
     FREQUENCY_HZ,
     HEIGHT,
@@ -124,9 +125,8 @@ def test_gains_at_a_slab_at_normal_incidence(tmp_path):
     scene = room(tmp_path, {"wall": ("itu_brick", sheet(0, 0.0, (-50.0, 50.0), (-50.0, 50.0)))})
     brick = scene.radio_materials["itu_brick"]
     constants = float(brick.relative_permittivity[0]), float(brick.conductivity[0])
-    beside, behind = (
-        traced(scene, [[x, 0.0, 0.0]], receiver([2.0, 0, 0]), transmission=True, depth=1) for x in (4.0, -4.0)
-    )
+    options = {"transmission": True, "depth": 1}
+    beside, behind = (traced(scene, [[x, 0.0, 0.0]], receiver([2.0, 0, 0]), **options) for x in (4.0, -4.0))
     assert beside.interactions.tolist() == [[0], [1]]
     assert behind.interactions.tolist() == [[4]]
     for gain, factor in zip((beside.gain[1], behind.gain[0]), slab(THICKNESS_M["itu_brick"], *constants), strict=True):
@@ -220,26 +220,6 @@ def test_number_of_rays_converges(shoebox):
     assert found.rays == solve_module.FIRST_RAYS  # a shoebox is easy
     assert found.options.rays == "auto"
     equal(found.paths, traced(shoebox, *ends, rays=found.rays, depth=2))
-
-
-def sionna_paths(scene, tx, rx, **kinds):
-    """Lengths and gains of Sionna RT's own solver, sorted by length."""
-    import mitsuba as mi
-    from sionna import rt
-
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
-    scene.add(rt.Transmitter("tx", mi.Point3f(tx.tolist())))
-    scene.add(rt.Receiver("rx", mi.Point3f(rx.tolist())))
-    try:
-        paths = rt.PathSolver(deterministic=True)(
-            scene, max_depth=3, samples_per_src=30_000, max_num_paths_per_src=100_000, seed=1, **kinds
-        )
-    finally:
-        scene.remove(["tx", "rx"])
-    valid, (real, imaginary) = paths.valid.numpy()[0, 0], (part.numpy()[0, 0, 0, 0] for part in paths.a)
-    length = paths.tau.numpy()[0, 0][valid].astype(float) * speed_of_light
-    order = np.argsort(length)
-    return length[order], (real + 1j * imaginary)[valid][order]
 
 
 def all_found(paths, length, gain, tolerance):

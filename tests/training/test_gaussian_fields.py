@@ -18,8 +18,7 @@ from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.models import Problem
 from wrf_mi.models.model import inputs_of
 from wrf_mi.models.networks import nerf2
-from wrf_mi.models.networks.nerf2 import Nerf2Settings
-from wrf_mi.models.networks.nerf2_march import Networks
+from wrf_mi.models.networks.nerf2 import Nerf2Settings, Networks
 from wrf_mi.runs.api import train
 from wrf_mi.tasks import TASKS
 from wrf_mi.training.checkpoint import read_checkpoint, write_checkpoint
