@@ -201,7 +201,7 @@ def two_stations(rows=60, antennas=1):
 def test_a_second_receiver_with_other_components_is_learned(antennas):
     record = two_stations(antennas=antennas)
     split = halves(record)
-    predict = fitted(record, split, "view.components=2", "steps=400", "batch=16", "optimiser.network=3e-3")
+    predict = fitted(record, split, "view.components=2", "steps=700", "batch=16", "optimiser.network=3e-3")
     for r in range(2):
         truth, found = record.observation[r, split.test], predict(record.tx_pos_m[split.test], r)
         assert found.shape == truth.shape
