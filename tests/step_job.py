@@ -3,12 +3,9 @@
 ``python step_job.py FOLDER FILE BACKEND`` takes a data set and stores the arrays in ``FILE`` (npz).
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +15,7 @@ from wrf_mi.backend.libraries import LLVM_VARIABLE
 STEP = ("initial.gaussians=8", "batch=4")
 
 
-def step_in_process(folder: Path, out: Path, backend: str = "llvm", llvm: Path | None = None) -> dict[str, np.ndarray]:
+def step_in_process(folder, out, backend="llvm", llvm=None):
     """Images ``image`` and gradients by parameter of the first step, with another LLVM library where one is given."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
     if llvm is not None:
@@ -28,7 +25,7 @@ def step_in_process(folder: Path, out: Path, backend: str = "llvm", llvm: Path |
         return dict(arrays)
 
 
-def main(folder: str, out: str, backend: str) -> None:
+def main(folder, out, backend):
     """Compute the step at the initial parameters, on one thread."""
     init(backend, 1)
     import drjit as dr

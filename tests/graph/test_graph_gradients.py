@@ -1,30 +1,24 @@
 """Gradients of Gaussians and paths in one graph by every kind of parameter, against differences in float64."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from fnmatch import fnmatchcase
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from box_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
-
-from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
-from wrf_mi.tracing.options import FACTOR
-from wrf_mi.tracing.paths.instrument_parameters import receiver_pose
-from wrf_mi.tracing.paths.surface_gaussians import SurfaceGaussians
-from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
-
-# isort: split
-import drjit as dr
-import mitsuba as mi
 
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.evaluations import learned_field
+from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
 from wrf_mi.tracing import TraceOptions
+from wrf_mi.tracing.options import FACTOR
+from wrf_mi.tracing.paths.instrument_parameters import receiver_pose
+from wrf_mi.tracing.paths.surface_gaussians import SurfaceGaussians
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 
 Float64 = dr.float64_array_t(mi.Float)
 Tensor64 = dr.tensor_t(Float64)
@@ -34,14 +28,12 @@ TOLERANCE = 1e-6
 deviation of such derivatives. Central differences in float64."""
 ROUNDING = 2e-15
 """Rounding of the terms of the loss, relative to the sum of their magnitudes; differences divide it by the step."""
-SIZE_M = 0.3
-"""Standard deviation of Gaussians on surfaces."""
-STEP = 1e-6
-"""So small that no pixel crosses a footprint's cut-off, where the field jumps."""
+SIZE_M = 0.3  # Standard deviation of Gaussians on surfaces
+STEP = 1e-6  # So small that no pixel crosses a footprint's cut-off, where the field jumps
 HEIGHT, WIDTH, BATCH = 12, 40, 2
 ELEMENTS_M = planar_array(3, 3, 0.16)
 
-MODELS: dict[str, Any] = {
+MODELS = {
     "pixel": PixelReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "coherent"),
     "pixel-power": PixelReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "power"),
     "array": ArrayReceiver(HEIGHT, WIDTH, ELEMENTS_M, FREQUENCY_HZ, "coherent", instrument_scale=True),
@@ -50,6 +42,7 @@ MODELS: dict[str, Any] = {
 }
 
 
+Both = tuple[TracedField, WrfGsPlus, dict[str, Any]]
 KINDS = (
     *("material.*.permittivity", "material.*.conductivity", "plane.shift", "plane.tilt", "receiver.array.gain"),
     *("receiver.array.position", "receiver.array.turn", "receiver.array.pattern", "pattern.transmitter"),
@@ -59,16 +52,13 @@ KINDS = (
 
 
 @pytest.fixture(scope="module")
-def both(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[TracedField, WrfGsPlus, dict[str, Any]]:
+def both(request, tmp_path_factory):
     """A traced side with reflections and transmissions, a learned side, and generic values of all their parameters."""
     rng = np.random.default_rng(5)
-    scene = room(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION})
-    own = receiver((30, 20, 10))
+    scene, array = room(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION}), receiver((30, 20, 10))
     options = TraceOptions(depth=2, transmission=True, rays=4096)
     how = TracedOptions(options, pattern_degree=2, materials=request.param, planes=True)
-    traced = TracedField(scene, transmitters(BATCH), own, how)
+    traced = TracedField(scene, transmitters(BATCH), array, how)
     values = {name: value.astype(float) for name, value in traced.parameters().items()}
     values[traced.gain_name][0] = np.log(300.0)  # the learned side's size
     met = traced.interactions
@@ -78,7 +68,7 @@ def both(
     # An encoding of positions that hardly changes: it is detached on purpose, so differences alone would see it.
     encoding = Encoding(position_octaves=1, position_scale_m=1e12, tx_octaves=2)
     field = WrfGsPlus(encoding=encoding, layers=3, width=16, skip=2)
-    start = field.init(random_gaussians([own], 25, rng, opacity=0.4), rng)
+    start = field.init(random_gaussians([array], 25, rng, opacity=0.4), rng)
     start["log_scale"] += rng.normal(0, 0.3, start["log_scale"].shape).astype(np.float32)
     start["rotation"] = rng.standard_normal(start["rotation"].shape).astype(np.float32)
     values |= {f"field.{name}": value.astype(float) for name, value in start.items()}
@@ -88,18 +78,15 @@ def both(
     return traced, field, values
 
 
-def terms_of(
-    both: tuple[TracedField, WrfGsPlus, dict[str, Any]], model: Any, weight: Any
-) -> Callable[[dict[str, Any]], Any]:
+def terms_of(both, model, weight):
     """The weighted report of a receiver, whose sum is the loss."""
     traced, field, _ = both
     plane, tx_pos = perception_plane(HEIGHT, WIDTH, Float64), Tensor64(np.ascontiguousarray(traced.tx_pos_m.T))
 
-    def terms(parameters: dict[str, Any]) -> Any:
+    def terms(parameters):
         own = {name.removeprefix("field."): v for name, v in parameters.items() if name.startswith("field.")}
-        learned = learned_field(
-            field.gaussians(own, tx_pos), receiver_pose(traced.receiver, parameters, Float64), plane, model.sphere
-        )
+        pose = receiver_pose(traced.receiver, parameters, Float64)
+        learned = learned_field(field.gaussians(own, tx_pos), pose, plane, model.sphere)
         return model(traced(parameters), learned) * weight
 
     return terms
@@ -109,18 +96,15 @@ def terms_of(
 @pytest.mark.parametrize(
     ("both", "name"), [*(("named", name) for name in MODELS), ("surface", "csi")], indirect=["both"]
 )
-def test_gradients_of_both_sides(name: str, both: tuple[TracedField, WrfGsPlus, dict[str, Any]]) -> None:
+def test_gradients_of_both_sides(name, both):
     model, rng = MODELS[name], np.random.default_rng(2)
-    size = BATCH * int(np.prod(model.shape))
-    terms = terms_of(both, model, Float64(rng.standard_normal(size)))
+    terms = terms_of(both, model, Float64(rng.standard_normal(BATCH * int(np.prod(model.shape)))))
     parameters = {n: Tensor64(value) for n, value in both[2].items()}
-    for p in parameters.values():
-        dr.enable_grad(p)
+    dr.enable_grad(parameters)
     dr.backward(dr.sum(terms(parameters)))
     gradient = {n: dr.grad(p).numpy() for n, p in parameters.items()}
     parameters = {n: dr.detach(p) for n, p in parameters.items()}
-    rounding = ROUNDING * float(np.abs(terms(parameters).numpy()).sum()) / STEP
-    errors = {}
+    rounding, errors = ROUNDING * float(np.abs(terms(parameters).numpy()).sum()) / STEP, {}
     for n, p in parameters.items():
         direction = rng.standard_normal(p.shape)
         ends = [terms(parameters | {n: Tensor64(p.numpy() + s * STEP * direction)}).numpy().sum() for s in (1, -1)]

@@ -1,44 +1,35 @@
-"""Sectors of cells with azimuths, downtilts and carriers: traced power against Sionna RT's own solver."""
-
-from __future__ import annotations
+"""Carriers of sectors and of rows: powers and fields of one trace are those of Sionna RT and of single carriers."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
-from traced_rooms import SHOEBOX, write_xml
+from box_room import FREQUENCY_HZ, THICKNESS_M, receiver, transmitters
+from sionna_reference import sionna_paths
 
-from wrf_mi.core import InputError, Record
+from wrf_mi.core import InputError
 from wrf_mi.datasets import read_ble_folder
 from wrf_mi.models.checks import check_parts
 from wrf_mi.models.model import Problem
 from wrf_mi.models.ray_tracing import MODEL, TracingSettings
 from wrf_mi.tasks import instrument_of
-from wrf_mi.tracing import TraceOptions, load_trace, open_scene, trace_paths
-from wrf_mi.tracing.paths.result import recompute, save_trace
+from wrf_mi.tracing import RayTracer, TraceOptions, load_trace, open_scene, recompute, save_trace, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
-from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions, traced_fields
+from wrf_mi.tracing.search import chains as search_module
 from wrf_mi.tracing.sionna.materials import CONSTANTS, at_frequency
-from wrf_mi.tracing.tracer import RayTracer
 
-POWER_DB = 0.01
-"""Gains and lengths of Sionna RT are in single precision."""
-SINGLE = 2e-6
-"""Of the strongest path: constants of materials and gains in single precision."""
+POWER_DB = 0.01  # Gains and lengths of Sionna RT are in single precision
+SINGLE = 2e-6  # Of the strongest path: constants of materials and gains in single precision
 SECTORS = {"cell:A": (200, 8, 3.56e9), "cell B": (20, 0, 3.69e9), "c": (110, 15, 0.92e9)}
 """Azimuth and downtilt in degrees, carrier in Hz: the last below the range of ITU-R P.2040 for the room's materials."""
 OPTIONS = TraceOptions(depth=2, transmission=False, rays=30_000)
 
 
 @pytest.fixture(scope="module")
-def xml(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_xml(tmp_path_factory.mktemp("shoebox"), SHOEBOX)
-
-
-@pytest.fixture(scope="module")
-def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
+def record(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cells")
     receivers = ["id,x,y,z,azimuth_deg,downtilt_deg,frequency_hz,pattern"]
     receivers += [f"{name},3.{k},2.2,1.6,{a},{d},{hz},tr38901" for k, (name, (a, d, hz)) in enumerate(SECTORS.items())]
@@ -49,84 +40,162 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
     return read_ble_folder(folder)
 
 
-def sionna_power_db(xml: Path, tx_m: np.ndarray, record: Record, name: str) -> float:
-    """Power of a link by Sionna RT alone: yaw and pitch of the device, carrier of the scene."""
-    import mitsuba as mi
-    from sionna import rt
-
-    azimuth, downtilt, hz = SECTORS[name]
-    scene = open_scene(xml, hz)
-    scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
-    scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="tr38901", polarization="V")
-    (place,) = [receiver.position_m for receiver in record.receivers if receiver.name == name]
-    turn = mi.Point3f(*np.radians([azimuth, downtilt, 0]).tolist())
-    scene.add(rt.Transmitter("tx", mi.Point3f(tx_m.tolist())))
-    scene.add(rt.Receiver("rx", mi.Point3f(place.tolist()), orientation=turn))
-    paths = rt.PathSolver(deterministic=True)(
-        scene, max_depth=2, refraction=False, samples_per_src=30_000, max_num_paths_per_src=100_000, seed=1
-    )
-    real, imaginary = (part.numpy()[0, 0, 0, 0] for part in paths.a)
-    return float(10 * np.log10((real**2 + imaginary**2)[paths.valid.numpy()[0, 0]].sum()))
+def close(gains, expected):
+    np.testing.assert_allclose(gains, expected, rtol=0, atol=SINGLE * np.abs(expected).max())
 
 
-def test_power_of_sectors_is_that_of_sionna_rt(xml: Path, record: Record):
-    tracer = RayTracer(xml, instrument_of(record), OPTIONS)
-    power_db = tracer(record.tx_pos_m[:4])
-    expected = [[sionna_power_db(xml, tx, record, name) for tx in record.tx_pos_m[:4]] for name in SECTORS]
+def test_power_of_sectors_is_that_of_sionna_rt(shoebox_xml, record):
+    """Yaw and pitch of the device, carrier of the scene."""
+    power_db, expected = RayTracer(shoebox_xml, instrument_of(record), OPTIONS)(record.tx_pos_m[:4]), []
+    for sector, (azimuth, downtilt, hz) in zip(record.receivers, SECTORS.values(), strict=True):
+        scene, turn_rad = open_scene(shoebox_xml, hz), np.radians([azimuth, downtilt, 0])
+        to = sector.position_m, "tr38901", turn_rad
+        gains = [sionna_paths(scene, tx_m, *to, depth=2, refraction=False)[1] for tx_m in record.tx_pos_m[:4]]
+        expected.append([10 * np.log10(np.square(np.abs(gain)).sum()) for gain in gains])
     np.testing.assert_allclose(power_db, expected, atol=POWER_DB)
     assert np.ptp(power_db, axis=0).min() > 1  # sectors differ
 
 
-def test_receivers_of_one_trace_are_those_of_scenes_at_their_carriers(xml: Path, record: Record, tmp_path: Path):
-    traced = trace_paths(open_scene(xml, 2e9), record.tx_pos_m, record.receivers, OPTIONS)
+def test_receivers_of_one_trace_are_those_of_scenes_at_their_carriers(shoebox_xml, record, tmp_path):
+    traced = trace_paths(open_scene(shoebox_xml, 2e9), record.tx_pos_m, record.receivers, OPTIONS)
     stored = load_trace(save_trace(tmp_path / "paths.npz", traced))
-    assert [receiver.frequency_hz for receiver in stored.receivers] == [hz for *_, hz in SECTORS.values()]
-    for number, receiver in enumerate(record.receivers):
-        alone = trace_paths(
-            open_scene(xml, SECTORS[receiver.name][2]), record.tx_pos_m, replace(receiver, frequency_hz=None), OPTIONS
-        )
-        gain = stored.paths.gain[stored.paths.rx == number]
-        np.testing.assert_allclose(gain, alone.paths.gain, rtol=0, atol=SINGLE * np.abs(gain).max())
-    gain, again = stored.paths.gain, recompute(stored, open_scene(xml, 3e9)).paths.gain
-    np.testing.assert_allclose(again, gain, rtol=0, atol=SINGLE * np.abs(gain).max())
+    assert [sector.frequency_hz for sector in stored.receivers] == [hz for *_, hz in SECTORS.values()]
+    for number, sector in enumerate(record.receivers):
+        scene, plain = open_scene(shoebox_xml, SECTORS[sector.name][2]), replace(sector, frequency_hz=None)
+        alone = trace_paths(scene, record.tx_pos_m, plain, OPTIONS).paths
+        close(stored.paths.gain[stored.paths.rx == number], alone.gain)
+    close(recompute(stored, open_scene(shoebox_xml, 3e9)).paths.gain, stored.paths.gain)
 
 
-def test_a_scene_is_left_as_it_was(xml: Path):
-    scene = open_scene(xml, 0.92e9)
+def test_a_scene_is_left_as_it_was(shoebox_xml):
+    scene = open_scene(shoebox_xml, 0.92e9)
 
-    def state(scene: Any) -> list[float]:
+    def state(scene):
         materials = scene.radio_materials.values()
         return [float(scene.frequency[0]), *(float(getattr(m, name)[0]) for m in materials for name in CONSTANTS)]
 
     before = state(scene)
     with at_frequency(scene, 3.6e9):
-        assert state(scene) == state(open_scene(xml, 3.6e9))
+        assert state(scene) == state(open_scene(shoebox_xml, 3.6e9))
     assert state(scene) == before
     with pytest.raises(InputError, match="not known at"), at_frequency(scene, 0.1e9):
         pass
     assert state(scene) == before
 
 
-def test_a_traced_field_has_the_carrier_of_its_receiver(xml: Path, record: Record):
-    for receiver in record.receivers[:2]:
-        options, tx = TracedOptions(OPTIONS), record.tx_pos_m[:4]
-        shared = Prepared(open_scene(xml, 3.6e9))
-        field = TracedField(shared.scene, tx, receiver, options, prepared=shared)
-        assert field.frequency_hz == receiver.frequency_hz
-        plain = replace(receiver, frequency_hz=None)
-        alone = TracedField(open_scene(xml, SECTORS[receiver.name][2]), tx, plain, options)
-        gains, expected = (np.stack([part.numpy() for part in each({}).gain]) for each in (field, alone))
-        np.testing.assert_allclose(gains, expected, rtol=0, atol=SINGLE * np.abs(expected).max())
+def test_a_traced_field_has_the_carrier_of_its_receiver(shoebox_xml, record):
+    shared, options, tx = Prepared(open_scene(shoebox_xml, 3.6e9)), TracedOptions(OPTIONS), record.tx_pos_m[:4]
+    for sector in record.receivers[:2]:
+        field = TracedField(shared.scene, tx, sector, options, prepared=shared)
+        assert field.frequency_hz == sector.frequency_hz
+        plain = replace(sector, frequency_hz=None)
+        alone = TracedField(open_scene(shoebox_xml, SECTORS[sector.name][2]), tx, plain, options)
+        close(*(np.stack([part.numpy() for part in each({}).gain]) for each in (field, alone)))
 
 
-def test_carriers_of_receivers_are_checked(xml: Path, record: Record):
+def test_carriers_of_receivers_are_checked(shoebox_xml, record):
     first, *others = record.receivers
+    unstated = replace(record, receivers=(replace(first, frequency_hz=None), *others))
+    twice = replace(record, carriers_hz=np.full(len(record), 1e9))
     for wrong, message in (
-        (replace(record, receivers=(replace(first, frequency_hz=None), *others)), "some receivers have no positive"),
-        (replace(record, carriers_hz=np.full(len(record), 1e9)), "state the carriers of receivers or of rows"),
+        (unstated, "some receivers have no positive"),
+        (twice, "state the carriers of receivers or of"),
     ):
         with pytest.raises(InputError, match=message):
             check_parts(wrong)
     low = replace(record, receivers=(replace(first, frequency_hz=0.1e9), *others))
     with pytest.raises(InputError, match=r"not known at 0\.1 GHz"):
-        MODEL.check(Problem(low, TracingSettings(), 0, str(xml)), [])
+        MODEL.check(Problem(low, TracingSettings(), 0, str(shoebox_xml)), [])
+
+
+Tensor64 = dr.tensor_t(dr.float64_array_t(mi.Float))
+LOW_HZ, MIDDLE_HZ, HIGH_HZ = CARRIERS_HZ = 1.2e9, 2.4e9, 5.8e9
+FIELD_OPTIONS = TraceOptions(depth=2, transmission=True, rays=4096)
+FIELD = TracedOptions(FIELD_OPTIONS)
+PLACE = {LOW_HZ: [0, 1, 2, 3], MIDDLE_HZ: [5, 1, 1], HIGH_HZ: [4, 3, 1, 0, 6]}
+"""Transmitters of each carrier: some at several, one of them twice."""
+
+
+@pytest.fixture
+def middle(box_xml):
+    return open_scene(box_xml, MIDDLE_HZ, THICKNESS_M)
+
+
+def rows():
+    """Positions [n, 3], headings [n] and carriers [n] of the rows, in a random order."""
+    place, carrier = np.concatenate(list(PLACE.values())), np.repeat(list(PLACE), [len(p) for p in PLACE.values()])
+    order = np.random.default_rng(0).permutation(len(place))
+    return transmitters(7)[place[order]], np.linspace(-2, 2, len(place)), carrier[order]
+
+
+def response(field, parameters):
+    """Sum of all paths of each transmitter, with phases."""
+    paths = field(parameters)
+    gain = paths.gain[0].numpy() + 1j * paths.gain[1].numpy()
+    phase = np.exp(-2j * np.pi * field.frequency_hz / 299792458 * paths.length_m.numpy())
+    return (gain * phase).reshape(len(field), -1).sum(axis=1)
+
+
+def test_a_trace_at_another_carrier_compiles_nothing_anew(box_xml):
+    """Carrier and constants of materials are no literals of the kernels."""
+
+    def kernels(carrier_hz):  # the next scene has the numbers of this one's objects, which are freed
+        scene = open_scene(box_xml, carrier_hz, THICKNESS_M)
+        search_module._kept.clear()  # rays are shot at each
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            trace_paths(scene, transmitters(5), receiver(), FIELD_OPTIONS)
+            return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
+
+    assert kernels(LOW_HZ) == kernels(MIDDLE_HZ) == kernels(HIGH_HZ)
+
+
+@pytest.mark.parametrize("faint", [0.0, 0.1])
+def test_fields_are_those_of_a_search_for_each_carrier(faint, middle, searches):
+    """Positions, headings, faint paths left out and lengths; the search is of each distinct position, once."""
+    options, (tx, heading, carriers) = TracedOptions(FIELD_OPTIONS, pattern_degree=1, faint=faint), rows()
+    pattern = {"pattern.transmitter": Tensor64(np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.3]]))}
+    found = traced_fields(tx, receiver(), options, Prepared(middle), heading, carriers)
+    assert searches == [7]
+    assert [field.frequency_hz for field in found] == list(CARRIERS_HZ)
+    for field, hz in zip(found, CARRIERS_HZ, strict=True):
+        at = carriers == hz
+        alone = TracedField(middle, tx[at], receiver(), options, heading[at], frequency_hz=hz)
+        np.testing.assert_array_equal(field.exists, alone.exists)
+        close(response(field, pattern), response(alone, pattern))
+    assert len(searches) == 4
+
+
+def test_fields_are_those_of_scenes_at_each_carrier(box_xml, middle):
+    """Materials follow the laws of ITU-R P.2040 from the carrier of the search."""
+    tx, heading, carriers = rows()
+    for field in traced_fields(tx, receiver(), FIELD, Prepared(middle), heading, carriers):
+        at, scene = carriers == field.frequency_hz, open_scene(box_xml, field.frequency_hz, THICKNESS_M)
+        close(response(field, {}), response(TracedField(scene, tx[at], receiver(), FIELD, heading[at]), {}))
+
+
+def test_moved_receivers_are_searched_as_by_refresh(middle, searches):
+    """Moved by 4 cm, more than a quarter of a wavelength at two carriers: one search from there and one as stated."""
+    (tx, _, carriers), moved = rows(), {"receiver.array.position": Tensor64([0.0, 0.04, 0.0])}
+    found = traced_fields(tx, receiver(), FIELD, Prepared(middle), None, carriers, parameters=moved)
+    assert len(searches) == 2
+    for field, hz in zip(found, CARRIERS_HZ, strict=True):
+        alone = TracedField(middle, tx[carriers == hz], receiver(), FIELD, frequency_hz=hz)
+        assert alone.refresh(moved) == (hz != LOW_HZ)
+        np.testing.assert_array_equal(field.searched_at_m, alone.searched_at_m)
+        assert (field.searched_at_m == receiver().position_m).all() == (hz == LOW_HZ)
+        np.testing.assert_array_equal(response(field, moved), response(alone, moved))
+        assert not field.refresh(moved)
+
+
+def test_rows_without_carriers_have_that_of_the_scene(box):
+    tx = transmitters(3)
+    [field] = traced_fields(tx, receiver(), FIELD, Prepared(box))
+    assert field.frequency_hz == pytest.approx(FREQUENCY_HZ)
+    np.testing.assert_array_equal(response(field, {}), response(TracedField(box, tx, receiver(), FIELD), {}))
+
+
+def test_wrong_positions_are_refused(box):
+    for wrong in ([[1.0, 2.0]], [[1.0, 2.0, np.nan]]):
+        with pytest.raises(ValueError, match="tx_pos_m has shape"):
+            traced_fields(wrong, receiver(), TracedOptions(FIELD_OPTIONS), Prepared(box))

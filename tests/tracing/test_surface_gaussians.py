@@ -1,10 +1,7 @@
 """Gaussians on surfaces that change traced paths: weights, factors, derivatives."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from box_room import CEILING, FREQUENCY_HZ, HEIGHT, LENGTH, WALLS, WIDTH, receiver, room, transmitters
@@ -20,84 +17,78 @@ from wrf_mi.tracing.options import DISC, FACTOR
 from wrf_mi.tracing.paths.surface_gaussians import NEAREST, SIZE, Interactions, SurfaceGaussians
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 
-# isort: split
-import drjit as dr
-import mitsuba as mi
-
 Tensor64 = dr.tensor_t(dr.float64_array_t(mi.Float))
 SPACING_M = 0.5
 UP, EAST = np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
-FLOAT32 = 1e-6
-"""Relative; centres are stored in single precision."""
+FLOAT32 = 1e-6  # Relative; centres are stored in single precision
 
 
-def on_floor(*places: tuple[float, float], height_m: float = 0.0, normal: np.ndarray = UP) -> Interactions:
+def on_floor(*places, height_m=0.0, normal=UP):
     position = np.array([[x, y, height_m] for x, y in places])
     return Interactions(position, np.broadcast_to(normal, position.shape))
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Any:
+def scene(tmp_path_factory):
     return room(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING})
 
 
-def traced(scene: Any, depth: int = 2) -> TracedField:
+def traced(scene, depth=2):
     return TracedField(scene, transmitters(6), receiver(), TracedOptions(TraceOptions(depth=depth, rays=4096)))
 
 
-def gain(side: TracedField, parameters: dict[str, Any], rows: Any | None = None) -> np.ndarray:
+def covered(side):
+    """Gaussians where its paths meet surfaces, attached."""
+    gaussians = SurfaceGaussians.covering(side.interactions, SPACING_M)
+    side.attach(gaussians)
+    return gaussians
+
+
+def gain(side, parameters, rows=None):
     re, im = side(parameters, rows).gain
     return re.numpy() + 1j * im.numpy()
 
 
-def test_weights_are_gaussians_of_the_distance_on_the_same_plane() -> None:
+def test_weights_are_gaussians_of_the_distance_on_the_same_plane():
     """Points at another height or on a wall are not on the floor, however near."""
     discs = np.array([[0.0, 0, 0, 0, 0, 1], [0.6, 0, 0, 0, 0, 1]]).T
     gaussians = SurfaceGaussians(discs, SIZE * SPACING_M)
     index, weight = gaussians.near(on_floor((0.2, 0.1)))
-    found = np.bincount(index[0], weight[0])
-    distance = np.array([0.04 + 0.01, 0.16 + 0.01])
-    np.testing.assert_allclose(found, np.exp(-distance / (2 * (SIZE * SPACING_M) ** 2)), rtol=FLOAT32)
+    expected = np.exp(-np.array([0.04 + 0.01, 0.16 + 0.01]) / (2 * (SIZE * SPACING_M) ** 2))
+    np.testing.assert_allclose(np.bincount(index[0], weight[0]), expected, rtol=FLOAT32)
     assert np.count_nonzero(weight) == 2
-    assert not gaussians.near(on_floor((0.2, 0.1), height_m=0.1))[1].any()
-    assert not gaussians.near(on_floor((0.2, 0.1), normal=EAST))[1].any()
-    assert not gaussians.near(on_floor((9.0, 9.0)))[1].any()
+    place = (0.2, 0.1)
+    for far in (on_floor(place, height_m=0.1), on_floor(place, normal=EAST), on_floor((9.0, 9.0))):
+        assert not gaussians.near(far)[1].any()
 
 
-def test_gaussians_cover_each_plane_where_enough_paths_meet_it() -> None:
+def test_gaussians_cover_each_plane_where_enough_paths_meet_it():
     """Two parallel planes within a cell get Gaussians of their own, a cell of few points none."""
-    rng = np.random.default_rng(0)
-    places = [tuple(place) for place in rng.uniform(-0.2, 0.2, (8, 2))]
-    low, high, few = on_floor(*places), on_floor(*places, height_m=0.1), on_floor((3.0, 3.0))
-    gaussians = SurfaceGaussians.covering(
-        Interactions(*map(np.concatenate, zip(low, high, few, strict=True))), SPACING_M
-    )
+    places = [tuple(place) for place in np.random.default_rng(0).uniform(-0.2, 0.2, (8, 2))]
+    groups = on_floor(*places), on_floor(*places, height_m=0.1), on_floor((3.0, 3.0))
+    gaussians = SurfaceGaussians.covering(Interactions(*map(np.concatenate, zip(*groups, strict=True))), SPACING_M)
     assert len(gaussians) == 2
     np.testing.assert_allclose(np.sort(gaussians.discs[2]), [0, 0.1], atol=FLOAT32)
     np.testing.assert_allclose(gaussians.discs[:2].T, [np.mean(places, axis=0)] * 2, atol=FLOAT32)
     assert (gaussians.discs[5] == 1).all()
 
 
-def test_parameters_restore_the_same_gaussians() -> None:
+def test_parameters_restore_the_same_gaussians():
     places = [tuple(place) for place in np.random.default_rng(1).uniform(0, 3, (200, 2))]
     gaussians = SurfaceGaussians.covering(on_floor(*places), SPACING_M)
-    again = SurfaceGaussians.of(gaussians.parameters(), SPACING_M)
-    assert again is not None
-    np.testing.assert_array_equal(again.discs, gaussians.discs)
+    np.testing.assert_array_equal(SurfaceGaussians.of(gaussians.parameters(), SPACING_M).discs, gaussians.discs)
     assert SurfaceGaussians.of({}, SPACING_M) is None
 
 
-def test_factor_multiplies_the_paths_that_meet_a_gaussian(scene: Any) -> None:
+def test_factor_multiplies_the_paths_that_meet_a_gaussian(scene):
     """One Gaussian under the ceiling, against NumPy: paths that the ceiling reflects change by exp(w (a + j b))."""
     side = traced(scene, depth=1)
     before = gain(side, {})
     met, path = side.interactions, np.flatnonzero(side.exists)
     on_ceiling = np.isclose(met.position_m[:, 2], HEIGHT)
     centre = met.position_m[on_ceiling][0]
-    gaussians = SurfaceGaussians(np.array([[*centre, 0, 0, 1.0]]).T, 0.3)
-    side.attach(gaussians)
-    factor = Tensor64(np.array([[0.2], [0.5]]))
-    ratio = gain(side, {FACTOR: factor})[path] / before[path]
+    side.attach(SurfaceGaussians(np.array([[*centre, 0, 0, 1.0]]).T, 0.3))
+    ratio = gain(side, {FACTOR: Tensor64(np.array([[0.2], [0.5]]))})[path] / before[path]
     distance = np.linalg.norm(met.position_m[on_ceiling] - centre, axis=1)
     weight = np.where(distance < 1.2, np.exp(-np.square(distance) / 0.18), 0)
     expected = np.exp(weight * (0.2 + 0.5j))
@@ -107,30 +98,24 @@ def test_factor_multiplies_the_paths_that_meet_a_gaussian(scene: Any) -> None:
     np.testing.assert_allclose(np.sort(np.abs(ratio[changed])), np.sort(np.abs(expected)), rtol=1e-9)
 
 
-def test_zero_factors_leave_paths_unchanged_and_batches_agree(scene: Any) -> None:
+def test_zero_factors_leave_paths_unchanged_and_batches_agree(scene):
     side = traced(scene)
-    before = gain(side, {})
-    gaussians = SurfaceGaussians.covering(side.interactions, SPACING_M)
-    side.attach(gaussians)
+    before, gaussians = gain(side, {}), covered(side)
     zeros = Tensor64(gaussians.parameters()[FACTOR].astype(float))
     np.testing.assert_allclose(gain(side, {FACTOR: zeros}), before, rtol=1e-12)
-    factor = Tensor64(np.random.default_rng(0).normal(0, 0.3, (2, len(gaussians))))
-    whole = gain(side, {FACTOR: factor})
-    assert np.abs(whole - before).max() > 0.01 * np.abs(before).max()
-    rows = gain(side, {FACTOR: factor}, mi.UInt32([4, 1]))
-    each = len(whole) // len(side)
-    np.testing.assert_allclose(rows, np.concatenate([whole[4 * each : 5 * each], whole[each : 2 * each]]), rtol=1e-12)
+    factor = {FACTOR: Tensor64(np.random.default_rng(0).normal(0, 0.3, (2, len(gaussians))))}
+    after = gain(side, factor)
+    assert np.abs(after - before).max() > 0.01 * np.abs(before).max()
+    rows = after.reshape(len(side), -1)[[4, 1]].ravel()
+    np.testing.assert_allclose(gain(side, factor, mi.UInt32([4, 1])), rows, rtol=1e-12)
 
 
-def test_derivatives_agree_with_finite_differences(scene: Any) -> None:
-    side = traced(scene)
-    gaussians = SurfaceGaussians.covering(side.interactions, SPACING_M)
-    side.attach(gaussians)
-    rng = np.random.default_rng(2)
-    start, direction = rng.normal(0, 0.3, (2, 2, len(gaussians)))
+def test_derivatives_agree_with_finite_differences(scene):
+    side, rng = traced(scene), np.random.default_rng(2)
+    start, direction = rng.normal(0, 0.3, (2, 2, len(covered(side))))
     weights = [dr.float64_array_t(mi.Float)(rng.normal(0, 1e6, len(gain(side, {})))) for _ in range(2)]
 
-    def value(factor: Any) -> Any:
+    def value(factor):
         re, im = side({FACTOR: factor}).gain
         return dr.sum(re * weights[0] + im * weights[1])
 
@@ -138,16 +123,14 @@ def test_derivatives_agree_with_finite_differences(scene: Any) -> None:
     dr.enable_grad(factor)
     dr.backward(value(factor))
     slope = float((dr.grad(factor).numpy() * direction).sum())
-    step = 1e-5
-    plus, minus = (float(value(Tensor64(start + sign * step * direction))[0]) for sign in (1, -1))
-    assert slope == pytest.approx((plus - minus) / (2 * step), rel=1e-7)
+    plus, minus = (float(value(Tensor64(start + step * direction))[0]) for step in (1e-5, -1e-5))
+    assert slope == pytest.approx((plus - minus) / 2e-5, rel=1e-7)
 
 
-def test_other_search_of_paths_keeps_the_gaussians(scene: Any, tmp_path: Path) -> None:
+def test_other_search_of_paths_keeps_the_gaussians(scene, tmp_path):
     """A receiver that moved has other paths, with weights of their own."""
     side = traced(scene)
-    gaussians = SurfaceGaussians.covering(side.interactions, SPACING_M)
-    side.attach(gaussians)
+    gaussians = covered(side)
     factor = {FACTOR: Tensor64(np.full((2, len(gaussians)), 0.2))}
     side.search(side.receiver.position_m + np.array([0.3, 0, 0]))
     moved = gain(side, factor)
@@ -157,7 +140,7 @@ def test_other_search_of_paths_keeps_the_gaussians(scene: Any, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_calibration_learns_a_patch_that_no_surface_has(tmp_path: Path) -> None:
+def test_calibration_learns_a_patch_that_no_surface_has(tmp_path):
     """Half of the metal ceiling is plasterboard, which the scene does not say: channels away from the training rows.
 
     Materials of whole surfaces cannot explain it. The run that is opened again predicts the same.

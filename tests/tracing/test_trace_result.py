@@ -1,59 +1,51 @@
-"""Files of traces, and recomputed gains for other materials, frequencies and antennas."""
+"""Paths that nothing obstructs, against all triangles; files of traces and gains that are recomputed from them."""
 
-from dataclasses import fields, replace
-from pathlib import Path
+from dataclasses import replace
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 import pytest
-from traced_rooms import FREQUENCY_HZ, PARTITION, SHOEBOX, inside, receiver, room, write_xml
+from traced_rooms import FREQUENCY_HZ, LENGTH, PARTITION, SHOEBOX, inside, receiver, room
+from wrf_mi_scenes.build_laboratory import sheet
 
-from wrf_mi.core import Antenna, InputError, Paths, load_paths, save_paths
+from wrf_mi.core import Antenna, InputError, load_paths, save_paths
 from wrf_mi.core.settings import settings_from, with_settings
 from wrf_mi.correction.options import CorrectionOptions
 from wrf_mi.graph.settings import TracedConfig
 from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.models.uplink.r2f2 import PathSettings
-from wrf_mi.tracing import TraceOptions, TraceResult, load_trace, open_scene, recompute, save_trace, trace_paths
-from wrf_mi.tracing.options import SpecularOptions
+from wrf_mi.tracing import TraceOptions, load_trace, open_scene, recompute, save_trace, trace_paths
+from wrf_mi.tracing.paths.solve import Prepared
+from wrf_mi.tracing.search.chains import SPECULAR, TRANSMISSION
 from wrf_mi.tracing.search.surfaces import scene_surfaces
+from wrf_mi.tracing.search.visibility import unobstructed
 from wrf_mi.tracing.sionna.path_solver import field_of, to_buffer
 
-SINGLE = 1e-5
-"""Relative to the largest; other widths of vector instructions."""
+SINGLE = 1e-5  # Relative to the largest; other widths of vector instructions
 OPTIONS = TraceOptions(transmission=True, rays=1 << 13)
 
 
-@pytest.fixture(scope="module")
-def xml(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_xml(tmp_path_factory.mktemp("room"), {**SHOEBOX, **PARTITION})
-
-
 @pytest.fixture
-def scene(xml: Path) -> Any:
-    return open_scene(xml, FREQUENCY_HZ)
+def scene(divided_xml):
+    return open_scene(divided_xml, FREQUENCY_HZ)
 
 
 @pytest.fixture(scope="module")
-def traced(xml: Path) -> TraceResult:
+def traced(divided_xml):
     everyone = [receiver(p, f"rx{k}") for k, p in enumerate(inside(2, 2))]
-    return trace_paths(open_scene(xml, FREQUENCY_HZ), inside(5), everyone, OPTIONS)
+    return trace_paths(open_scene(divided_xml, FREQUENCY_HZ), inside(5), everyone, OPTIONS)
 
 
-def close(a: np.ndarray, b: np.ndarray) -> None:
+def close(a, b):
     np.testing.assert_allclose(a, b, atol=SINGLE * np.abs(b).max())
 
 
-def test_stored_traces_are_read_back(traced: TraceResult, tmp_path: Path):
+def test_stored_traces_are_read_back(traced, tmp_path):
     read = load_trace(save_trace(tmp_path / "paths.npz", traced))
-    for field in fields(Paths):
-        np.testing.assert_array_equal(getattr(read.paths, field.name), getattr(traced.paths, field.name))
-    assert (read.options, read.rays, read.from_receivers, read.frequency_hz) == (
-        traced.options,
-        traced.rays,
-        traced.from_receivers,
-        traced.frequency_hz,
-    )
+    np.testing.assert_equal(vars(read.paths), vars(traced.paths))
+    for name in ("options", "rays", "from_receivers", "frequency_hz"):
+        assert getattr(read, name) == getattr(traced, name), name
     for name in ("tx_pos_m", "primitives", "probability"):
         np.testing.assert_array_equal(getattr(read, name), getattr(traced, name))
     assert [r.name for r in read.receivers] == ["rx0", "rx1"]
@@ -61,23 +53,22 @@ def test_stored_traces_are_read_back(traced: TraceResult, tmp_path: Path):
     assert {path.name for path in tmp_path.iterdir()} == {"paths.npz"}
 
 
-@pytest.mark.parametrize("kind", [TracedConfig, CorrectionOptions, PathSettings, TracingSettings])
-def test_settings_of_every_model_with_a_scene_state_the_same_search(kind: type[SpecularOptions]) -> None:
+def test_settings_of_every_model_with_a_scene_state_the_same_search():
     """One name and one meaning of depth, reflections, transmission and rays."""
-    for transmission in (True, False):
+    for kind, transmission in product((TracedConfig, CorrectionOptions, PathSettings, TracingSettings), (True, False)):
         stated = {"depth": 2, "reflections": 1, "transmission": transmission, "rays": 64}
-        assert kind(**stated).options == TraceOptions(**stated)
+        assert kind(**stated).options == TraceOptions(**stated), kind
 
 
-def test_former_names_of_depth_and_reflections_are_read() -> None:
+def test_former_names_of_depth_and_reflections_are_read():
     """Traces and runs of earlier versions state them, and so do scripts."""
     stated = {"max_depth": 6, "max_reflections": 2, "transmission": True}
+    as_text = with_settings(TraceOptions(), [f"{name}={value}" for name, value in stated.items()])
     expected = TraceOptions(depth=6, reflections=2, transmission=True)
-    assert settings_from(TraceOptions, stated, "paths.npz") == expected
-    assert with_settings(TraceOptions(), [f"{name}={value}" for name, value in stated.items()]) == expected
+    assert settings_from(TraceOptions, stated, "paths.npz") == as_text == expected
 
 
-def test_selected_transmitters_have_the_paths_of_their_own_trace(traced: TraceResult, scene: Any):
+def test_selected_transmitters_have_the_paths_of_their_own_trace(traced, scene):
     """In the order asked for, repeatedly, at all receivers, of one carrier or several."""
     which = np.array([3, 1, 3])
     found = replace(traced, carriers_hz=np.arange(5.0)).of_transmitters(which)
@@ -86,49 +77,48 @@ def test_selected_transmitters_have_the_paths_of_their_own_trace(traced: TraceRe
         np.testing.assert_array_equal(getattr(found.paths, name), getattr(expected.paths, name))
     np.testing.assert_array_equal(found.primitives, expected.primitives)
     np.testing.assert_array_equal(found.tx_pos_m, inside(5)[which])
-    np.testing.assert_array_equal(found.carriers_hz, [3, 1, 3])
+    np.testing.assert_array_equal(found.carriers_hz, which)
+    assert not len(traced.of_transmitters(which[:0]).paths)
     close(found.paths.gain, expected.paths.gain)
     close(found.paths.length_m, expected.paths.length_m)
-    assert len(traced.of_transmitters(which[:0]).paths) == 0
 
 
-def test_wrong_files_are_refused(traced: TraceResult, tmp_path: Path, scene: Any):
+def test_wrong_files_are_refused(traced, tmp_path):
     with pytest.raises(InputError, match="missing; trace"):
         load_trace(tmp_path / "none.npz")
-    (tmp_path / "bad.npz").write_bytes(b"PK no")
-    with pytest.raises(InputError, match="not readable"):
-        load_paths(tmp_path / "bad.npz")
-    plain = save_paths(tmp_path / "plain.npz", traced.paths)
+    plain, bad = save_paths(tmp_path / "plain.npz", traced.paths), tmp_path / "bad.npz"
     assert len(load_paths(plain)) == len(traced.paths)
     with pytest.raises(InputError, match="holds paths alone"):
         load_trace(plain)
-    arrays = dict(np.load(plain))
-    np.savez(tmp_path / "new.npz", **(arrays | {"format": 99}))
-    with pytest.raises(InputError, match="format 99"):
-        load_paths(tmp_path / "new.npz")
-    np.savez(tmp_path / "short.npz", **{key: value for key, value in arrays.items() if key != "gain"})
-    with pytest.raises(InputError, match="gain"):
-        load_paths(tmp_path / "short.npz")
-    np.savez(tmp_path / "pickle.npz", **(arrays | {"tx": np.array([{}], object)}))
+    bad.write_bytes(b"PK no")
     with pytest.raises(InputError, match="not readable"):
-        load_paths(tmp_path / "pickle.npz")
+        load_paths(bad)
+    arrays = dict(np.load(plain))
+    without = {key: value for key, value in arrays.items() if key != "gain"}
+    pickled = arrays | {"tx": np.array([{}], object)}
+    wrong = {"format 99": arrays | {"format": np.array(99)}, "gain": without, "not readable": pickled}
+    for message, changed in wrong.items():
+        np.savez(bad, **changed)
+        with pytest.raises(InputError, match=message):
+            load_paths(bad)
     with pytest.raises(ValueError, match="length_m has shape"):
         replace(traced.paths, length_m=traced.paths.length_m[:-1])
-    other = room(tmp_path / "other", SHOEBOX)
+
+
+def test_traces_of_other_scenes_are_refused(traced, scene, shoebox):
     with pytest.raises(InputError, match="no object 'partition'"):
-        recompute(traced, other)
+        recompute(traced, shoebox)
     again = replace(traced, primitives=np.where(traced.primitives >= 0, 77, -1).astype(np.int32))
     with pytest.raises(InputError, match="is not the one"):
         recompute(again, scene)
 
 
-def test_recomputed_gains_are_the_traced_ones(traced: TraceResult, scene: Any, tmp_path: Path):
-    np.testing.assert_array_equal(recompute(traced, scene).paths.gain, traced.paths.gain)
-    read = load_trace(save_trace(tmp_path / "paths.npz", traced))
-    np.testing.assert_array_equal(recompute(read, scene).paths.gain, traced.paths.gain)
+def test_recomputed_gains_are_the_traced_ones(traced, scene, tmp_path):
+    for trace in (traced, load_trace(save_trace(tmp_path / "paths.npz", traced))):
+        np.testing.assert_array_equal(recompute(trace, scene).paths.gain, traced.paths.gain)
 
 
-def test_recomputed_gains_for_other_materials_are_those_of_a_new_trace(traced: TraceResult, scene: Any):
+def test_recomputed_gains_for_other_materials_are_those_of_a_new_trace(traced, scene):
     for name, thickness in (("itu_concrete", 0.37), ("itu_plasterboard", 0.013)):
         scene.radio_materials[name].thickness = thickness
     brick = scene.radio_materials["itu_brick"]
@@ -141,18 +131,17 @@ def test_recomputed_gains_for_other_materials_are_those_of_a_new_trace(traced: T
     assert np.abs(again.gain - traced.paths.gain).max() > 1e-2 * np.abs(traced.paths.gain).max()
 
 
-def test_recomputed_gains_at_another_frequency_are_those_of_a_new_trace(traced: TraceResult, xml: Path):
-    scene = open_scene(xml, 5.2e9)
+def test_recomputed_gains_at_another_frequency_are_those_of_a_new_trace(traced, divided_xml):
+    scene = open_scene(divided_xml, 5.2e9)
     again = recompute(traced, scene)
     assert again.frequency_hz == pytest.approx(5.2e9, rel=1e-6)
     close(again.paths.gain, trace_paths(scene, traced.tx_pos_m, traced.receivers, OPTIONS).paths.gain)
 
 
-def test_recomputed_gains_of_dipoles_have_their_pattern(traced: TraceResult, scene: Any):
+def test_recomputed_gains_of_dipoles_have_their_pattern(traced, scene):
     """A half-wave dipole's directivity is 1.64 at the horizon, and cos(pi/2 cos) / sin elsewhere, at both ends."""
-    direct = traced.select(traced.paths.bounces == 0)
+    direct, antenna = traced.select(traced.paths.bounces == 0), Antenna("hw_dipole")
     assert len(direct.paths)
-    antenna = Antenna("hw_dipole")
     receivers = tuple(replace(rx, antenna=antenna) for rx in direct.receivers)
     dipole = recompute(replace(direct, receivers=receivers, tx_antenna=antenna), scene).paths.gain
     cosine = direct.paths.departure[:, 2]
@@ -160,7 +149,7 @@ def test_recomputed_gains_of_dipoles_have_their_pattern(traced: TraceResult, sce
     np.testing.assert_allclose(np.abs(dipole / direct.paths.gain), pattern, rtol=1e-3)  # of the rounded 1.643
 
 
-def test_reversed_legs_have_reversed_interactions(traced: TraceResult, scene: Any):
+def test_reversed_legs_have_reversed_interactions(traced, scene):
     legs = traced.legs(scene_surfaces(scene))
     back = legs.reverse()
     for index in np.flatnonzero(traced.paths.bounces == 3)[:5]:
@@ -170,19 +159,18 @@ def test_reversed_legs_have_reversed_interactions(traced: TraceResult, scene: An
 
 
 @pytest.mark.gradcheck
-def test_derivatives_by_materials_are_central_differences(traced: TraceResult, scene: Any):
+def test_derivatives_by_materials_are_central_differences(traced, scene):
     """Single precision leaves three digits."""
     import drjit as dr
     import mitsuba as mi
 
-    surfaces = scene_surfaces(scene)
+    surfaces, material = scene_surfaces(scene), scene.radio_materials["itu_brick"]
     buffer = to_buffer(traced.legs(surfaces), surfaces)
-    material = scene.radio_materials["itu_brick"]
     material.frequency_update_callback = None
     names = "relative_permittivity", "conductivity", "thickness"
     stated = {name: float(np.ravel(getattr(material, name))[0]) for name in names}
 
-    def power(**changes: Any) -> Any:
+    def power(**changes):
         for name, value in stated.items():
             setattr(material, name, changes.get(name, mi.Float(value)))
         real, imaginary = field_of(scene, buffer, traced.ends(), traced.rays, loop_mode="evaluated")
@@ -195,3 +183,106 @@ def test_derivatives_by_materials_are_central_differences(traced: TraceResult, s
         step = 2e-3 * value  # a slab of half a wavelength resonates
         high, low = (float(power(**{name: mi.Float(value + sign * step)})[0]) for sign in (1, -1))
         assert float(dr.grad(variables[name])[0]) == pytest.approx((high - low) / (2 * step), rel=2e-2), name
+
+
+SHORT_M = 0.01  # Sionna RT's least distance of interactions
+AT_M = 1e-9  # Rounding of float64 at a few metres, with a margin of a million
+TWO_SHEETS = {
+    **SHOEBOX,
+    **PARTITION,
+    "behind": ("itu_plasterboard", sheet(0, 3.19, (0.5, 4.5), (0.0, 2.8))),
+    "board": ("itu_brick", sheet(1, 2.6, (0.4, LENGTH - 0.7), (0.6, 2.0))),
+}
+"""The shoebox with a wall of two sheets, of which the first hides the second, and a board across it."""
+
+
+@pytest.fixture(scope="module")
+def sheets(tmp_path_factory):
+    return room(tmp_path_factory.mktemp("sheets"), TWO_SHEETS)
+
+
+def met(surfaces, start, end):
+    """Distances from the start at which a segment meets planes with faces, by plane (Moeller and Trumbore, 1997)."""
+    a, way = surfaces.triangles[:, 0], end - start
+    first, second = (surfaces.triangles[:, k] - a for k in (1, 2))
+    p = np.cross(way, second)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1 / (first * p).sum(axis=1)
+        u = ((start - a) * p).sum(axis=1) * scale
+        q = np.cross(start - a, first)
+        v, t = (q @ way) * scale, (second * q).sum(axis=1) * scale
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t <= 1 + AT_M)
+    return {int(surfaces.plane[face]): float(t[face] * np.linalg.norm(way)) for face in np.flatnonzero(hit)}
+
+
+def paths_of(surfaces, source, target, depth, reflections, passes):
+    """Kinds and planes of the interactions of all paths, by trying all sequences of planes."""
+    for planes in (p for count in range(reflections + 1) for p in product(range(len(surfaces.normal)), repeat=count)):
+        images = [source]
+        for plane in planes:
+            height = images[-1] @ surfaces.normal[plane] - surfaces.offset[plane]
+            images.append(images[-1] - 2 * height * surfaces.normal[plane])
+        vertices = [target]
+        for plane, image in zip(reversed(planes), reversed(images), strict=False):
+            near, far = (x @ surfaces.normal[plane] - surfaces.offset[plane] for x in (vertices[0], image))
+            if near * far >= 0:
+                break
+            vertices.insert(0, vertices[0] + near / (near - far) * (image - vertices[0]))
+        if len(vertices) != len(planes) + 1:
+            continue
+        vertices.insert(0, source)
+        found, points = list[tuple[int, int]](), [source]
+        for leg, (start, end) in enumerate(pairwise(vertices)):
+            hits = met(surfaces, start, end)
+            length = float(np.linalg.norm(end - start))
+            if leg:
+                hits.pop(planes[leg - 1], None)
+            reflecting = leg < len(planes)
+            if reflecting and hits.pop(planes[leg], None) is None:
+                break
+            between = sorted((at, plane) for plane, at in hits.items() if at < length - AT_M)
+            found += [(TRANSMISSION, plane) for _, plane in between]
+            points += [start + (end - start) * at / length for at, _ in between] + [end]
+            if reflecting:
+                found.append((SPECULAR, planes[leg]))
+        else:
+            apart = np.linalg.norm(np.diff(points, axis=0), axis=1).min() > SHORT_M
+            kinds, where = tuple(kind for kind, _ in found), tuple(plane for _, plane in found)
+            if apart and len(found) <= depth and (passes or TRANSMISSION not in kinds):
+                yield kinds, where
+
+
+@pytest.mark.parametrize("passes", [False, True])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_paths_are_those_of_all_sequences_of_planes(sheets, seed, passes):
+    """Among them reflections at the second sheet of a wall, with a transmission through the first before and after."""
+    tx, rx = inside(4, seed), [receiver(p, f"rx{k}") for k, p in enumerate(inside(2, seed + 10))]
+    options = TraceOptions(transmission=passes, depth=5, reflections=2, rays=1 << 16)
+    prepared = Prepared(sheets)
+    traced = trace_paths(sheets, tx, rx, options, prepared=prepared, gains=False)
+    surfaces, paths, found = prepared.surfaces, traced.paths, set[tuple[Any, ...]]()
+    plane = surfaces.plane[surfaces.first_face[:-1]]  # of each sheet
+    for number, kinds in enumerate(paths.interactions):
+        count = np.count_nonzero(kinds)
+        ends = int(paths.tx[number]), int(paths.rx[number])
+        found.add((*ends, tuple(kinds[:count].tolist()), tuple(plane[paths.objects[number, :count]].tolist())))
+    expected = {
+        (i, k, *path)
+        for i, k in product(range(len(tx)), range(len(rx)))
+        for path in paths_of(surfaces, tx[i], rx[k].position_m, 5, 2, passes)
+    }
+    assert found == expected
+    assert len(found) == len(paths) > 25
+    behind = paths.objects[:, 1] == paths.object_names.index("behind")
+    assert (behind & (paths.interactions[:, :3] == [4, 1, 4]).all(axis=1)).any() == passes
+
+
+def test_every_target_is_reached_where_there_are_no_surfaces(sheets):
+    """In a scene without surfaces, and without candidates."""
+    surfaces = Prepared(sheets).surfaces
+    none = replace(surfaces, triangles=surfaces.triangles[:0], plane=surfaces.plane[:0])
+    ends = np.array([[[0.0, 0, 0], [1, 2, 2]], [[0, 0, 0], [0.005, 0, 0]]])
+    met = unobstructed(none, ends, np.zeros((2, 0), np.int64), 3, True)
+    assert met.candidate.tolist() == [0, 1]
+    assert not met.interactions.any()
+    assert not len(unobstructed(surfaces, ends[:0], np.zeros((0, 0), np.int64), 3, True).candidate)

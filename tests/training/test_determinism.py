@@ -1,8 +1,6 @@
 """Repeatability: equal bits of fits, equal steps on other backends, and the backend of ``--deterministic``."""
 
-from __future__ import annotations
-
-from pathlib import Path
+from functools import partial
 
 import drjit as dr
 import numpy as np
@@ -14,7 +12,7 @@ from wrf_mi import backend
 from wrf_mi.backend.probe import try_llvm
 from wrf_mi.cli import train as cli_train
 from wrf_mi.cli.main import main
-from wrf_mi.core import BackendError, Record
+from wrf_mi.core import BackendError
 from wrf_mi.core.array_files import stored_arrays
 from wrf_mi.parallel import run_module
 from wrf_mi.runs.api import Interrupted, resume, train
@@ -25,54 +23,38 @@ FIT = (
     *(*QUICK, "steps=30", "checkpoint_every=10"),
     *("density.every=12", "density.start=0", "density.stop=1", "density.growth_fraction=0.3"),
 )
-IMAGE = 1e-5
-"""Bound on the largest difference of an image, relative to its largest pixel."""
-GRADIENT = 1e-3
-"""Bound on the relative difference in norm of a step's gradient, each group, as in the stress benchmark."""
+IMAGE = 1e-5  # Bound on the largest difference of an image, relative to its largest pixel
+GRADIENT = 1e-3  # Bound on the relative difference in norm of a step's gradient, each group, as in the stress benchmark
 
 
-@pytest.fixture
-def gpu_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process that has begun to compute on a GPU."""
-    cuda = backend.Backend("cuda", backend.VARIANTS["cuda"], None, None, "made up")
-    monkeypatch.setattr(backend, "_active", cuda)
-
-
-def arrays_of(run: Path) -> dict[str, np.ndarray]:
+def arrays_of(run):
     """Fitted arrays and predictions of a run, without times."""
     files = [run / name for name in ("model.npz", "paths.npz", "predictions.npz") if (run / name).exists()]
-    loaded = {f"{file.name}: {key}": values for file in files for key, values in stored_arrays(file).items()}
-    return {name: values for name, values in loaded.items() if not name.endswith("seconds")}
+    arrays = {f"{file.name}: {key}": values for file in files for key, values in stored_arrays(file).items()}
+    return {name: values for name, values in arrays.items() if not name.endswith("seconds")}
 
 
-def assert_same_bits(one: Path, other: Path) -> None:
-    found, expected = arrays_of(one), arrays_of(other)
+def assert_same_bits(run, other):
+    found, expected = ({k: (v.dtype, v.tobytes()) for k, v in arrays_of(folder).items()} for folder in (run, other))
     assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        assert (found[name].dtype, found[name].tobytes()) == (values.dtype, values.tobytes()), name
+    assert [name for name, bits in expected.items() if found[name] != bits] == []
 
 
-def test_deterministic_fits_of_two_processes_have_equal_bits(folder: Path, tmp_path: Path) -> None:
-    """One trains without a stop, one stops here and is resumed by another process."""
-    words = [word for setting in FIT for word in ("--set", setting)]
-    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
-    assert (
-        run_module(
-            "wrf_mi.cli", ["train", str(folder), "--model", "wrf-gs+", "--deterministic", *words, "--out", str(whole)]
-        )[0]
-        == 0
-    )
+def test_deterministic_fits_of_two_processes_have_equal_bits(folder, tmp_path):
+    """Another process trains without a stop, this one stops and resumes from the files."""
+    words, complete, resumed = [word for s in FIT for word in ("--set", s)], tmp_path / "complete", tmp_path / "resumed"
+    asked = ["train", str(folder), "--model", "wrf-gs+", "--deterministic", *words, "--out", str(complete)]
+    assert run_module("wrf_mi.cli", asked)[0] == 0
     with pytest.raises(Interrupted):
         train(folder, resumed, "wrf-gs+", settings=[*FIT, "deterministic=true"], stop=stop_after(17))
-    assert run_module("wrf_mi.cli", ["train", "--resume", str(resumed)])[0] == 0
-    assert_same_bits(whole, resumed)
-    assert stored_arrays(whole / "model.npz")["param/position"].shape[1] > 8
+    backend.set_threads(2)
+    resume(resumed)
+    assert_same_bits(complete, resumed)
+    assert stored_arrays(complete / "model.npz")["param/position"].shape[1] > 8
 
 
 @pytest.mark.parametrize("model", ["kriging", "ray-tracing"])
-def test_kriging_and_paths_do_not_depend_on_the_number_of_threads(
-    model: str, flat_folder: Path, tmp_path: Path
-) -> None:
+def test_kriging_and_paths_do_not_depend_on_the_number_of_threads(model, flat_folder, tmp_path):
     scene = make_scene(flat_folder / "layout.csv", tmp_path / "room", height_m=2.7).folder
     for threads in (1, 2):
         backend.set_threads(threads)
@@ -80,33 +62,35 @@ def test_kriging_and_paths_do_not_depend_on_the_number_of_threads(
     assert_same_bits(tmp_path / "on-1", tmp_path / "on-2")
 
 
-def assert_equal_steps(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+def assert_equal_steps(one, other):
     assert np.abs(one["image"] - other["image"]).max() < IMAGE * np.abs(one["image"]).max()
     for name, values in one.items():
         assert np.linalg.norm(values - other[name]) <= GRADIENT * np.linalg.norm(values), name
 
 
-def other_llvms() -> list[Path]:
+def other_llvms():
     """Usable LLVM libraries of other major versions than this process uses."""
     major = (backend.init().llvm_version or "").split(".")[0]
     verdicts = {library.path: try_llvm(library) for library in backend.find_llvm(ignore_variable=True)}
     return [path for path, one in verdicts.items() if one.usable and one.version.split(".")[0] != major]
 
 
-@pytest.mark.skipif(not other_llvms(), reason="one version of LLVM here")
-def test_another_llvm_gives_equal_steps(folder: Path, tmp_path: Path) -> None:
-    one = step_in_process(folder, tmp_path / "one.npz")
-    for path in other_llvms():
-        assert_equal_steps(one, step_in_process(folder, tmp_path / "other.npz", llvm=path))
+def test_another_llvm_gives_equal_steps(folder, tmp_path):
+    libraries = other_llvms()
+    if not libraries:
+        pytest.skip("one version of LLVM here")
+    step = step_in_process(folder, tmp_path / "one.npz")
+    for path in libraries:
+        assert_equal_steps(step, step_in_process(folder, tmp_path / "other.npz", llvm=path))
 
 
 @pytest.mark.gpu
-def test_gpu_gives_equal_steps(folder: Path, tmp_path: Path) -> None:
-    one = step_in_process(folder, tmp_path / "one.npz")
-    assert_equal_steps(one, step_in_process(folder, tmp_path / "other.npz", "cuda"))
+def test_gpu_gives_equal_steps(folder, tmp_path):
+    step = step_in_process(folder, tmp_path / "one.npz")
+    assert_equal_steps(step, step_in_process(folder, tmp_path / "other.npz", "cuda"))
 
 
-def test_deterministic_fits_take_one_thread_of_the_cpu(one_gateway: Record) -> None:
+def test_deterministic_fits_take_one_thread_of_the_cpu(one_gateway):
     backend.set_threads(2)
     Trainer(one_gateway, official(one_gateway), settings("steps=1"))
     assert dr.thread_count() == 2
@@ -114,49 +98,46 @@ def test_deterministic_fits_take_one_thread_of_the_cpu(one_gateway: Record) -> N
     assert dr.thread_count() == 1
 
 
-@pytest.mark.usefixtures("gpu_process")
-def test_no_deterministic_fit_on_a_gpu(one_gateway: Record) -> None:
-    with pytest.raises(BackendError, match="already computes with cuda: start another for llvm"):
+def test_no_deterministic_fit_or_run_on_a_gpu(one_gateway, tmp_path, monkeypatch):
+    """In a process that has begun to compute on one: nothing is written, wherever determinism is stated."""
+    cuda = backend.Backend("cuda", backend.VARIANTS["cuda"], None, None, "made up")
+    monkeypatch.setattr(backend, "_active", cuda)
+    refused = partial(pytest.raises, BackendError, match="already computes with cuda: start another for llvm")
+    with refused():
         Trainer(one_gateway, official(one_gateway), settings("steps=1", "deterministic=true"))
-
-
-@pytest.mark.usefixtures("gpu_process")
-def test_no_deterministic_run_on_a_gpu(one_gateway: Record, tmp_path: Path) -> None:
-    """Nothing is written, wherever determinism is stated."""
     for stated in ({"model": "wrf-gs+", "settings": ["deterministic=true"]}, {"model": "idw", "deterministic": True}):
-        with pytest.raises(BackendError, match="already computes with cuda: start another for llvm"):
+        with refused():
             train(one_gateway, tmp_path / "run", **stated)
         assert not (tmp_path / "run").exists()
 
 
+@pytest.fixture
+def asked(monkeypatch):
+    """Backends and threads that `train` asks for."""
+    calls = []
+    monkeypatch.setattr(cli_train, "init", lambda name, threads: calls.append((name, threads)))
+    return calls
+
+
 @pytest.mark.parametrize("model", ["wrf-gs+", "kriging", "ray-tracing"])
-def test_deterministic_command_initialises_the_cpu_first(
-    model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_deterministic_command_initialises_the_cpu_first(model, tmp_path, asked):
     """Before anything is read: whatever reads a data set may choose the GPU."""
-    asked: list[tuple[object, ...]] = []
-    monkeypatch.setattr(cli_train, "init", lambda name, threads: asked.append((name, threads)))
     call = ["train", str(tmp_path / "none"), "--model", model, "--out", str(tmp_path / "run")]
     call += ["--scene", "laboratory"] if model == "ray-tracing" else []
-    assert main(call) == 2
-    assert asked == []
-    assert main([*call, "--deterministic"]) == 2
-    assert asked == [("llvm", 1)]
+    for words, backends in (([], []), (["--deterministic"], [("llvm", 1)])):
+        assert main([*call, *words]) == 2
+        assert asked == backends
 
 
-def test_deterministic_run_is_resumed_on_the_cpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[object, ...]] = []
-    monkeypatch.setattr(cli_train, "init", lambda name, threads: asked.append((name, threads)))
-    for text in ("settings: {deterministic: true}", "[", "deterministic: false"):
+def test_deterministic_run_is_resumed_on_the_cpu(tmp_path, asked):
+    for text in ("settings: {deterministic: true}", "[", "deterministic: false", "deterministic: true"):
+        assert asked == []
         (tmp_path / "config.yaml").write_text(text)
         assert main(["train", "--resume", str(tmp_path)]) == 2
-    assert asked == []
-    (tmp_path / "config.yaml").write_text("deterministic: true")
-    assert main(["train", "--resume", str(tmp_path)]) == 2
     assert asked == [("llvm", 1)]
 
 
-def test_deterministic_baseline_is_resumed_on_one_thread(one_gateway: Record, tmp_path: Path) -> None:
+def test_deterministic_baseline_is_resumed_on_one_thread(one_gateway, tmp_path):
     """Stopped before it was fitted, and resumed by a process with more threads."""
     settings = ("steps=5", "width=8", "last=8")
     run = train(one_gateway, tmp_path / "run", "vae", settings=settings, deterministic=True).folder

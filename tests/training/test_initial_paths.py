@@ -1,32 +1,36 @@
 """Gaussians that start from traced paths or from a mesh."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 from traced_rooms import FREQUENCY_HZ, HEIGHT, LENGTH, SHOEBOX, WIDTH, inside, receiver, room, write_xml
 
-from wrf_mi.core import InputError, Paths, Record
+from wrf_mi.core import InputError, Record
 from wrf_mi.core.settings import with_settings
 from wrf_mi.gaussians import WrfGsPlus
 from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.training.config import InitialConfig, TrainConfig
 from wrf_mi.training.initial import gaussians_from_mesh, gaussians_from_paths, initial_gaussians
 
+STATION = receiver([3.0, 2.0, 1.0])
+
 
 @pytest.fixture(scope="module")
-def traced(tmp_path_factory: pytest.TempPathFactory) -> tuple[Paths, np.ndarray]:
+def traced(tmp_path_factory):
+    """Paths and positions of transmitters."""
     scene, tx = room(tmp_path_factory.mktemp("scene")), inside(12)
-    return trace_paths(scene, tx, receiver([3.0, 2.0, 1.0]), TraceOptions(depth=1, rays=1 << 12)).paths, tx
+    return trace_paths(scene, tx, STATION, TraceOptions(depth=1, rays=1 << 12)).paths, tx
 
 
-def test_gaussians_start_at_sources_of_paths(traced: tuple[Paths, np.ndarray]) -> None:
+def start_from(paths, tx, count):
+    return gaussians_from_paths(paths, tx, (STATION,), count, np.random.default_rng(0))
+
+
+def test_gaussians_start_at_sources_of_paths(traced):
     paths, tx = traced
-    start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 40, np.random.default_rng(0))
+    start = start_from(paths, tx, 40)
     assert start.count == 40
     # Clusters mix points of one wall; in a convex room their means are inside it.
     assert (start.position_m > -0.3).all()
@@ -40,9 +44,8 @@ def test_gaussians_start_at_sources_of_paths(traced: tuple[Paths, np.ndarray]) -
     assert np.isclose(np.abs(start.signals).max(), 0.3)
 
 
-def test_field_starts_with_signals_of_paths(traced: tuple[Paths, np.ndarray]) -> None:
-    paths, tx = traced
-    start = gaussians_from_paths(paths, tx, (receiver([3.0, 2.0, 1.0]),), 20, np.random.default_rng(0))
+def test_field_starts_with_signals_of_paths(traced):
+    start = start_from(*traced, 20)
     weights = WrfGsPlus(layers=2, width=8, skip=1).init(start, np.random.default_rng(0))
     assert weights["opacity"].shape == (1, 20)
     assert np.array_equal(weights["signal"][0] + 1j * weights["signal"][1], start.signals.astype(np.complex64))
@@ -50,16 +53,14 @@ def test_field_starts_with_signals_of_paths(traced: tuple[Paths, np.ndarray]) ->
     assert np.ptp(weights["opacity"]) > 0
 
 
-def test_more_gaussians_than_clusters_are_jittered(traced: tuple[Paths, np.ndarray]) -> None:
+def test_more_gaussians_than_clusters_are_jittered(traced):
     paths, tx = traced
-    one = paths.select(np.arange(2))
-    start = gaussians_from_paths(one, tx, (receiver([3.0, 2.0, 1.0]),), 9, np.random.default_rng(0))
-    assert len(np.unique(start.position_m, axis=0)) == 9
+    assert len(np.unique(start_from(paths.select(np.arange(2)), tx, 9).position_m, axis=0)) == 9
     with pytest.raises(InputError, match="no path"):
-        gaussians_from_paths(paths.select(np.arange(0)), tx, (receiver([3.0, 2.0, 1.0]),), 4, np.random.default_rng(0))
+        start_from(paths.select(np.arange(0)), tx, 4)
 
 
-def test_gaussians_on_a_mesh_are_distributed_by_area(tmp_path: Path) -> None:
+def test_gaussians_on_a_mesh_are_distributed_by_area(tmp_path):
     triangles = np.concatenate([mesh.triangles for _, mesh in SHOEBOX.values()])
     start = gaussians_from_mesh(triangles, 2000, np.random.default_rng(0))
     floor = np.abs(start.position_m[:, 2]) < 1e-9
@@ -69,30 +70,28 @@ def test_gaussians_on_a_mesh_are_distributed_by_area(tmp_path: Path) -> None:
         gaussians_from_mesh(np.zeros((1, 3, 3)), 4, np.random.default_rng(0))
 
 
-def test_gaussians_start_from_the_source_in_the_settings(tmp_path: Path) -> None:
-    scene, tx = str(write_xml(tmp_path, SHOEBOX)), inside(40)
-    own = receiver([3.0, 2.0, 1.0])
-    record = Record("room", "spectrum", tx, (own,), np.zeros((1, 40, 2, 4)), frequencies_hz=np.array([FREQUENCY_HZ]))
+def test_gaussians_start_from_the_source_in_the_settings(tmp_path):
+    scene, tx, hz = str(write_xml(tmp_path, SHOEBOX)), inside(40), np.array([FREQUENCY_HZ])
+    record = Record("room", "spectrum", tx, (STATION,), np.zeros((1, 40, 2, 4)), frequencies_hz=hz)
     rows = np.flatnonzero(tx[:, 0] < LENGTH / 2)
 
-    def start(config: InitialConfig, record: Record = record) -> np.ndarray:
-        return initial_gaussians(config, record, rows, np.random.default_rng(0)).position_m
+    def start(record=record, count=40, **source):
+        """Positions, and their distances from a wall."""
+        config = InitialConfig(count, **source)
+        position = initial_gaussians(config, record, rows, np.random.default_rng(0)).position_m
+        return position, np.minimum(np.abs(position), np.abs(position - [LENGTH, WIDTH, HEIGHT])).min(axis=1)
 
-    def from_a_wall(position: np.ndarray) -> np.ndarray:
-        return np.minimum(np.abs(position), np.abs(position - [LENGTH, WIDTH, HEIGHT])).min(axis=1)
-
-    assert from_a_wall(start(InitialConfig(40, mesh=scene))).max() < 1e-5  # float32 of some metres
-    # A mesh without materials has surfaces as well.
-    assert from_a_wall(start(InitialConfig(40, mesh=str(tmp_path / "floor.ply")))).max() < 1e-5
-    found = start(InitialConfig(200, paths=scene))
+    for mesh in (scene, str(tmp_path / "floor.ply")):  # a mesh without materials has surfaces as well
+        assert start(mesh=mesh)[1].max() < 1e-5  # float32 of some metres
+    position, from_a_wall = start(count=200, paths=scene)
     # Direct paths begin at transmitters: at those of the training rows, and at none of the others.
-    standing = found[from_a_wall(found) > 0.25]
+    standing = position[from_a_wall > 0.25]
     assert len(standing) > 5
     assert cdist(standing, tx[rows]).min(axis=1).max() < 0.5
     assert standing[:, 0].max() < LENGTH / 2
     with pytest.raises(InputError, match="room states no carrier frequency"):
-        start(InitialConfig(paths=scene), replace(record, frequencies_hz=None))
+        start(replace(record, frequencies_hz=None), paths=scene)
     with pytest.raises(InputError, match=r"is a mesh without radio materials; .*wrf-mi mesh room.ply --out DIR"):
-        start(InitialConfig(paths="room.ply"))
+        start(paths="room.ply")
     with pytest.raises(InputError, match="Gaussians start from one"):
         with_settings(TrainConfig(), ["initial.mesh=a", "initial.paths=b"])

@@ -1,10 +1,6 @@
 """Rows of several carriers in one graph: ports of a receiver, each at its carrier."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +9,7 @@ from made_spectra import true_field
 from traced_rooms import write_xml
 
 import wrf_mi
-from wrf_mi.core import Receiver, Record, Split
+from wrf_mi.core import Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.graph.graph import Graph
 from wrf_mi.graph.receivers import Form
@@ -31,94 +27,96 @@ BETWEEN_HZ = 3.5e9
 OPTIONS = TraceOptions(depth=2, transmission=True, rays=4096)
 CONFIG = TracedConfig(depth=2, reflections=2, rays=4096, faint=0.0)
 SIZE = (9, 24)
-SINGLE, SINGLE_DB = 1e-6, 2e-5
-"""Of greys in 0..1, and of dB: rounding of single precision."""
-STRENGTH_DB, TRACED = 1e-3, 1e-3
-"""In dB and of greys: gains of the tracer are in single precision."""
+SINGLE, SINGLE_DB = 1e-6, 2e-5  # Of greys in 0..1, and of dB: rounding of single precision
+STRENGTH_DB, TRACED = 1e-3, 1e-3  # In dB and of greys: gains of the tracer are in single precision
 QUICK = ("initial.gaussians=8", "optimiser.warm_up=5", "density.every=0", "validate_every=10", "batch=4")
 
 
 @pytest.fixture(scope="module")
-def xml(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def xml(tmp_path_factory):
     return write_xml(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION})
 
 
-def array() -> Receiver:
+def array():
     return replace(receiver(), array_m=planar_array(4, 4, 0.026))
 
 
-def spectra(xml: Path, count: int = 12) -> Record:
+def second():
+    return replace(array(), name="second", position_m=np.array([4.0, 2.2, 0.7]))
+
+
+def spectra(xml, count=12):
     """Spectra of each transmitter at each carrier, traced."""
-    positions, size = transmitters(count), len(CARRIERS_HZ)
-    instrument = SpectrumInstrument((array(),), np.array([CARRIERS_HZ[0]]), size=SIZE)
-    tracer, carriers = RayTracer(xml, instrument, OPTIONS), np.repeat(CARRIERS_HZ, count)
-    traced = tracer.trace(np.tile(positions, (size, 1)), carriers_hz=carriers)
+    tracer = RayTracer(xml, SpectrumInstrument((array(),), np.array([CARRIERS_HZ[0]]), size=SIZE), OPTIONS)
+    carriers = np.repeat(CARRIERS_HZ, count)
+    traced = tracer.trace(np.tile(transmitters(count), (len(CARRIERS_HZ), 1)), carriers_hz=carriers)
     observed = tracer.observe(traced).astype(np.float32)
     return Record("bands", "spectrum", traced.tx_pos_m, (array(),), observed, carriers_hz=carriers)
 
 
-@pytest.mark.parametrize(("task", "tolerance"), [("spectrum", SINGLE), ("rssi", SINGLE_DB)])
-def test_ports_report_what_a_graph_of_each_carrier_reports(task: str, tolerance: float, xml: Path) -> None:
+def graph_of(xml, form, field=None, receivers=None, **config):
+    """A graph at the carrier of a form, with a field beside the paths or without."""
+    scene = open_scene(xml, form.carrier_hz or form.frequencies_hz[0])
+    return Graph(field, receivers or (array(),), form, scene, replace(CONFIG, **config))
+
+
+MIDDLE = Form("array", SIZE, [CARRIERS_HZ[1]])
+PORTS = Form("array", SIZE, carriers_hz=np.array(CARRIERS_HZ))
+
+
+@pytest.mark.parametrize(("model", "tolerance"), [("array", SINGLE), ("power", SINGLE_DB)])
+def test_ports_report_what_a_graph_of_each_carrier_reports(model, tolerance, xml):
     """At trained carriers and at others, in the order of the rows; materials follow the laws of ITU-R P.2040."""
-    receivers = (array(), replace(array(), name="second", position_m=np.array([4.0, 2.2, 0.7])))
-    form = Form("array" if task == "spectrum" else "power", SIZE, carriers_hz=np.array(CARRIERS_HZ))
+    receivers, form = (array(), second()), replace(PORTS, receiver=model)
     rows = np.array([*CARRIERS_HZ, BETWEEN_HZ])[np.random.default_rng(0).permutation(np.arange(12) % 4)]
-    graph = Graph(None, receivers, form, open_scene(xml, form.carrier_hz), CONFIG)
-    predict = Predictor(graph, {})
+    predict = Predictor(graph_of(xml, form, receivers=receivers), {})
     found = [predict(transmitters(12), number, carriers_hz=rows) for number in range(2)]
     for hz in np.unique(rows):
-        at = rows == hz
-        single = Graph(
-            None, receivers, replace(form, frequencies_hz=[hz], carriers_hz=None), open_scene(xml, hz), CONFIG
-        )
-        alone = Predictor(single, {})
+        single = replace(form, frequencies_hz=[hz], carriers_hz=None)
+        alone = Predictor(graph_of(xml, single, receivers=receivers), {})
         for number in range(2):
-            np.testing.assert_allclose(found[number][at], alone(transmitters(12)[at], number), atol=tolerance)
+            expected = alone(transmitters(12)[rows == hz], number)
+            np.testing.assert_allclose(found[number][rows == hz], expected, atol=tolerance)
 
 
 @pytest.mark.parametrize("count", [1, 5])
-def test_spectra_of_uncertain_phases_are_the_expectation_of_the_tracer(count: int, xml: Path) -> None:
+def test_spectra_of_uncertain_phases_are_the_expectation_of_the_tracer(count, xml):
     """Of several transmitters, and of one, whose report is recorded; both differ from those of certain phases."""
     instrument = SpectrumInstrument((array(),), np.array([CARRIERS_HZ[1]]), size=SIZE, phase_error=1.0)
-    tracer = RayTracer(xml, instrument, OPTIONS)
+    tracer, graph = RayTracer(xml, instrument, OPTIONS), graph_of(xml, MIDDLE)
     expected = tracer.observe(tracer.trace(transmitters(count)))[0]
-    graph = Graph(None, (array(),), Form("array", SIZE, [CARRIERS_HZ[1]]), open_scene(xml, CARRIERS_HZ[1]), CONFIG)
-    certain, predict = (Predictor(graph, {}, phase_error=sd) for sd in (0.0, 1.0))
-    np.testing.assert_allclose(predict(transmitters(count), 0), expected, rtol=0, atol=TRACED)
-    assert np.abs(certain(transmitters(count), 0) - expected).max() > 0.05
+    certain, found = (Predictor(graph, {}, phase_error=sd)(transmitters(count), 0) for sd in (0.0, 1.0))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TRACED)
+    assert np.abs(certain - expected).max() > 0.05
 
 
-def test_gaussians_count_in_each_draw_of_the_paths_phases(xml: Path) -> None:
+def test_gaussians_count_in_each_draw_of_the_paths_phases(xml):
     """With phases that are as good as certain the expectation is the report itself, beside Gaussians, too."""
     field, params = true_field("wrf-gs+")
-    graph = Graph(field, (array(),), Form("array", SIZE, [CARRIERS_HZ[1]]), open_scene(xml, CARRIERS_HZ[1]), CONFIG)
-    certain, nearly = (Predictor(graph, params, phase_error=sd) for sd in (0.0, 1e-9))
+    graph = graph_of(xml, MIDDLE, field)
     for count in (1, 5):
-        reports = [predict(transmitters(count), 0) for predict in (certain, nearly)]
+        reports = [Predictor(graph, params, phase_error=sd)(transmitters(count), 0) for sd in (0.0, 1e-9)]
         np.testing.assert_allclose(*reports, rtol=0, atol=10 * SINGLE)
 
 
-def test_reports_from_one_search_are_those_of_a_search_for_each_carrier(xml: Path) -> None:
+def test_reports_from_one_search_are_those_of_a_search_for_each_carrier(xml):
     """Of rows whose positions are partly the same, some of them repeated, at two trained carriers and another one."""
-    form = Form("array", SIZE, carriers_hz=np.array(CARRIERS_HZ))
-    graph = Graph(None, (array(),), form, open_scene(xml, form.carrier_hz), replace(CONFIG, faint=0.05))
-    predict = Predictor(graph, {})
+    predict = Predictor(graph_of(xml, PORTS, faint=0.05), {})
     tx = transmitters(6)[[0, 1, 2, 2, 3, 2, 1, 0, 5, 3, 4, 4]]
     carriers = np.array([CARRIERS_HZ[0], CARRIERS_HZ[2], BETWEEN_HZ]).repeat(4)
     found = predict(tx, 0, carriers_hz=carriers)
     for hz in np.unique(carriers):
-        at = carriers == hz
-        np.testing.assert_allclose(found[at], predict(tx[at], 0, carriers_hz=carriers[at]), rtol=0, atol=SINGLE)
+        alone = predict(tx[carriers == hz], 0, carriers_hz=carriers[carriers == hz])
+        np.testing.assert_allclose(found[carriers == hz], alone, rtol=0, atol=SINGLE)
     assert np.abs(found[0] - found[7]).max() > 0.01  # the same position at two carriers
     assert predict(tx[:0], 0, carriers_hz=carriers[:0]).shape == (0, *SIZE)
 
 
-def test_paths_are_searched_once_for_all_carriers(xml: Path, searches: list[int]) -> None:
+def test_paths_are_searched_once_for_all_carriers(xml, searches):
     """For the training rows of each receiver, at no validation, and in a prediction that asks for several."""
     record = spectra(xml, 10)
-    second = replace(array(), name="second", position_m=np.array([4.0, 2.2, 0.7]))
     observed = np.concatenate([record.observation, record.observation[:, ::-1]])
-    record = replace(record, receivers=(array(), second), observation=observed)
+    record = replace(record, receivers=(array(), second()), observation=observed)
     split = Split("own", 0, np.r_[0:8, 12:18, 23:28], np.array([8, 18, 28]), np.array([9, 19, 29]))
     trained = np.unique(record.tx_pos_m[split.all_train], axis=0)
     settings = "traced.rays=4096", "traced.depth=2", "traced.reflections=2", "steps=20"
@@ -135,26 +133,22 @@ def test_paths_are_searched_once_for_all_carriers(xml: Path, searches: list[int]
     assert searches == [5]
 
 
-def test_strengths_at_ports_are_those_of_the_tracer(xml: Path) -> None:
+def test_strengths_at_ports_are_those_of_the_tracer(xml):
     rows = np.array([*CARRIERS_HZ, BETWEEN_HZ]).repeat(3)
     tracer = RayTracer(xml, PowerInstrument((array(),), np.array([CARRIERS_HZ[0]])), OPTIONS)
     expected = tracer.observe(tracer.trace(transmitters(12), carriers_hz=rows))[0]
-    form = Form("power", SIZE, carriers_hz=np.array(CARRIERS_HZ))
-    graph = Graph(None, (array(),), form, open_scene(xml, form.carrier_hz), CONFIG)
-    found = Predictor(graph, {})(transmitters(12), 0, carriers_hz=rows)
+    found = Predictor(graph_of(xml, replace(PORTS, receiver="power")), {})(transmitters(12), 0, carriers_hz=rows)
     np.testing.assert_allclose(found, expected, atol=STRENGTH_DB)
 
 
 @pytest.mark.parametrize("scene", [False, True])
-def test_a_field_of_several_carriers_is_trained_resumed_and_restored(scene: bool, xml: Path, tmp_path: Path) -> None:
+def test_a_field_of_several_carriers_is_trained_and_restored(scene, xml, tmp_path):
     """With and without paths; a carrier without training rows is predicted, and predictions depend on the carrier."""
-    record, place = spectra(xml), str(xml) if scene else None
-    settings = (*QUICK, "steps=30") + (("traced.rays=4096", "traced.depth=2") if scene else ())
-    given: dict[str, Any] = {"scene": place, "split": "frequency-known:1", "settings": settings}
-    run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", **given)
-    again = wrf_mi.open_run(run.folder, record)
+    record, settings = spectra(xml), (*QUICK, "steps=16", *("traced.rays=4096", "traced.depth=2") * scene)
+    how = {"scene": str(xml) if scene else None, "split": "frequency-known:1", "settings": settings}
+    run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", **how)
+    again, positions = wrf_mi.open_run(run.folder, record), np.tile(record.tx_pos_m[:2], (2, 1))
     at = np.repeat([CARRIERS_HZ[0], CARRIERS_HZ[1]], 2)
-    positions = np.tile(record.tx_pos_m[:2], (2, 1))
     found = again.predict(positions, 0, carriers_hz=at).mean
     np.testing.assert_array_equal(found, run.predict(positions, 0, carriers_hz=at).mean)
     assert np.abs(found[:2] - found[2:]).max() > 1e-3
@@ -162,68 +156,55 @@ def test_a_field_of_several_carriers_is_trained_resumed_and_restored(scene: bool
         again.predict(positions, 0)
 
 
-def test_networks_learn_from_the_carrier(xml: Path, tmp_path: Path) -> None:
+def test_networks_learn_from_the_carrier(tmp_path):
     """Strengths at one place that fall with the frequency: one field of all carriers follows them."""
-    positions = np.tile(transmitters(10), (3, 1))
-    carriers = np.repeat(CARRIERS_HZ, 10)
+    positions, carriers = np.tile(transmitters(10), (3, 1)), np.repeat(CARRIERS_HZ, 10)
     observed = (-40 - 20 * np.log10(carriers / CARRIERS_HZ[0]))[None].astype(np.float32)
     record = Record("falling", "rssi", positions, (receiver(),), observed, carriers_hz=carriers)
-    settings = (*QUICK, "steps=400", "optimiser.network=0.003")
+    settings = (*QUICK, "steps=200", "optimiser.network=0.005")
     run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", split="random", settings=settings)
     assert run.metrics["abs_error_db"]["median"] < 2  # 6 dB for the middle carrier's strength, the median
 
 
-def test_paths_are_calibrated_at_several_carriers(xml: Path, tmp_path: Path) -> None:
+def test_paths_are_calibrated_at_several_carriers(xml, tmp_path):
     """All surfaces are stated as wood: one permittivity and conductivity of each serve all carriers."""
-    record = spectra(xml, 16)
-    wrong = {name: ("itu_wood", mesh) for name, (_, mesh) in {**WALLS, **CEILING, **PARTITION}.items()}
-    stated = write_xml(tmp_path / "stated", wrong)
-    common = ("depth=2", "rays=4096", "transmission=true")
-    given: dict[str, Any] = {"scene": str(stated), "split": "frequency:1"}
-    plain = wrf_mi.train(record, tmp_path / "plain", "ray-tracing", settings=common, **given)
-    calibration = (*common, "calibration=gain,materials", "steps=120")
-    run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", settings=calibration, **given)
+    record, parts = spectra(xml, 16), {**WALLS, **CEILING, **PARTITION}
+    stated = write_xml(tmp_path / "stated", {name: ("itu_wood", mesh) for name, (_, mesh) in parts.items()})
+
+    def trained(name, *settings):
+        how = {"scene": str(stated), "split": "frequency:1"}
+        common = ("depth=2", "rays=4096", "transmission=true", *settings)
+        return wrf_mi.train(record, tmp_path / name, "ray-tracing", settings=common, **how)
+
+    plain, run = trained("plain"), trained("run", "calibration=gain,materials", "steps=60")
     assert run.metrics["ssim"]["mean"] > plain.metrics["ssim"]["mean"] + 0.01
     assert open_scene(run.folder / "corrected", BETWEEN_HZ).radio_materials
 
 
-@pytest.mark.parametrize("receiver_model", ["array", "power"])
-def test_single_predictions_are_those_of_a_batch(receiver_model: str, xml: Path) -> None:
+@pytest.mark.parametrize(("model", "tolerance"), [("array", SINGLE), ("power", SINGLE_DB)])
+def test_single_predictions_are_those_of_a_batch(model, tolerance, xml):
     """Recordings of one transmitter serve others, whose numbers of paths differ, with Gaussians beside the paths."""
-    field, params = true_field("wrf-gs+")
-    form = Form(receiver_model, SIZE, frequencies_hz=np.array([CARRIERS_HZ[1]]))
-    graph = Graph(field, (array(),), form, open_scene(xml, CARRIERS_HZ[1]), CONFIG)
-    predict = Predictor(graph, params)
-    tx = transmitters(12)
+    (field, params), form, tx = true_field("wrf-gs+"), replace(MIDDLE, receiver=model), transmitters(12)
+    predict, paths_alone = Predictor(graph_of(xml, form, field), params), Predictor(graph_of(xml, form), {})
     alone = np.concatenate([predict(tx[k : k + 1], 0) for k in range(12)])
-    traced = Predictor(Graph(None, (array(),), form, graph.scene, CONFIG), {})
-    assert np.abs(alone - traced(tx, 0)).max() > 0.01  # the Gaussians tell
-    np.testing.assert_allclose(alone, predict(tx, 0), rtol=0, atol=SINGLE if receiver_model == "array" else SINGLE_DB)
-    assert any(name[0] == "both" and one.frozen.n_recordings for (name, _), one in predict.evaluate.recordings.items())
+    assert np.abs(alone - paths_alone(tx, 0)).max() > 0.01  # the Gaussians tell
+    np.testing.assert_allclose(alone, predict(tx, 0), rtol=0, atol=tolerance)
+    recordings = predict.evaluate.recordings.items()
+    assert any(name[0] == "both" and each.frozen.n_recordings for (name, _), each in recordings)
 
 
 @pytest.mark.parametrize(("off_m", "certain"), [(0.0, True), (0.03, False)])
-def test_phases_are_uncertain_where_walls_are_off(off_m: float, certain: bool, xml: Path, tmp_path: Path) -> None:
+def test_phases_are_uncertain_where_walls_are_off(off_m, certain, xml, tmp_path):
     """By held-out rows; the choice is stored with the state, and the trainer's predictions follow it."""
-    record = spectra(xml, 60)
+    record, parts = spectra(xml, 60), {**WALLS, **CEILING, **PARTITION}
     rows = np.flatnonzero(record.carriers_hz == CARRIERS_HZ[2])
-    record = replace(
-        record,
-        tx_pos_m=record.tx_pos_m[rows],
-        observation=record.observation[:, rows],
-        frequencies_hz=np.array([CARRIERS_HZ[2]]),
-        carriers_hz=None,
-    )
-    moved = {
-        name: (material, mesh.copy().apply_translation([off_m, -off_m, off_m]))
-        for name, (material, mesh) in {**WALLS, **CEILING, **PARTITION}.items()
-    }
-    scene = open_scene(write_xml(tmp_path, moved), CARRIERS_HZ[2])
-    split = Split("own", 0, np.arange(50), np.arange(50, 55), np.arange(55, 60))
+    at_high = {"tx_pos_m": record.tx_pos_m[rows], "observation": record.observation[:, rows], "carriers_hz": None}
+    record = replace(record, frequencies_hz=np.array([CARRIERS_HZ[2]]), **at_high)
+    moved = {n: (kind, mesh.copy().apply_translation([off_m, -off_m, off_m])) for n, (kind, mesh) in parts.items()}
+    split = Split("own", 0, *np.split(np.arange(60), [50, 55]))
     settings = "traced.rays=4096", "traced.depth=2", "traced.reflections=2", "steps=40", "validate_every=10"
-    trainer = Trainer(
-        record, split, with_settings(calibration_config(["gain", "surface"], images=True), settings), scene=scene
-    )
+    config = with_settings(calibration_config(["gain", "surface"], images=True), settings)
+    trainer = Trainer(record, split, config, scene=open_scene(write_xml(tmp_path, moved), CARRIERS_HZ[2]))
     trainer.run(lambda progress: None, lambda: None, lambda: False)
     assert (trainer.state.phase_error == 0) == certain
     assert trainer.predictor().phase_error == trainer.state.phase_error
