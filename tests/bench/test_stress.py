@@ -12,7 +12,7 @@ import pytest
 from wrf_mi_bench import stress as bench_stress
 from wrf_mi_bench import stress_fields, stress_joint, stress_plugins, stress_receivers, stress_rows
 from wrf_mi_bench.comparison import Row
-from wrf_mi_bench.stress_fields import HARD, Field, image, image_row, made, reference
+from wrf_mi_bench.stress_fields import HARD, StressField, image, image_row, made, reference
 from wrf_mi_bench.stress_joint import joint, phases
 from wrf_mi_bench.stress_losses import losses
 from wrf_mi_bench.stress_receivers import of_fields
@@ -181,7 +181,7 @@ def test_names_without_a_quick_form_are_refused(names: list[str], capsys: pytest
 
 
 def test_image_row_reports_an_error_beyond_its_bound() -> None:
-    def off(field: Field, blending: str, size: tuple[int, int]) -> np.ndarray:
+    def off(field: StressField, blending: str, size: tuple[int, int]) -> np.ndarray:
         return image(field, blending, size) * 1.001
 
     worst, bound = worst_of(image_row("image, random", {"random": lambda rng: made(20, rng)}, 2, render=off))
