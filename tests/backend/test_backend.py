@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -90,17 +88,17 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
         ("libLLVM-C.so", None),
     ],
 )
-def test_version_from_file_name(name: str, version: tuple[int, ...] | None) -> None:
+def test_version_from_file_name(name, version):
     assert libraries.version_from_name(name) == version
 
 
 @given(st.integers(3, 99), st.integers(0, 9), st.integers(0, 99))
-def test_version_round_trips_through_a_file_name(major: int, minor: int, patch: int) -> None:
+def test_version_round_trips_through_a_file_name(major, minor, patch):
     assert libraries.version_from_name(f"libLLVM-{major}.{minor}.{patch}.so") == (major, minor, patch)
     assert libraries.version_from_name(f"libLLVM.so.{major}.{minor}") == (major, minor)
 
 
-def test_newest_first_each_file_once(only) -> None:
+def test_newest_first_each_file_once(only):
     folder = only("libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM.so.9.1", "libLLVM-19.1.7.so", "libLLVMCore.a")
     (folder / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
     found = [(library.version, library.path.name) for library in backend.find_llvm()]
@@ -112,7 +110,7 @@ def test_newest_first_each_file_once(only) -> None:
     ]
 
 
-def test_variable_excludes_all_others(only, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variable_excludes_all_others(only, tmp_path, monkeypatch):
     folder = only("libLLVM.so.19.1", "libLLVM-15.so.1")
     monkeypatch.setenv(libraries.LLVM_VARIABLE, str(folder / "libLLVM-15.so.1"))
     assert [library.version for library in backend.find_llvm()] == [(15,)]
@@ -121,14 +119,14 @@ def test_variable_excludes_all_others(only, tmp_path: Path, monkeypatch: pytest.
     assert backend.find_llvm() == []
 
 
-def test_newest_good_library_is_chosen(only, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_newest_good_library_is_chosen(only, monkeypatch):
     only("libLLVM.so.23.1", "libLLVM.so.20.1", "libLLVM.so.19.1", "libLLVM-15.so.1")
     monkeypatch.setattr(backend, "try_llvm", good_if((20, 1), (19, 1), (15,)))
     assert backend.choose("llvm").llvm_version == "20.1"
 
 
 @pytest.mark.parametrize("major", [14, 15, 16])
-def test_old_llvm_is_refused_without_a_trial(only, major: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_llvm_is_refused_without_a_trial(only, major, monkeypatch):
     only(f"libLLVM-{major}.so.1")
     monkeypatch.setattr(probe, "_run_trial", lambda *arguments: pytest.fail("an old LLVM was loaded"))
     with pytest.raises(BackendError, match=rf"LLVM {major} .* is too old .*: .*install") as caught:
@@ -136,20 +134,20 @@ def test_old_llvm_is_refused_without_a_trial(only, major: int, monkeypatch: pyte
     assert "\n" not in str(caught.value)
 
 
-def test_no_llvm_at_all(only) -> None:
+def test_no_llvm_at_all(only):
     only()
     with pytest.raises(BackendError, match=r"no usable LLVM \(none was found\): .*install"):
         backend.choose("llvm")
 
 
-def test_invalid_library_is_refused(only) -> None:
+def test_invalid_library_is_refused(only):
     only("libLLVM.so.19.1")
     with pytest.raises(BackendError, match=r"LLVM 19\.1 .* fails") as caught:
         backend.choose("llvm")
     assert "\n" not in str(caught.value)
 
 
-def test_variable_names_a_bad_library_and_a_good_one_exists(only, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variable_names_a_bad_library_and_a_good_one_exists(only, monkeypatch):
     folder = only("libLLVM.so.19.1", "libLLVM-15.so.1")
     monkeypatch.setenv(libraries.LLVM_VARIABLE, str(folder / "libLLVM-15.so.1"))
     monkeypatch.setattr(backend, "try_llvm", good_if((19, 1)))
@@ -157,7 +155,7 @@ def test_variable_names_a_bad_library_and_a_good_one_exists(only, monkeypatch: p
         backend.choose("llvm")
 
 
-def test_trial_reports_an_abort() -> None:
+def test_trial_reports_an_abort():
     verdict, final = probe._run_trial(backend.VARIANTS["llvm"], libraries.LLVM_VARIABLE, real_llvm(15).path)
     assert final
     assert not verdict.usable
@@ -166,7 +164,7 @@ def test_trial_reports_an_abort() -> None:
     assert "0x" not in verdict.reason
 
 
-def test_verdicts_are_cached_until_the_file_changes(only, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verdicts_are_cached_until_the_file_changes(only, monkeypatch):
     file = only("libLLVM.so.19.1") / "libLLVM.so.19.1"
     trials = []
 
@@ -185,7 +183,7 @@ def test_verdicts_are_cached_until_the_file_changes(only, monkeypatch: pytest.Mo
     assert len(trials) == 3
 
 
-def test_verdicts_of_hidden_and_visible_devices_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verdicts_of_hidden_and_visible_devices_differ(tmp_path, monkeypatch):
     """An empty list of devices hides them, none shows all."""
     driver, tried = tmp_path / "libcuda.so.1", list[str | None]()
     driver.touch()
@@ -202,14 +200,14 @@ def test_verdicts_of_hidden_and_visible_devices_differ(tmp_path: Path, monkeypat
     assert tried == [None, ""]
 
 
-def test_cached_failures_expire() -> None:
+def test_cached_failures_expire():
     probe.remember("short", {"usable": False}, seconds=-1)
     probe.remember("long", {"usable": True})
     assert probe.recall("short") is None
     assert probe.recall("long") == {"usable": True}
 
 
-def test_damaged_cache_counts_as_empty() -> None:
+def test_damaged_cache_counts_as_empty():
     probe.remember("key", {"usable": True})
     probe.cache_file().write_text('{"key": {"usa')
     assert probe.recall("key") is None
@@ -217,14 +215,14 @@ def test_damaged_cache_counts_as_empty() -> None:
     assert probe.recall("key") == {"usable": True}
 
 
-def test_unwritable_cache_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritable_cache_is_ignored(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setattr(probe, "cache_file", lambda: tmp_path / "file" / "libraries.json")
     probe.remember("key", {"usable": True})
     assert probe.recall("key") is None
 
 
-def test_choice_is_fast_once_cached() -> None:
+def test_choice_is_fast_once_cached():
     backend.choose()
     seconds = []
     for _ in range(5):
@@ -236,7 +234,7 @@ def test_choice_is_fast_once_cached() -> None:
 
 @pytest.mark.parametrize("imported_before", ["", "import drjit; "])
 @pytest.mark.parametrize("major", [14, 15])
-def test_process_with_an_old_llvm_ends_with_one_line(major: int, imported_before: str) -> None:
+def test_process_with_an_old_llvm_ends_with_one_line(major, imported_before):
     path = str(real_llvm(major).path)
     ended = run_python(f"{imported_before}import wrf_mi.backend as b; b.init()", **{libraries.LLVM_VARIABLE: path})
     assert ended.returncode == 1
@@ -245,7 +243,7 @@ def test_process_with_an_old_llvm_ends_with_one_line(major: int, imported_before
     assert libraries.LLVM_VARIABLE in last or "install" in last
 
 
-def test_init_in_a_new_process() -> None:
+def test_init_in_a_new_process():
     code = """
 import os, sys
 import wrf_mi.backend as b
@@ -268,7 +266,7 @@ else:
     assert ended.returncode == 0, ended.stderr
 
 
-def test_init_after_drjit_was_imported() -> None:
+def test_init_after_drjit_was_imported():
     code = """
 import warnings
 import mitsuba
@@ -285,7 +283,7 @@ assert chosen.llvm_version and "LLVM" in (chosen.llvm_path or "libLLVM")
     assert ended.returncode == 0, ended.stderr
 
 
-def test_cuda_with_a_driver_that_does_not_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cuda_with_a_driver_that_does_not_load(tmp_path, monkeypatch):
     driver = tmp_path / "libcuda.so.1"
     driver.write_text("not a library")
     monkeypatch.setenv(libraries.CUDA_VARIABLE, str(driver))
@@ -294,7 +292,7 @@ def test_cuda_with_a_driver_that_does_not_load(tmp_path: Path, monkeypatch: pyte
     assert backend.choose("auto").name == "llvm"
 
 
-def test_cuda_without_a_device() -> None:
+def test_cuda_without_a_device():
     if backend.find_cuda():
         pytest.skip("there is a GPU here")
     with pytest.raises(BackendError, match="CUDA cannot be used, no NVIDIA driver"):
@@ -302,11 +300,11 @@ def test_cuda_without_a_device() -> None:
 
 
 @pytest.mark.gpu
-def test_cuda_is_preferred_where_it_works() -> None:
+def test_cuda_is_preferred_where_it_works():
     assert backend.choose("auto").name == "cuda"
 
 
-def test_arguments_are_checked() -> None:
+def test_arguments_are_checked():
     with pytest.raises(InputError, match="backend: 'opencl' is none of"):
         backend.init("opencl")
     with pytest.raises(InputError, match="threads: must be at least 1, got 0"):

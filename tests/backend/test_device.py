@@ -1,13 +1,10 @@
 """What comes from NumPy is Dr.Jit's own: nothing is read beyond its end, nothing is wrapped elsewhere."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -40,7 +37,7 @@ print(*on_device(values, mi.Float).numpy())
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("kind", [mi.Float, mi.UInt32, mi.Int32, mi.Bool, mi.Float64])
-def test_values_are_copied(size: int, kind: Any) -> None:
+def test_values_are_copied(size, kind):
     values = np.arange(size) % 7 - (3 if kind in (mi.Float, mi.Int32, mi.Float64) else 0)
     found = on_device(values, kind)
     expected = values.astype(found.numpy().dtype)
@@ -50,7 +47,7 @@ def test_values_are_copied(size: int, kind: Any) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_wrapped_arrays_are_padded_by_a_packet(size: int) -> None:
+def test_wrapped_arrays_are_padded_by_a_packet(size):
     room = with_room(np.ones(size), np.float32)
     memory = room.base
     while memory.base is not None:
@@ -59,7 +56,7 @@ def test_wrapped_arrays_are_padded_by_a_packet(size: int) -> None:
     assert size == 0 or room.ctypes.data % ALIGNED_BYTES == 0  # NumPy states no address of nothing
 
 
-def test_shapes_and_columns() -> None:
+def test_shapes_and_columns():
     values = np.arange(12.0).reshape(4, 3)
     np.testing.assert_array_equal(to_tensor(values).numpy(), values)
     np.testing.assert_array_equal(to_vectors(values, mi.Point3f).numpy(), values.T)
@@ -67,7 +64,7 @@ def test_shapes_and_columns() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="protects a page by Linux's C library")
-def test_device_copies_read_within_bounds() -> None:
+def test_device_copies_read_within_bounds():
     done = subprocess.run([sys.executable, "-c", AT_THE_END], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split()) == (0, ["0.0", "1.0", "2.0", "3.0", "4.0"]), done.stderr
 
@@ -82,7 +79,7 @@ def wraps(code: str) -> bool:
     return bool(ARRAYS.match(code) and NUMPY.search(code)) and ".tolist()" not in code
 
 
-def test_only_the_device_module_wraps_numpy() -> None:
+def test_only_the_device_module_wraps_numpy():
     assert wraps("mi.Float(x.astype(np.float32))")
     assert not wraps("mi.UInt32(np.asarray(rows).tolist())")
     found = []

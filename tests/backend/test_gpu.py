@@ -1,9 +1,6 @@
 """A GPU computes what the CPU computes: recorded functions, float64, fits and predictions."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -31,7 +28,7 @@ def on_cpu(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         assert run_module("wrf_mi.cli", arguments) == (0, "")
 
 
-def test_sorting_in_a_recording_is_replayed() -> None:
+def test_sorting_in_a_recording_is_replayed():
     """Dr.Jit 1.5 records its own sort on CUDA, and its replay ends the process."""
     double, frozen = dr.float64_array_t(mi.Float), dr.freeze(depth_order)
     rng = np.random.default_rng(0)
@@ -42,7 +39,7 @@ def test_sorting_in_a_recording_is_replayed() -> None:
         np.testing.assert_array_equal(found, np.lexsort((*position[::-1], depth)))
 
 
-def test_division_and_roots_are_exact() -> None:
+def test_division_and_roots_are_exact():
     double = dr.float64_array_t(mi.Float)
     values = np.random.default_rng(0).uniform(0.1, 1000, 1000)
     x = double(values)
@@ -51,7 +48,7 @@ def test_division_and_roots_are_exact() -> None:
 
 
 @pytest.mark.parametrize("model", [*FIELDS, "kriging"])
-def test_fits_score_alike(model: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fits_score_alike(model, folder, tmp_path, monkeypatch):
     given = [*QUICK, "steps=60"] if model in FIELDS else []
     here = train(folder, tmp_path / "gpu", model, settings=given).metrics["ssim"]["mean"]
     words = [word for setting in given for word in ("--set", setting)]
@@ -61,7 +58,7 @@ def test_fits_score_alike(model: str, folder: Path, tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize("model", ["wrf-gs+", "factorised"])
-def test_a_run_predicts_alike(model: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_predicts_alike(model, folder, tmp_path, monkeypatch):
     run = train(folder, tmp_path / "run", model, settings=[*QUICK, "steps=20"])
     tx = np.random.default_rng(0).uniform(-2, 2, (8, 3)).astype(np.float32)
     np.savez(tmp_path / "tx.npz", tx_pos=tx)
@@ -77,9 +74,7 @@ def test_a_run_predicts_alike(model: str, folder: Path, tmp_path: Path, monkeypa
     ("model", "given"),
     [("ray-tracing", ["--calibrate", "gain,materials"]), ("hybrid", []), ("wrf-gs+", ["--set", "steps=200"])],
 )
-def test_models_of_a_scene_score_alike(
-    model: str, given: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_models_of_a_scene_score_alike(model, given, tmp_path, monkeypatch):
     """Traced, in stages and joint."""
     words = ["train", "laboratory", "--scene", "laboratory", "--n-train", "24", "--seed", "1", "--model", model, *given]
     assert run_module("wrf_mi.cli", [*words, "--out", str(tmp_path / "gpu")]) == (0, "")

@@ -1,7 +1,5 @@
 """Recorded functions and waiting sums where the number of threads changes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -33,7 +31,7 @@ def always(call: Callable[[], Any]) -> None:
         np.testing.assert_array_equal(call().numpy(), TERMS / SUMS)
 
 
-def test_functions_are_recorded_again_for_more_threads() -> None:
+def test_functions_are_recorded_again_for_more_threads():
     recorded, one = Recorded(sums), dr.opaque(mi.Float, 1)
     set_threads(1)
     always(lambda: recorded(one))
@@ -47,7 +45,7 @@ def test_functions_are_recorded_again_for_more_threads() -> None:
 
 
 @pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1)])
-def test_pending_sums_are_evaluated_before_threads_change(before: int, after: int) -> None:
+def test_pending_sums_are_evaluated_before_threads_change(before, after):
     def waited() -> Any:
         set_threads(before)
         found = sums(mi.Float(1))

@@ -1,7 +1,5 @@
 """Tables of the benchmarks, and their agreement with the documents."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -26,7 +24,6 @@ from wrf_mi_bench.table_pages import fronts, read_points
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
-from wrf_mi.parallel import Scheduler
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
@@ -80,7 +77,7 @@ def result(case: str, median: float) -> dict[str, object]:
     return {"case": case, "title": CASES[case].title, "metrics": metrics}
 
 
-def test_table_has_a_line_for_each_result() -> None:
+def test_table_has_a_line_for_each_result():
     text = table([result("wrf-gs+-paper", 0.91), result("demo", 0.97)])
     assert len(text.splitlines()) == 4
     assert (
@@ -89,22 +86,20 @@ def test_table_has_a_line_for_each_result() -> None:
     )
 
 
-def test_results_come_in_the_order_of_the_cases(tmp_path: Path) -> None:
+def test_results_come_in_the_order_of_the_cases(tmp_path):
     for case in ("demo", "wrf-gs+-paper"):
         (tmp_path / f"{case}.json").write_text(json.dumps(result(case, 0.9)))
     assert [r["case"] for r in read_results(tmp_path)[0]] == ["wrf-gs+-paper", "demo"]
 
 
-def test_unknown_case_is_refused_before_anything_runs(tmp_path: Path) -> None:
+def test_unknown_case_is_refused_before_anything_runs(tmp_path):
     with pytest.raises(InputError, match="unknown; choose from"):
         bench(["no-such-case"], tmp_path / "out", tmp_path / "runs")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_checks_name_missing_data(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_checks_name_missing_data(name, tmp_path, monkeypatch, capsys):
     """The function is there; without data it is one line, exit status 2 and no file."""
     assert callable(resolve(CHECKS[name].function))
     if name in NEEDS_NO_DATA:
@@ -116,7 +111,7 @@ def test_checks_name_missing_data(
     assert not (tmp_path / "out.json").exists()
 
 
-def test_result_of_a_check_is_stored_and_tabulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_of_a_check_is_stored_and_tabulated(tmp_path, monkeypatch):
     figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
     monkeypatch.setattr(bench_scene, "flat_plan", lambda: figures)
     assert main("wrf_mi_bench.scene:flat_plan", str(tmp_path / "out.json")) == 0
@@ -125,9 +120,7 @@ def test_result_of_a_check_is_stored_and_tabulated(tmp_path: Path, monkeypatch: 
     assert line == "| mesh: walls | **0.9** | 0.8 |"
 
 
-def test_bench_on_workers_writes_figures_and_reports_failures(
-    two: Scheduler, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bench_on_workers_writes_figures_and_reports_failures(two, tmp_path, capsys):
     """A check that was measured before, and a run that cannot go on."""
     runs, out = tmp_path / "runs", tmp_path / "out"
     folder = case_folder(runs, "flat-plan")
@@ -145,7 +138,7 @@ def test_bench_on_workers_writes_figures_and_reports_failures(
         bench(["flat-plan", "demo"], out, runs, two)
 
 
-def test_documents_show_the_stored_results() -> None:
+def test_documents_show_the_stored_results():
     results = (CHECKOUT / "docs" / "results.md").read_text()
     trained, checked = read_results(RESULTS)
     others = [one for one in checked if one["case"] not in ON_PAGE]
@@ -158,14 +151,14 @@ def test_documents_show_the_stored_results() -> None:
         assert text in results.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
 
 
-def test_documents_show_no_check_without_a_stored_result() -> None:
+def test_documents_show_no_check_without_a_stored_result():
     measured = {one["case"] for one in read_results(RESULTS)[1]}
     for page in (CHECKOUT / "docs").glob("*.md"):
         blocks = set(re.findall(r"^<!-- ([\w-]+) -->$", page.read_text(), re.MULTILINE))
         assert blocks <= {*measured, *OTHER_BLOCKS}, page.name
 
 
-def test_documents_show_the_fronts_of_the_stored_tables() -> None:
+def test_documents_show_the_fronts_of_the_stored_tables():
     rows = fronts(read_points(RESULTS / "tables"))
     shown = check_table([{"title": CHECKS["pareto"].title, "figures": {"rows": rows}}])
     assert f"<!-- pareto -->\n{shown}\n<!-- /pareto -->" in (CHECKOUT / "docs" / "speed.md").read_text()
@@ -184,7 +177,7 @@ def summary_table(rows: Sequence[Mapping[str, str]]) -> str:
     return "\n".join(lines)
 
 
-def test_documents_show_the_worst_of_each_stage() -> None:
+def test_documents_show_the_worst_of_each_stage():
     rows = json.loads((RESULTS / "stress.json").read_text())["figures"]["rows"]
     shown = (CHECKOUT / "docs" / "results.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
     assert shown.strip() == summary_table(rows)
@@ -194,7 +187,7 @@ def test_documents_show_the_worst_of_each_stage() -> None:
     assert "| **9.0e-01** | 0.001 |" in summary_table(worse)
 
 
-def test_stored_results_are_complete() -> None:
+def test_stored_results_are_complete():
     trained, checked = read_results(RESULTS)
     assert [r["case"] for r in trained] == list(CASES)
     # What compares this code with stored figures holds for this code alone, so it may not be measured yet, nor may

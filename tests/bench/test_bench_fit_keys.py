@@ -1,7 +1,5 @@
 """Keys of cases and table rows: what is measured again and what is used again."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +16,7 @@ def other_versions(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("name", ["wrf-gs+-paper", "flat-plan"])
-def test_case_folder_depends_on_data_and_versions(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_case_folder_depends_on_data_and_versions(name, tmp_path, monkeypatch):
     data = tmp_path / "data"
     monkeypatch.setattr(bench, "dataset_files", lambda dataset: [data])
     data.mkdir()
@@ -36,9 +34,7 @@ def test_case_folder_depends_on_data_and_versions(name: str, tmp_path: Path, mon
     assert all(folder.name.startswith(f"{name}-") for folder in folders)
 
 
-def test_rows_of_tables_are_run_again_for_other_data_or_versions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_of_tables_are_run_again_for_other_data_or_versions(tmp_path, monkeypatch, capsys):
     row = Row(next(part for part in PARTS if part.dataset == "flat-ble"), "idw", 1.0, 0)
     data, asked = tmp_path / "data", []
     data.mkdir()

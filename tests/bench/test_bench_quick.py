@@ -1,7 +1,5 @@
 """The quick benchmark's rule, on made-up timings, and its stored ratios."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -42,7 +40,7 @@ def made_up(value: float, spread: float = 1.1, name: str = "splatting") -> Ratio
         (made_up(9.0, name="new"), False),  # not stored yet
     ],
 )
-def test_only_a_whole_interval_above_twice_the_stored_ratio_fails(measured: Ratios, fails: bool) -> None:
+def test_only_a_whole_interval_above_twice_the_stored_ratio_fails(measured, fails):
     lines = worse(measured, made_up(0.5))
     assert bool(lines) == fails
     assert all("splatting 1.2 (1.09 to 1.32) is above 2 times the stored 0.5" in line for line in lines)
@@ -52,7 +50,7 @@ def with_ratios(monkeypatch: pytest.MonkeyPatch, ratios: Ratios) -> None:
     monkeypatch.setattr(bench_quick, "measure_pairs", lambda pairs: ratios)
 
 
-def test_ratios_are_compared_with_stored_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ratios_are_compared_with_stored_ones(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="no stored ratios; measure them with `wrf-mi bench --quick --store`"):
         quick(tmp_path / "out", store=False)
     with_ratios(monkeypatch, made_up(0.5))
@@ -67,9 +65,7 @@ def test_ratios_are_compared_with_stored_ones(tmp_path: Path, monkeypatch: pytes
         quick(tmp_path / "out", store=False)
 
 
-def test_quick_command_fails_with_one_line_for_a_worse_ratio(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_quick_command_fails_with_one_line_for_a_worse_ratio(tmp_path, monkeypatch, capsys):
     with_ratios(monkeypatch, made_up(0.5))
     assert cli(["bench", "--quick", "--store", "--out", str(tmp_path)]) == 0
     assert cli(["bench", "--quick", "--out", str(tmp_path)]) == 0
@@ -81,14 +77,12 @@ def test_quick_command_fails_with_one_line_for_a_worse_ratio(
 
 
 @pytest.mark.parametrize("arguments", [["--store"], ["--quick", "demo"]])
-def test_options_outside_quick_are_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_outside_quick_are_refused(arguments, capsys):
     assert cli(["bench", *arguments]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_ratios_of_another_backend_or_a_damaged_file_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ratios_of_another_backend_or_a_damaged_file_are_refused(tmp_path, monkeypatch):
     with_ratios(monkeypatch, made_up(0.5))
     stored = quick(tmp_path, store=True)
     stored["versions"]["backend"] = "abacus 1.0"
@@ -101,7 +95,7 @@ def test_ratios_of_another_backend_or_a_damaged_file_are_refused(
             read_stored(tmp_path / FILE)
 
 
-def test_pair_measures_the_ratio_of_ours_to_theirs() -> None:
+def test_pair_measures_the_ratio_of_ours_to_theirs():
     calls: list[str] = []
 
     def busy(name: str, size: int) -> None:
@@ -115,7 +109,7 @@ def test_pair_measures_the_ratio_of_ours_to_theirs() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_stock_integrator_renders_the_splatted_field(seed: int) -> None:
+def test_stock_integrator_renders_the_splatted_field(seed):
     """So that its time and ours are for the same job; complex and signed signals go through colours."""
     gaussians, receiver = random_field(seed, "alpha", 100, 2.0)
     stock = StockRenderer(receiver, 90, 360)
@@ -127,13 +121,13 @@ def test_stock_integrator_renders_the_splatted_field(seed: int) -> None:
     assert difference(stock.field(other), splatted(other, receiver))["complex_error"] < SAME_L2
 
 
-def test_stock_integrator_refuses_attenuation() -> None:
+def test_stock_integrator_refuses_attenuation():
     gaussians, receiver = random_field(0, "product", 5)
     with pytest.raises(ValueError, match="opacity"):
         StockRenderer(receiver, 9, 36).field(gaussians)
 
 
-def test_documents_show_the_stored_ratios() -> None:
+def test_documents_show_the_stored_ratios():
     stored = json.loads(STORED.read_text())
     assert set(stored["figures"]["ratios"]) == {pair.name for pair in PAIRS}
     assert stored["wall_seconds"] < 120

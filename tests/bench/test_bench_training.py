@@ -1,7 +1,5 @@
 """Operations, shares and lines of the training benchmark."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -23,13 +21,12 @@ from wrf_mi_bench.training import (
     work_of,
 )
 
-from wrf_mi.core import Record
 from wrf_mi.training.trainer import Trainer
 
 SMALL = ("network.width=16", "network.layers=2", "encoding.tx_octaves=3", "encoding.position_octaves=2", "steps=1000")
 
 
-def test_operations_follow_from_the_shapes(one_gateway: Record) -> None:
+def test_operations_follow_from_the_shapes(one_gateway):
     """WRF-GS+ of 8 Gaussians, two layers of 16 that both see 12 and 18 numbers, nine outputs."""
     trainer = Trainer(one_gateway, official(one_gateway), settings(*SMALL))
     n, width = 8, 16
@@ -39,7 +36,7 @@ def test_operations_follow_from_the_shapes(one_gateway: Record) -> None:
 
 
 @pytest.mark.parametrize("model", ["wrf-gs+", "factorised"])
-def test_static_geometry_is_walked_once_per_batch(model: str, one_gateway: Record) -> None:
+def test_static_geometry_is_walked_once_per_batch(model, one_gateway):
     one, four = (
         work_of(Trainer(one_gateway, official(one_gateway), settings("steps=9", f"batch={batch}", model=model)))
         for batch in (1, 4)
@@ -51,7 +48,7 @@ def test_static_geometry_is_walked_once_per_batch(model: str, one_gateway: Recor
     assert one.moved_gb < four.moved_gb < 4 * one.moved_gb
 
 
-def test_shares_of_a_step_sum_to_one(one_gateway: Record) -> None:
+def test_shares_of_a_step_sum_to_one(one_gateway):
     trainer = Trainer(one_gateway, official(one_gateway), settings(*SMALL))
     found = shares(some_steps(trainer, 3))
     assert trainer.state.step == 6
@@ -61,14 +58,14 @@ def test_shares_of_a_step_sum_to_one(one_gateway: Record) -> None:
     assert found[bench_training.WALKS] > 0
 
 
-def test_reference_calls_compute_a_product_and_a_copy() -> None:
+def test_reference_calls_compute_a_product_and_a_copy():
     rng = np.random.default_rng(0)
     a, b = (rng.standard_normal((32, 32)) for _ in range(2))
     np.testing.assert_allclose(product_call(32)().numpy(), a @ b, atol=1e-4)
     assert dr.width(stream_call(1000)()) == 1000
 
 
-def test_fit_of_a_subprocess_has_its_time_and_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit_of_a_subprocess_has_its_time_and_scores(monkeypatch):
     def run_command(arguments: tuple[str, ...], folder: Path, where: str) -> None:
         assert arguments == ("train", bench_training.DATA, "--model", "wrf-gs")
         folder.mkdir()
@@ -81,7 +78,7 @@ def test_fit_of_a_subprocess_has_its_time_and_scores(monkeypatch: pytest.MonkeyP
     assert (found["seconds"], found["peak_memory_mb"], found["gaussians"]) == (9.0, 80.0, 7)
 
 
-def test_lines_state_the_share_of_the_limit() -> None:
+def test_lines_state_the_share_of_the_limit():
     fit = {"seconds": 90.4, "processor_seconds": 170.0, "peak_memory_mb": 380.2, "ssim": {"median": 0.9731}}
     work = {"network_gflop": 0.9, "splat_gflop": 0.1, "moved_gb": 0.02}
     step = {"ms": {"value": 10.0, "low": 9.0, "high": 11.0}, "work": work, "shares": {"products of networks": 0.6}}

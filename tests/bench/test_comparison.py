@@ -1,16 +1,9 @@
 """Parts of long benchmarks."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
-import pytest
 from wrf_mi_bench.comparison import MEASURED, STORED, measured_on, stored_part
 
 
-def test_part_is_measured_once_and_stored_with_machine_and_date(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_part_is_measured_once_and_stored_with_machine_and_date(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     calls: list[int] = []
 
@@ -27,7 +20,7 @@ def test_part_is_measured_once_and_stored_with_machine_and_date(
     assert len(calls) == 2
 
 
-def test_dates_of_parts() -> None:
+def test_dates_of_parts():
     assert measured_on([{MEASURED: {"date": "2026-01-02"}}]) == "2026-01-02"
     assert (
         measured_on([{MEASURED: {"date": day}} for day in ("2026-01-02", "2025-12-31")]) == "2025-12-31 to 2026-01-02"

@@ -1,16 +1,13 @@
 """Benchmark of intervals: its runs, with the fits replaced, and its table."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
-import pytest
 from wrf_mi_bench import comparison, stages
 from wrf_mi_bench.stages import JOINT, Cell
 
 
-def test_runs_are_stored_and_those_outside_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_are_stored_and_those_outside_are_counted(tmp_path, monkeypatch):
     asked = list[tuple[str, str]]()
 
     def measured(cell: Cell, name: str, _: Path) -> dict[str, Any]:

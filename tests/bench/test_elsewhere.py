@@ -1,7 +1,5 @@
 """Differences between numbers of threads, small."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +8,7 @@ from wrf_mi_bench import elsewhere
 
 
 @pytest.mark.slow
-def test_two_threads_give_what_one_gives(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_threads_give_what_one_gives(monkeypatch):
     """Images, spectra and metrics have equal bits; a change of one of them is reported."""
     both = [one for one in elsewhere.variants((1, 2)) if one.kind == "threads"]
     monkeypatch.setattr(elsewhere, "variants", lambda threads: iter(both))
@@ -30,7 +28,7 @@ def test_two_threads_give_what_one_gives(monkeypatch: pytest.MonkeyPatch) -> Non
     assert elsewhere.main(small=True)["failed"] == "beyond its bound: 2 threads: image of Gaussians"
 
 
-def test_failed_child_is_reported() -> None:
+def test_failed_child_is_reported():
     one = next(elsewhere.variants((1,)))
     with pytest.raises(elsewhere.BenchFailed, match="is none of auto, llvm, cuda"):
         elsewhere.computed(replace(one, backend="none"), True)

@@ -1,25 +1,21 @@
 """Times on a GPU and on the CPU: the jobs of both, and the refusal without a GPU."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys
-from pathlib import Path
 
-import pytest
 from wrf_mi_bench import gpu, gpu_job
 from wrf_mi_bench.bench import all_here
 from wrf_mi_bench.check import main
 
 
-def test_without_a_gpu_it_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_gpu_it_is_one_line(tmp_path, capsys):
     assert main("wrf_mi_bench.gpu:main", str(tmp_path / "out.json")) == 2
     assert capsys.readouterr().err.startswith("wrf-mi: bench gpu: CUDA cannot be used")
     assert "gpu" not in all_here()
 
 
-def test_rows_have_the_times_of_both(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_rows_have_the_times_of_both(monkeypatch, tmp_path):
     """Both jobs are measured on the CPU, each in its own process, as no test has a GPU."""
     small = tmp_path / "small_job.py"
     sizes = {"gaussians-splat": (20, 40)}

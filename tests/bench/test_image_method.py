@@ -21,7 +21,7 @@ CEA_DB = 30.0
 
 
 @pytest.mark.parametrize("name", ["conference", "office"])
-def test_paths_of_matlabs_image_method_are_found(name: str):
+def test_paths_of_matlabs_image_method_are_found(name):
     if not (DATA / f"{name}.npz").is_file():
         pytest.skip("newrf is not in WRF_MI_DATA")
     found = image_method_agreement(DATA / f"{name}.npz", rays=1 << 17)
@@ -34,7 +34,7 @@ def test_paths_of_matlabs_image_method_are_found(name: str):
 
 
 @pytest.mark.parametrize("reference", ["line of sight alone", "no path"])
-def test_a_reference_that_lacks_a_path_at_every_position_is_compared(tmp_path: Path, reference: str):
+def test_a_reference_that_lacks_a_path_at_every_position_is_compared(tmp_path, reference):
     mesh = trimesh.util.concatenate([part for _, part in SHOEBOX.values()])
     mesh.export(tmp_path / "room.stl")
     moving, fixed, k = inside(3), np.array([4.4, 3.1, 1.7]), 2 * np.pi / WAVELENGTH_M
@@ -73,7 +73,7 @@ def test_matching_is_one_to_one():
     assert not len(match_paths(ours, far)[0])
 
 
-def test_confirmation_rejects_moved_and_obstructed_paths(tmp_path: Path):
+def test_confirmation_rejects_moved_and_obstructed_paths(tmp_path):
     partition = {"partition": ("itu_wood", sheet(0, 3.0, (0.0, 4.0), (0.0, 2.0)))}
     scene = room(tmp_path / "open", SHOEBOX)
     tx, rx = np.array([[1.3, 2, 1]]), np.array([4.4, 3.1, 1.7])

@@ -1,7 +1,5 @@
 """Benchmark of positions: draws of the training rows pooled, and the verdict on them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from wrf_mi_bench.locate import CELLS, STRETCH, stretches, summary
@@ -23,7 +21,7 @@ def measured(error_m: float, inside: float) -> dict[str, object]:
     }
 
 
-def test_draws_are_pooled_and_judged_together() -> None:
+def test_draws_are_pooled_and_judged_together():
     shares = {0: 0.8, 1: 1.0, 2: 0.9}
     found = {cell: measured(1.0 + cell.seed, shares[cell.seed]) for cell in CELLS}
     made = summary(found)
@@ -38,6 +36,6 @@ def test_draws_are_pooled_and_judged_together() -> None:
     assert "failed" in made
 
 
-def test_stretches_are_means_of_consecutive_rows_over_draws() -> None:
+def test_stretches_are_means_of_consecutive_rows_over_draws():
     values = np.stack([np.arange(50.0), np.arange(50.0) + 2])
     np.testing.assert_allclose(stretches(values), [np.arange(20).mean() + 1, np.arange(20, 50).mean() + 1])

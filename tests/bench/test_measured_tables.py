@@ -1,11 +1,8 @@
 """Measured tables of the documents are made from stored results."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -43,14 +40,14 @@ def made(name: str, result: Mapping[str, Any]) -> str:
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(CHECKOUT)))
-def test_measured_tables_are_made_from_results(path: Path) -> None:
+def test_measured_tables_are_made_from_results(path):
     text = prose(path)
     assert unsourced(text, path.name) == []
     assert BLOCK.findall(text) == re.findall(r"<!-- ([\w-][\w/-]*) -->", text)
 
 
 @pytest.mark.parametrize("path", EARLIER, ids=lambda path: path.stem)
-def test_earlier_measurements_are_stated_and_shown(path: Path) -> None:
+def test_earlier_measurements_are_stated_and_shown(path):
     result = json.loads(path.read_text(encoding="utf-8"))
     for one in result.get("measurements", [result]):
         assert re.fullmatch(r"\d{4}-\d{2}-\d{2} [0-9a-f]{7}", f"{one['date']} {one['commit']}"), one
@@ -59,7 +56,7 @@ def test_earlier_measurements_are_stated_and_shown(path: Path) -> None:
         assert made(path.stem, result) in (CHECKOUT / result["page"]).read_text(encoding="utf-8")
 
 
-def test_table_without_a_result_is_found() -> None:
+def test_table_without_a_result_is_found():
     table = "| what | error |\n| --- | --- |\n| a | 0.1 |"
     assert unsourced(f"By `wrf-mi bench stress`:\n\n{table}\n\nSmall.", "page.md") == ["| what | error |"]
     for text in (f"<!-- made -->\n{table}\n<!-- /made -->", table.replace("0.1", "one")):

@@ -1,8 +1,5 @@
 """Run time against error from the tables' rows: points, fronts, text and picture."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,7 +17,7 @@ POINTS: Points = {
 }
 
 
-def test_front_holds_the_pareto_optimal_methods_from_cheap_to_costly() -> None:
+def test_front_holds_the_pareto_optimal_methods_from_cheap_to_costly():
     assert front(POINTS, "ms_per_sample", True) == ["fast", "middle", "slow"]
     assert front(POINTS, "train_seconds", True) == ["slow"]
     assert front(POINTS, "ms_per_sample", False) == ["fast"]
@@ -29,7 +26,7 @@ def test_front_holds_the_pareto_optimal_methods_from_cheap_to_costly() -> None:
     assert front(even, "ms", False) == ["b"]
 
 
-def test_points_are_means_of_medians_over_seeds_of_all_training_rows() -> None:
+def test_points_are_means_of_medians_over_seeds_of_all_training_rows():
     rows = [Row(PART, "vae", 1.0, 0), Row(PART, "vae", 1.0, 1), Row(PART, "vae", 1.0, 2), Row(PART, "kriging", 0.1, 0)]
     stored: dict[str, Any] = {
         row.name: {"score": {"median": 0.1 * k}, "ms_per_sample": 10.0**k, "train_seconds": 2.0 * k}
@@ -40,7 +37,7 @@ def test_points_are_means_of_medians_over_seeds_of_all_training_rows() -> None:
     }
 
 
-def test_text_and_picture_show_both_fronts() -> None:
+def test_text_and_picture_show_both_fronts():
     rows = fronts({PART: POINTS})
     assert [row["what"] for row in rows] == ["rfid-lab, SSIM, prediction of a sample", "rfid-lab, SSIM, training"]
     assert rows[0]["value"] == "fast 0.700 in 1 ms, middle 0.900 in 3 ms, slow 0.990 in 10 ms"
@@ -55,6 +52,6 @@ def test_text_and_picture_show_both_fronts() -> None:
     assert figure.axes[1].lines[0].get_xdata()[0] == LEAST
 
 
-def test_missing_rows_are_reported(tmp_path: Path) -> None:
+def test_missing_rows_are_reported(tmp_path):
     with pytest.raises(InputError, match="no stored rows; call it in a checkout that has them, or run wrf-mi bench"):
         read_points(tmp_path)

@@ -1,7 +1,5 @@
 """Random rooms: what a seed fixes, and what rooms and their channels promise."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +14,7 @@ ROOMS = [random_room(seed) for seed in range(200, 240)]
 SMALL = Survey(train=30, test=4, rays=10_000)
 
 
-def test_rooms_keep_their_bounds() -> None:
+def test_rooms_keep_their_bounds():
     for room in ROOMS:
         low, high = (
             getattr(np, what)([m.bounds[k] for _, m in room.parts.values()], axis=0)
@@ -29,7 +27,7 @@ def test_rooms_keep_their_bounds() -> None:
         assert FEWEST <= len(room.parts) - 6 <= MOST
 
 
-def test_furniture_and_access_point_stand_apart() -> None:
+def test_furniture_and_access_point_stand_apart():
     for room in ROOMS:
         boxes = [mesh.bounds for name, (_, mesh) in room.parts.items() if name.startswith("piece")]
         for index, one in enumerate(boxes):
@@ -40,7 +38,7 @@ def test_furniture_and_access_point_stand_apart() -> None:
         assert walls.min() == pytest.approx(MOUNTED_M, abs=1e-4) if room.mount != "free" else walls.min() > MOUNTED_M
 
 
-def test_rooms_differ_in_mount_and_materials() -> None:
+def test_rooms_differ_in_mount_and_materials():
     assert {room.mount for room in ROOMS} == set(MOUNTS)
     perfect = [{material for material, _ in room.parts.values()} == {PERFECT} for room in ROOMS]
     assert perfect == [room.perfect for room in ROOMS]
@@ -52,7 +50,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Path, Path]:
     return random_room_record(103, tmp_path_factory.mktemp("room"), SMALL)
 
 
-def test_a_seed_fixes_channels_and_scan(made: tuple[Record, Path, Path], tmp_path: Path) -> None:
+def test_a_seed_fixes_channels_and_scan(made, tmp_path):
     record, _, scan = made
     again, _, other = random_room_record(103, tmp_path, SMALL)
     np.testing.assert_array_equal(record.observation, again.observation)
@@ -61,7 +59,7 @@ def test_a_seed_fixes_channels_and_scan(made: tuple[Record, Path, Path], tmp_pat
     assert [file.read_bytes() for file in one] == [file.read_bytes() for file in two]
 
 
-def test_noise_has_the_stated_power(made: tuple[Record, Path, Path]) -> None:
+def test_noise_has_the_stated_power(made):
     record, *_ = made
     noise = np.square(np.abs(record.observation - record.truth)).mean(axis=2)
     signal = np.square(np.abs(record.truth)).mean(axis=2)

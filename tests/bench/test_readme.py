@@ -1,7 +1,5 @@
 """README and documents: scripts run, commands parse, links exist, numbers equal the stored ones."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json
@@ -68,7 +66,7 @@ def tiny_folder(tmp_path: Path) -> Path:
     return write_spectrum_folder(tmp_path / "tiny", record)
 
 
-def test_scripts_of_the_readme_run(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_scripts_of_the_readme_run(tiny_folder, tmp_path, monkeypatch, capsys):
     """Scripts run unchanged except data set and number of steps."""
     script = "\n".join(blocks(README, "python"))
     for shown, tiny in (('"rfid-lab"', repr(str(tiny_folder))), ('"steps=6000"', '"steps=2"')):
@@ -93,7 +91,7 @@ def test_scripts_of_the_readme_run(tiny_folder: Path, tmp_path: Path, monkeypatc
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(CHECKOUT)))
-def test_commands_parse(path: Path) -> None:
+def test_commands_parse(path):
     targets = set(re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE))
     for line in commands(path):
         program, *arguments = shlex.split(line, comments=True)
@@ -112,14 +110,14 @@ def test_commands_parse(path: Path) -> None:
             assert name in {*CASES, *CHECKS, TABLES}, line
 
 
-def test_readme_shows_all_main_commands() -> None:
+def test_readme_shows_all_main_commands():
     shown = {shlex.split(line, comments=True)[1] for line in commands(README) if line.startswith("wrf-mi")}
     assert shown >= {"doctor", "data", "train", "evaluate", "predict", "compare", "demo", "mesh", "trace", "sweep"}
     assert {"make demo", "make test"} <= {line.partition("#")[0].strip() for line in commands(README)}
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(CHECKOUT)))
-def test_links_and_paths_exist(path: Path) -> None:
+def test_links_and_paths_exist(path):
     text = path.read_text(encoding="utf-8")
     links = [link for link in re.findall(r"\]\(([^)#]+)\)", text) if "://" not in link]
     for link in links:
@@ -129,7 +127,7 @@ def test_links_and_paths_exist(path: Path) -> None:
         assert (CHECKOUT / name).exists(), name
 
 
-def test_model_page_states_the_defaults_and_constants() -> None:
+def test_model_page_states_the_defaults_and_constants():
     rows = cell_rows((CHECKOUT / "docs" / "model.md").read_text(encoding="utf-8"))
     constants = [row for row in rows if row[0].isupper()]
     settings = [row for row in rows if not row[0].isupper()]
@@ -143,12 +141,12 @@ def test_model_page_states_the_defaults_and_constants() -> None:
         assert value == defaults.get(name), name
 
 
-def test_results_page_names_every_case() -> None:
+def test_results_page_names_every_case():
     rows = cell_rows((CHECKOUT / "docs" / "results.md").read_text(encoding="utf-8"))
     assert [name for name, *_ in rows] == [*CASES, *CHECKS]
 
 
-def test_notebooks_are_stored_without_output() -> None:
+def test_notebooks_are_stored_without_output():
     paths = list((CHECKOUT / "notebooks").glob("*.ipynb"))
     assert paths
     for path in paths:

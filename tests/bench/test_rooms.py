@@ -1,7 +1,5 @@
 """Benchmark of random rooms: errors of scans, gain of the correction, table."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -21,7 +19,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Path, Path]:
     return random_room_record(103, tmp_path_factory.mktemp("room"), Survey(train=60, test=24, rays=40_000))
 
 
-def test_a_third_of_the_scans_paths_and_a_radian_of_phase_are_wrong(made: tuple[Record, Path, Path]) -> None:
+def test_a_third_of_the_scans_paths_and_a_radian_of_phase_are_wrong(made):
     """And the scan states no material of the room: those of the rules."""
     record, true, scan = made
     traced = [RayTracer(scene, instrument_of(record), OPTIONS).trace(record.tx_pos_m) for scene in (true, scan)]
@@ -35,7 +33,7 @@ def test_a_third_of_the_scans_paths_and_a_radian_of_phase_are_wrong(made: tuple[
 
 # Eight seconds. tests/correction/test_correct.py requires 20 dB of a correction by channels, in a smaller room.
 @pytest.mark.slow
-def test_correction_brings_channels_closer_than_the_scan(made: tuple[Record, Path, Path], tmp_path: Path) -> None:
+def test_correction_brings_channels_closer_than_the_scan(made, tmp_path):
     """By 3 dB at the test rows, 60 training rows; 7 dB with seed 103 and 90 rows."""
     record, _, scan = made
     options = CorrectionOptions(rays=1 << 14, steps=3)
@@ -50,7 +48,7 @@ def test_correction_brings_channels_closer_than_the_scan(made: tuple[Record, Pat
     assert accuracy[1] > accuracy[0] + 3
 
 
-def test_table_has_a_line_for_each_room_and_the_median() -> None:
+def test_table_has_a_line_for_each_room_and_the_median():
     row = {
         "what": "0: 3 x 4 x 3 m",
         "value": "1.0 to 9.0 dB",

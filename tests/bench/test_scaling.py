@@ -1,15 +1,10 @@
 """Exponents of growth."""
 
-from __future__ import annotations
-
 from wrf_mi_bench.scaling import Axis, rows, scale, verdict
-from wrf_mi_bench.timing import (
-    Interval,
-    n_log_n,
-)
+from wrf_mi_bench.timing import Interval, n_log_n
 
 
-def test_growth_beyond_n_log_n_is_reported(clock: list[float]) -> None:
+def test_growth_beyond_n_log_n_is_reported(clock):
     def axis(power: float) -> Axis:
         def make(n: int):
             def call() -> None:

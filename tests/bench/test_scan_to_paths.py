@@ -1,7 +1,5 @@
 """Paths of scenes made from simulated scans."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -18,7 +16,7 @@ from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 FREQUENCY_HZ = 2.4e9
 
 
-def test_paths_of_the_made_scene_equal_those_of_the_room(tmp_path: Path) -> None:
+def test_paths_of_the_made_scene_equal_those_of_the_room(tmp_path):
     """Two rooms with a doorway, scanned from both: LoS and two reflections."""
     xml = scene_file(tmp_path / "room", two_rooms())
     np.savez(tmp_path / "scan.npz", points=simulate_scan(xml, [[2, 2, 1.4], [5.5, 2, 1.4]], rays_per_pose=40_000))
@@ -36,7 +34,7 @@ def test_paths_of_the_made_scene_equal_those_of_the_room(tmp_path: Path) -> None
     assert power_ours[matched].sum() > 0.95 * power_ours.sum()
 
 
-def test_scanner_poses_are_far_from_each_other() -> None:
+def test_scanner_poses_are_far_from_each_other():
     places = np.array([[0.0, 0, 0], [0.1, 0, 0], [5, 0, 0], [2.4, 0, 0]])
     np.testing.assert_array_equal(spread(places, 3), places[[0, 2, 3]])
     assert len(spread(places, 9)) == 4
@@ -44,7 +42,7 @@ def test_scanner_poses_are_far_from_each_other() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("room", ["conference", "office"])
-def test_a_noisy_scan_of_a_cad_room_gives_most_of_its_paths(room: str) -> None:
+def test_a_noisy_scan_of_a_cad_room_gives_most_of_its_paths(room):
     file = Path(os.environ.get("WRF_MI_DATA", "/nowhere")) / "newrf" / f"{room}.npz"
     if not file.is_file():
         pytest.skip("WRF_MI_DATA names no folder with newrf/")

@@ -1,7 +1,5 @@
 """Sentinels: which stored figures they are, when a figure counts as kept, and that a stopped call goes on."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,7 +28,7 @@ def stored_rows() -> list[dict]:
     return [json.loads((CHECKOUT / STORED / FOLDER / f"{name}-100-seed0.json").read_text()) for name in TABLE_ROWS]
 
 
-def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeypatch):
     monkeypatch.chdir(CHECKOUT)
     known = groups()
     figures = [figure for group in known for figure in group.figures]
@@ -42,7 +40,7 @@ def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeyp
 
 
 @pytest.mark.parametrize("count", [40, 400])
-def test_interval_of_a_median_has_its_nominal_coverage(count: int) -> None:
+def test_interval_of_a_median_has_its_nominal_coverage(count):
     rng = np.random.default_rng(1)
     inside = 0
     for _ in range(400):
@@ -65,7 +63,7 @@ def test_interval_of_a_median_has_its_nominal_coverage(count: int) -> None:
         (ERROR, float("inf"), "worse"),
     ],
 )
-def test_a_figure_is_worse_outside_its_interval_on_the_bad_side(figure: Figure, measured: float, verdict: str) -> None:
+def test_a_figure_is_worse_outside_its_interval_on_the_bad_side(figure, measured, verdict):
     assert figure.verdict(measured) == verdict
 
 
@@ -101,7 +99,7 @@ def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Made:
     return Made(monkeypatch, tmp_path / "sentinels")
 
 
-def test_equal_figures_pass_and_missing_data_are_reported(made: Made) -> None:
+def test_equal_figures_pass_and_missing_data_are_reported(made):
     found = main()
     assert "failed" not in found
     assert [row["verdict"] for row in found["rows"]] == ["equal", "equal", "not on this machine"]
@@ -110,7 +108,7 @@ def test_equal_figures_pass_and_missing_data_are_reported(made: Made) -> None:
     assert lines[4] == "| flat: field, median absolute error (dB) | 3 | 2.8 to 3.2 |  | not on this machine |"
 
 
-def test_stopped_call_resumes_from_measured_groups(made: Made, tmp_path: Path) -> None:
+def test_stopped_call_resumes_from_measured_groups(made, tmp_path):
     made.error = KeyboardInterrupt
     assert check.main(CHECKS["sentinels"].function, str(tmp_path / "out.json")) == 130
     assert not (tmp_path / "out.json").exists()
@@ -119,7 +117,7 @@ def test_stopped_call_resumes_from_measured_groups(made: Made, tmp_path: Path) -
     assert made.asked == ["good", "other", "other"]
 
 
-def test_changed_code_is_measured_again(made: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_changed_code_is_measured_again(made, monkeypatch, tmp_path):
     first = main()
     assert main() == first  # nothing was measured, dates and seconds are those of the measurement
     changed = tmp_path / "changed.py"
@@ -129,7 +127,7 @@ def test_changed_code_is_measured_again(made: Made, monkeypatch: pytest.MonkeyPa
     assert made.asked == ["good", "other"] * 2
 
 
-def test_source_files_are_the_packages_without_compiled_files() -> None:
+def test_source_files_are_the_packages_without_compiled_files():
     found = source_files()
     assert {"wrf_mi/runs/folder.py", "wrf_mi_plugins/shape.py", "wrf_mi_scenes/registry.py"} <= set(found)
     assert not [name for name in found if name.endswith(".pyc")]
@@ -138,9 +136,7 @@ def test_source_files_are_the_packages_without_compiled_files() -> None:
 @pytest.mark.parametrize(
     ("error", "value"), [(3.3, "3.3, worse"), (InputError("no\nscene"), "failed: no scene"), (OSError(), "failed")]
 )
-def test_worse_or_failed_figure_is_named_after_all_were_measured(
-    made: Made, error: float | Exception, value: str
-) -> None:
+def test_worse_or_failed_figure_is_named_after_all_were_measured(made, error, value):
     made.error = error
     found = main()
     assert made.asked == ["good", "other"]
@@ -148,9 +144,7 @@ def test_worse_or_failed_figure_is_named_after_all_were_measured(
     assert found["failed"].startswith(begin)
 
 
-def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_worse(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_worse(monkeypatch, tmp_path, capsys):
     """The check runs in a process of its own, which is left out here."""
     figures = {"rows": [ERROR.row(3.3, "worse"), SSIM.row(0.9, "equal")], "failed": "1 of 2 figures got worse"}
     calls = []
@@ -178,9 +172,7 @@ def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_wo
     assert calls == [CHECKS["sentinels"].function] * 2
 
 
-def test_missing_stored_figures_are_reported_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_stored_figures_are_reported_in_one_line(monkeypatch, tmp_path, capfd):
     """The command, with the process that it starts."""
     monkeypatch.chdir(tmp_path)
     status, out, err = call(["bench", "sentinels", "--out", "out", "--runs", "runs"], capfd)

@@ -1,7 +1,5 @@
 """Benchmark of the hybrid beside its parts alone: differences by row, and the table."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -13,7 +11,7 @@ def measured(model: str, median: float, **more: Any) -> dict[str, Any]:
     return {"model": model, "score": score, "block": "ssim", "inside_90": None, "crps": None} | more
 
 
-def test_table_names_stages_the_best_part_and_those_that_are_clearly_better() -> None:
+def test_table_names_stages_the_best_part_and_those_that_are_clearly_better():
     stages = [
         {"stage": "mean", "kept": True, "held_out": 0.7, "seconds": None},
         {"stage": "correction", "kept": False, "held_out": 0.695, "seconds": 3.0},
@@ -38,5 +36,5 @@ def test_table_names_stages_the_best_part_and_those_that_are_clearly_better() ->
         ("rssi", "flat", ["kriging", "idw", "ray-tracing", CALIBRATED]),
     ],
 )
-def test_parts_are_those_of_the_task_and_the_scene(task: str, scene: str | None, parts: list[str]) -> None:
+def test_parts_are_those_of_the_task_and_the_scene(task, scene, parts):
     assert parts_of(task, scene) == parts

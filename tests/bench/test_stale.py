@@ -1,14 +1,11 @@
 """Results that are older than their source."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import subprocess
 from pathlib import Path
 
-import pytest
 from wrf_mi_bench.bench import modules_of, provenance
 from wrf_mi_bench.sources import PACKAGES, SOURCE, code_digest, modules_of_command, needed_files
 from wrf_mi_bench.stale import UNKNOWN, stale
@@ -20,14 +17,14 @@ DATE = "2020-05-01"
 TEXT = 'def f(x):\n    """Old."""\n    return x + 1\n'
 
 
-def test_digest_ignores_comments_and_docstrings() -> None:
+def test_digest_ignores_comments_and_docstrings():
     assert code_digest(
         '"""New."""\n' + TEXT.replace("Old", "New").replace("return", "# why\n    return")
     ) == code_digest(TEXT)
     assert code_digest(TEXT.replace("1", "2")) != code_digest(TEXT)
 
 
-def test_source_of_a_result_has_what_its_module_imports_and_the_models_that_it_names() -> None:
+def test_source_of_a_result_has_what_its_module_imports_and_the_models_that_it_names():
     files = needed_files(*modules_of("stages"))
     assert {"wrf_mi_bench/stages.py", "wrf_mi/core/files.py", "wrf_mi/models/hybrid/model.py"} <= files.keys()
     assert "wrf_mi/gaussians/blend.py" in needed_files(*modules_of("elsewhere"))  # of its child process
@@ -38,7 +35,7 @@ def test_source_of_a_result_has_what_its_module_imports_and_the_models_that_it_n
     assert ["wrf_mi/models/uplink/fire.py" in one for one in rows] == [False, True]
 
 
-def test_results_of_changed_source_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_of_changed_source_are_listed(tmp_path, capsys):
     scan, plan = (provenance(*modules_of(name)) for name in ("large-scan", "flat-plan"))
     scan[SOURCE] |= {"wrf_mi/scene": "changed"}
     results = {"flat-plan": plan, "large-scan": scan, "rooms": {"date": DATE}, "stages/part": {"measured": scan}}
@@ -58,7 +55,7 @@ def test_results_of_changed_source_are_listed(tmp_path: Path, capsys: pytest.Cap
     assert main(["bench", "demo", "--stale", "--out", str(tmp_path)]) == 2
 
 
-def test_results_without_digest_are_compared_with_the_source_of_their_date(tmp_path: Path) -> None:
+def test_results_without_digest_are_compared_with_the_source_of_their_date(tmp_path):
     """A repository with this source, but a comment in one folder and a statement in another."""
     for name, folder in PACKAGES.items():
         ignored = shutil.ignore_patterns("__pycache__", "results", "[!_]*.[!p]*")

@@ -1,23 +1,12 @@
 """How calls are timed, split and compared, on calls whose cost is known."""
 
-from __future__ import annotations
-
 import itertools
 import time
 
 import numpy as np
 import pytest
 from wrf_mi_bench import timing
-from wrf_mi_bench.timing import (
-    Interval,
-    bootstrap,
-    exponent,
-    history_of,
-    interleaved,
-    larger_half,
-    memory_mb,
-    ratio,
-)
+from wrf_mi_bench.timing import Interval, bootstrap, exponent, history_of, interleaved, larger_half, memory_mb, ratio
 from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 BUSY_S = 0.02
@@ -36,7 +25,7 @@ def array() -> np.ndarray:
     return np.ones(ARRAY_MB * 1_000_000 // 8)
 
 
-def test_bootstrap_interval_holds_the_median_and_narrows() -> None:
+def test_bootstrap_interval_holds_the_median_and_narrows():
     rng = np.random.default_rng(0)
     few, many = (bootstrap(rng.normal(5, 1, n)) for n in (20, 2000))
     assert few.low < few.value < few.high
@@ -47,7 +36,7 @@ def test_bootstrap_interval_holds_the_median_and_narrows() -> None:
         bootstrap([])
 
 
-def test_calls_take_turns_and_warm_up_is_not_timed(clock: list[float]) -> None:
+def test_calls_take_turns_and_warm_up_is_not_timed(clock):
     order: list[str] = []
 
     def call(name: str, cost: float) -> None:
@@ -62,7 +51,7 @@ def test_calls_take_turns_and_warm_up_is_not_timed(clock: list[float]) -> None:
     np.testing.assert_allclose(times["b"], [1] * 4)
 
 
-def test_rounds_end_when_time_is_up_but_three_are_timed(clock: list[float]) -> None:
+def test_rounds_end_when_time_is_up_but_three_are_timed(clock):
     def slow() -> None:
         clock[0] += 10
 
@@ -70,7 +59,7 @@ def test_rounds_end_when_time_is_up_but_three_are_timed(clock: list[float]) -> N
     assert len(interleaved({"slow": slow}, repeats=50, warm_up=1, most_s=75)["slow"]) == 7
 
 
-def test_what_slows_both_calls_leaves_their_ratio(clock: list[float]) -> None:
+def test_what_slows_both_calls_leaves_their_ratio(clock):
     load = itertools.count(1)
     calls = {"ours": 0.003, "theirs": 0.001}
 
@@ -85,7 +74,7 @@ def test_what_slows_both_calls_leaves_their_ratio(clock: list[float]) -> None:
         ratio([1, 2], [1])
 
 
-def test_history_holds_the_kernels_of_a_call() -> None:
+def test_history_holds_the_kernels_of_a_call():
     import drjit as dr
     import mitsuba as mi
 
@@ -97,7 +86,7 @@ def test_history_holds_the_kernels_of_a_call() -> None:
     assert 0 < kernel["execution_time"] <= total_ms
 
 
-def test_memory_is_what_a_call_needs_beyond_what_was_there() -> None:
+def test_memory_is_what_a_call_needs_beyond_what_was_there():
     import drjit as dr
     import mitsuba as mi
 
@@ -110,7 +99,7 @@ def test_memory_is_what_a_call_needs_beyond_what_was_there() -> None:
     assert held.nbytes == 1e6 * ARRAY_MB
 
 
-def test_without_linux_memory_is_watched(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+def test_without_linux_memory_is_watched(monkeypatch, tmp_path):
     monkeypatch.setattr(timing, "RESET_PEAK", tmp_path / "missing")
 
     def call() -> None:
@@ -121,7 +110,7 @@ def test_without_linux_memory_is_watched(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert ARRAY_MB - PAGES_MB <= memory_mb(call) < ARRAY_MB + SLACK_MB
 
 
-def test_exponent_is_that_of_the_larger_half() -> None:
+def test_exponent_is_that_of_the_larger_half():
     sizes = [10**k for k in range(1, 7)]
     cost = [[1000 + n**1.5] * 3 for n in sizes]  # the overhead hides the growth at first
     found = exponent(sizes, cost)
@@ -134,7 +123,7 @@ def test_exponent_is_that_of_the_larger_half() -> None:
         exponent([10], [[1.0]])
 
 
-def test_exponent_is_less_sure_of_noisy_times() -> None:
+def test_exponent_is_less_sure_of_noisy_times():
     rng, sizes = np.random.default_rng(0), [10, 100, 1000, 10000]
     calm, noisy = (exponent(sizes, [n * rng.lognormal(0, s, 9) for n in sizes]) for s in (0.01, 0.5))
     assert noisy.high - noisy.low > 10 * (calm.high - calm.low)
@@ -142,7 +131,7 @@ def test_exponent_is_less_sure_of_noisy_times() -> None:
 
 
 @pytest.mark.parametrize("count", [12, 100, 5000])
-def test_rooms_of_a_number_of_triangles(count: int) -> None:
+def test_rooms_of_a_number_of_triangles(count):
     walls = divided_room(count)
     assert count <= len(walls.faces) <= 1.6 * count
     np.testing.assert_allclose(walls.area, divided_room(12).area)

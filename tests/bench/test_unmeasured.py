@@ -1,7 +1,5 @@
 """Benchmark of new carriers and receivers: rows left to new receivers alone, and gains over seeds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from wrf_mi_bench.unmeasured import HYBRID, LAW, gains, only
@@ -10,7 +8,7 @@ from wrf_mi.core import Receiver, Record
 from wrf_mi.datasets import make_splits
 
 
-def test_new_receivers_alone_see_the_rows_left_to_them() -> None:
+def test_new_receivers_alone_see_the_rows_left_to_them():
     receivers = tuple(Receiver(f"rx{k}", np.array([k, 0.0, 1.0]), np.array([0.0, 0, 0, 1])) for k in range(3))
     observed = -np.arange(180, dtype=np.float32).reshape(3, 60)
     rows = np.arange(40), np.arange(40, 60)
@@ -25,7 +23,7 @@ def test_new_receivers_alone_see_the_rows_left_to_them() -> None:
     np.testing.assert_array_equal(alone.observation[0, known], observed[1, known])
 
 
-def test_seeds_that_score_the_same_rows_do_not_narrow_an_interval() -> None:
+def test_seeds_that_score_the_same_rows_do_not_narrow_an_interval():
     errors = np.random.default_rng(1).uniform(1, 3, (2, 50))
     pairs = [["rx", row] for row in range(50)]
     one = {HYBRID: errors[0].tolist(), LAW: errors[1].tolist(), "pairs": pairs, "inside_90": 0.9, "crps": 1.0}

@@ -1,7 +1,5 @@
 """Figures in the documents' prose are those of stored results, or stated by ``figures/PAGE.yml`` not to be measured."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator
@@ -72,7 +70,7 @@ def unfounded(text: str, found: list[float]) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(CHECKOUT)))
-def test_figures_have_a_source(page: Path) -> None:
+def test_figures_have_a_source(page):
     left = prose(page.read_text(encoding="utf-8"))
     for entry in stated(page):
         text = prose(entry["text"])
@@ -90,7 +88,7 @@ def test_figures_have_a_source(page: Path) -> None:
     assert [left[max(at.start() - 60, 0) : at.end() + 20] for at in FIGURE.finditer(left)] == []
 
 
-def test_figures_without_a_source_are_found() -> None:
+def test_figures_without_a_source_are_found():
     assert FIGURE.search(prose("The error is 3.2 dB."))
     assert FIGURE.search(prose("It takes 3 to 4 minutes."))
     assert not FIGURE.search(prose("See `0.3 s`, eq. 4 and\n\n| a | 0.1 |\n"))

@@ -1,7 +1,5 @@
 """Code of README and documents: names are defined, and no folder is written by two of their commands or scripts."""
 
-from __future__ import annotations
-
 import ast
 import itertools
 import re
@@ -41,17 +39,17 @@ def undefined(code: str) -> list[str]:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if script(page)], ids=lambda page: page.name)
-def test_code_of_documents_defines_its_names(page: Path) -> None:
+def test_code_of_documents_defines_its_names(page):
     assert undefined(script(page)) == []
 
 
-def test_code_with_undefined_names_is_found() -> None:
+def test_code_with_undefined_names_is_found():
     assert len(undefined("import os\nprint(os.name, positions)\n")) == 1
     assert len(undefined("print(\n")) == 1
 
 
 @pytest.mark.slow
-def test_training_from_python_prints_what_the_page_states(capsys: pytest.CaptureFixture[str]) -> None:
+def test_training_from_python_prints_what_the_page_states(capsys):
     code = script(CHECKOUT / "docs" / "joint.md")
     stated = [float(number) for number in re.findall(r"^print\(.*\)  # ([\d.]+)", code, re.MULTILINE)]
     assert len(stated) == 2
@@ -74,7 +72,7 @@ def written(page: Path) -> Iterator[str]:
                 yield str(ast.literal_eval(call.args[place]))
 
 
-def test_no_folder_is_written_twice() -> None:
+def test_no_folder_is_written_twice():
     """A run, a scene or a sweep that exists is refused: a reader of one page could not follow the next."""
     places: dict[str, list[str]] = {}
     for page in PAGES:

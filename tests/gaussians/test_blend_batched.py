@@ -1,7 +1,5 @@
 """Batched blending of transmitters that share one geometry against blending with repeated geometry."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr
@@ -10,15 +8,7 @@ import numpy as np
 import pytest
 
 from wrf_mi.core import Receiver
-from wrf_mi.gaussians import (
-    Encoding,
-    Factorised,
-    Gaussians,
-    WrfGs,
-    WrfGsPlus,
-    random_gaussians,
-    tiles,
-)
+from wrf_mi.gaussians import Encoding, Factorised, Gaussians, WrfGs, WrfGsPlus, random_gaussians, tiles
 from wrf_mi.gaussians.blend import GROUP, group_size, splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
@@ -52,7 +42,7 @@ def drawn(name: str, batch: int) -> tuple[dict[str, Any], Any]:
 @pytest.mark.gradcheck
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("batch", [2, 5, 8])
-def test_shared_geometry_equals_repeated_geometry(name: str, batch: int) -> None:
+def test_shared_geometry_equals_repeated_geometry(name, batch):
     """Spectra, and derivatives by every parameter; batches of half a group, of a prime number, of two groups."""
     plane, rng = perception_plane(*SIZE, Float64), np.random.default_rng(3)
     weight = [Float64(rng.standard_normal(batch * plane.pixels)) for _ in range(2)]
@@ -74,7 +64,7 @@ def test_shared_geometry_equals_repeated_geometry(name: str, batch: int) -> None
         assert expected.any(), key
 
 
-def test_counted_lists_give_the_same_image(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_counted_lists_give_the_same_image(monkeypatch):
     """Counted lists of large fields serve all groups of transmitters."""
     plane, images = perception_plane(*SIZE, Float64), []
     params, tx_pos = drawn("factorised", 8)
@@ -86,7 +76,7 @@ def test_counted_lists_give_the_same_image(monkeypatch: pytest.MonkeyPatch) -> N
     assert images[0].any()
 
 
-def test_group_size_divides_the_batch() -> None:
+def test_group_size_divides_the_batch():
     sizes = [group_size(batch) for batch in range(1, 13)]
     assert sizes == [1, 2, 3, 4, 1, 3, 1, 4, 3, 2, 1, 4]
     assert max(sizes) == GROUP

@@ -1,7 +1,5 @@
 """Chunked evaluation equals evaluation at once: lists of tiles, networks of many Gaussians."""
 
-from __future__ import annotations
-
 from dataclasses import fields as fields_of
 
 import drjit as dr
@@ -12,12 +10,7 @@ from made_spectra import RECEIVERS, SIZE, true_field
 
 from wrf_mi.backend.device import to_float, to_tensor
 from wrf_mi.core import InputError
-from wrf_mi.gaussians import (
-    FIELDS,
-    Gaussians,
-    random_gaussians,
-    tiles,
-)
+from wrf_mi.gaussians import FIELDS, Gaussians, random_gaussians, tiles
 from wrf_mi.gaussians.footprint import depth_order, project
 from wrf_mi.gaussians.operator import pixel_weights
 from wrf_mi.gaussians.parameters import gaussians_in_parts
@@ -52,7 +45,7 @@ def members(lists: TileLists, n: int) -> list[list[int]]:
 
 
 @pytest.mark.parametrize("size", [0.02, 0.4])
-def test_counted_lists_equal_allocated_lists(monkeypatch: pytest.MonkeyPatch, size: float):
+def test_counted_lists_equal_allocated_lists(monkeypatch, size):
     """A plane whose last tiles stick out, three transmitters, Gaussians below the horizon and across the seam."""
     batch, count, pose, plane = 3, 60, device_pose(RECEIVERS[0]), perception_plane(23, 61, mi.Float)
     field = gaussians(batch, count, size)
@@ -69,7 +62,7 @@ def test_counted_lists_equal_allocated_lists(monkeypatch: pytest.MonkeyPatch, si
     assert room < dr.width(reserved.index)
 
 
-def test_lists_without_visible_gaussians_are_empty(monkeypatch: pytest.MonkeyPatch):
+def test_lists_without_visible_gaussians_are_empty(monkeypatch):
     monkeypatch.setattr(tiles, "RESERVED", 0)
     field = gaussians(1, 5, 1e-3)
     field.position = [mi.Float(0, 0.1, 0.2, 0, 0), mi.Float(0), dr.full(mi.Float, -3, 5)]
@@ -79,7 +72,7 @@ def test_lists_without_visible_gaussians_are_empty(monkeypatch: pytest.MonkeyPat
     assert not lists.length.numpy().any()
 
 
-def test_operator_is_the_same_with_counted_lists(monkeypatch: pytest.MonkeyPatch):
+def test_operator_is_the_same_with_counted_lists(monkeypatch):
     """Its strips are planes of a row of tiles each."""
     field, pose, plane = gaussians(1, 60, 0.3), device_pose(RECEIVERS[0]), perception_plane(23, 61, mi.Float)
     whole = pixel_weights(field, pose, plane).toarray()
@@ -98,7 +91,7 @@ def test_more_entries_than_32_bits_count_are_refused():
 
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+", "factorised"])
 @pytest.mark.parametrize("batch", [1, 2])
-def test_networks_in_chunks_equal_the_whole(model: str, batch: int):
+def test_networks_in_chunks_equal_the_whole(model, batch):
     field = FIELDS[model]()
     rng = np.random.default_rng(0)
     start = random_gaussians([RECEIVERS[0]], 23, rng)
@@ -114,7 +107,7 @@ def test_networks_in_chunks_equal_the_whole(model: str, batch: int):
             np.testing.assert_allclose(a, b, rtol=ROUNDING, atol=ROUNDING)
 
 
-def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch: pytest.MonkeyPatch):
+def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch):
     """Above a number of Gaussians nothing is recorded, networks run in chunks and lists are counted."""
     field, params = true_field("wrf-gs+")
     tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))

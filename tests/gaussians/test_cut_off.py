@@ -2,8 +2,6 @@
 error has a bound.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -22,7 +20,7 @@ from wrf_mi.gaussians.tiles import build_lists, perception_plane
 pytestmark = pytest.mark.all_threads
 
 
-def test_lists_hold_only_gaussians_near_the_tile() -> None:
+def test_lists_hold_only_gaussians_near_the_tile():
     gaussians = fields(1, False)
     footprints = project(gaussians, POSE)
     order = depth_order(footprints.depth, gaussians.position)
@@ -32,7 +30,7 @@ def test_lists_hold_only_gaussians_near_the_tile() -> None:
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32))
-def test_cut_off_stays_within_its_bound(seed: int) -> None:
+def test_cut_off_stays_within_its_bound(seed):
     """Footprints end at three standard deviations, where their weight is at most exp(-4.5) of the opacity.
 
     Removal of Gaussian i changes a pixel by w_i T_i (S_i - B_i), where the signal B_i of those behind is at most the
@@ -52,7 +50,7 @@ def test_cut_off_stays_within_its_bound(seed: int) -> None:
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32))
-def test_faint_gaussians_are_pruned_within_the_bound_of_their_opacities(seed: int) -> None:
+def test_faint_gaussians_are_pruned_within_the_bound_of_their_opacities(seed):
     """The bound is that of the cut-off with the whole weight of each pruned Gaussian, at most its opacity."""
     gaussians, least = fields(seed, False), LEAST_OPACITY
     opacity = 10.0 ** np.random.default_rng(seed).uniform(-4, 0, COUNT)
@@ -90,7 +88,7 @@ def _oracle(gaussians: Any, opacity: Any = None, own: Any = slice(0, COUNT)) -> 
 
 @given(st.integers(1, 40), st.integers(0, 2**31))
 @settings(max_examples=20, deadline=None)
-def test_counted_order_is_the_sorted_one(count: int, seed: int) -> None:
+def test_counted_order_is_the_sorted_one(count, seed):
     """With ties in all keys; the GPU counts where a function is recorded."""
     rng = np.random.default_rng(seed)
     depth, *position = (Float64(rng.integers(0, 3, count).astype(float)) for _ in range(4))

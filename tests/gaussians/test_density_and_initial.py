@@ -1,7 +1,5 @@
 """Density control between two steps, and where Gaussians start."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,14 +17,7 @@ from scipy.stats import kstest
 from wrf_mi.backend.device import to_float
 from wrf_mi.core import InputError, Receiver, Record, azimuth_elevation, rotation_matrix
 from wrf_mi.gaussians import gaussians_from_points, random_gaussians
-from wrf_mi.gaussians.initial import (
-    LEAST_OPACITY,
-    RESET_OPACITY,
-    SPLIT_SHRINK,
-    DensityChange,
-    adapt,
-    reset_opacity,
-)
+from wrf_mi.gaussians.initial import LEAST_OPACITY, RESET_OPACITY, SPLIT_SHRINK, DensityChange, adapt, reset_opacity
 from wrf_mi.scene.scan.points import read_points
 from wrf_mi.training.config import InitialConfig
 from wrf_mi.training.initial import initial_gaussians
@@ -73,7 +64,7 @@ def counts(change: DensityChange, n: int) -> tuple[int, int, int]:
     return 2 * grown - fresh, fresh - grown, n - alive
 
 
-def test_small_gaussians_are_cloned_and_large_ones_split() -> None:
+def test_small_gaussians_are_cloned_and_large_ones_split():
     parameters = made_up(8)
     parameters["log_scale"][:] = np.log(0.01)
     parameters["log_scale"][1, 5] = np.log(0.5)  # one axis is enough
@@ -99,7 +90,7 @@ def test_small_gaussians_are_cloned_and_large_ones_split() -> None:
                 np.testing.assert_array_equal(values[:, part], parameters[name][:, old])
 
 
-def test_angular_size_decides_between_clone_and_split() -> None:
+def test_angular_size_decides_between_clone_and_split():
     """The same Gaussian is split near the receiver and cloned far from it."""
     parameters = made_up(2)
     parameters["log_scale"][:] = np.log(0.2)
@@ -108,7 +99,7 @@ def test_angular_size_decides_between_clone_and_split() -> None:
     np.testing.assert_array_equal(np.flatnonzero(change.fresh), [0, 2, 3])
 
 
-def test_split_positions_are_drawn_from_the_gaussian() -> None:
+def test_split_positions_are_drawn_from_the_gaussian():
     """In the Gaussian's own axes the parts lie as its density: each coordinate over its scale is standard normal."""
     n = 400
     parameters = made_up(n)
@@ -121,7 +112,7 @@ def test_split_positions_are_drawn_from_the_gaussian() -> None:
         assert kstest(own[:, axis] / scale, "norm").pvalue > SMALLEST_P
 
 
-def test_transparent_and_unseen_gaussians_are_pruned() -> None:
+def test_transparent_and_unseen_gaussians_are_pruned():
     parameters = made_up(5)
     parameters["opacity"][0] = [0, logit(LEAST_OPACITY) - 0.1, logit(LEAST_OPACITY) + 0.1, 0, 0]
     change = one_round(parameters, [1, 1, 1, 0, 1], growth_fraction=0.0)
@@ -132,7 +123,7 @@ def test_transparent_and_unseen_gaussians_are_pruned() -> None:
 
 
 @pytest.mark.parametrize("opacity", [True, False])
-def test_pruning_keeps_at_least_one_gaussian(opacity: bool) -> None:
+def test_pruning_keeps_at_least_one_gaussian(opacity):
     parameters = made_up(4, opacity=opacity)
     if opacity:
         parameters["opacity"][0] = [-20, -19, -18, -19]
@@ -149,9 +140,7 @@ def test_pruning_keeps_at_least_one_gaussian(opacity: bool) -> None:
     seed=st.integers(0, 1000),
     opacity=st.booleans(),
 )
-def test_invariants_of_a_density_round(
-    n: int, max_gaussians: int, growth_fraction: float, seed: int, opacity: bool
-) -> None:
+def test_invariants_of_a_density_round(n, max_gaussians, growth_fraction, seed, opacity):
     parameters = made_up(n, seed, opacity)
     before = {name: values.copy() for name, values in parameters.items()}
     rng = np.random.default_rng(seed)
@@ -176,7 +165,7 @@ def test_invariants_of_a_density_round(
         np.testing.assert_array_equal(values[:, old], before[name][:, change.source[old]])
 
 
-def test_opacity_reset() -> None:
+def test_opacity_reset():
     before = np.float32([[-9.0, logit(RESET_OPACITY), 0.0, 5.0]])
     after = reset_opacity(before)
     np.testing.assert_allclose(after, [[-9.0, *[logit(RESET_OPACITY)] * 3]], rtol=FLOAT32_EPS)
@@ -198,7 +187,7 @@ def trained_state(n: int) -> tuple[FitState, dict[str, np.ndarray]]:
     return state, state.params()
 
 
-def test_density_round_keeps_momentum_of_old_gaussians() -> None:
+def test_density_round_keeps_momentum_of_old_gaussians():
     n = 6
     state, before = trained_state(n)
     first, second, count = state.moments()
@@ -230,7 +219,7 @@ def test_density_round_keeps_momentum_of_old_gaussians() -> None:
     np.testing.assert_array_equal(state.view_gradient_norm.numpy(), np.zeros(7))
 
 
-def test_training_step_works_after_a_density_round() -> None:
+def test_training_step_works_after_a_density_round():
     state, _ = trained_state(5)
     parameters = state.params()
     own = {name: parameters[name] for name in made_up(1)}
@@ -242,7 +231,7 @@ def test_training_step_works_after_a_density_round() -> None:
     assert all((values != before[name]).all() for name, values in state.params().items())
 
 
-def test_opacity_reset_clears_only_its_momentum() -> None:
+def test_opacity_reset_clears_only_its_momentum():
     state, before = trained_state(5)  # opacity is the last parameter: the step count must not come from it
     first, _, _ = state.moments()
     state.set_param("opacity", reset_opacity(before["opacity"]))
@@ -255,7 +244,7 @@ def test_opacity_reset_clears_only_its_momentum() -> None:
     assert {int(t[0]) for _, _, _, (t, _, _, _) in state.adam.state.values()} == {3}
 
 
-def test_state_round_trips_through_arrays() -> None:
+def test_state_round_trips_through_arrays():
     state, _ = trained_state(4)
     arrays = state.arrays()
     again = FitState.from_arrays(arrays).arrays()
@@ -264,7 +253,7 @@ def test_state_round_trips_through_arrays() -> None:
         np.testing.assert_array_equal(again[name], values, err_msg=name)
 
 
-def test_best_parameters_are_not_modified_later() -> None:
+def test_best_parameters_are_not_modified_later():
     """Dr.Jit gives memory of an array that is summed to in place to the next one of that size."""
     state, _ = trained_state(4)
     state.keep_best(1.0)
@@ -285,7 +274,7 @@ def seen_from(receiver: Receiver, position_m: np.ndarray) -> tuple[np.ndarray, n
     return (*azimuth_elevation(local), np.linalg.norm(local, axis=1))
 
 
-def test_random_gaussians_fill_each_receivers_hemisphere() -> None:
+def test_random_gaussians_fill_each_receivers_hemisphere():
     count, size_deg = 4001, 7.0
     start = random_gaussians([TILTED, UPSIDE_DOWN], count, np.random.default_rng(0), (1.0, 8.0), size_deg)
     assert start.position_m.shape == (count, 3)
@@ -303,13 +292,13 @@ def test_random_gaussians_fill_each_receivers_hemisphere() -> None:
         np.testing.assert_allclose(np.degrees(np.arctan(start.scale_m[own] / distance)), size_deg, rtol=1e-9)
 
 
-def test_fewer_gaussians_than_receivers() -> None:
+def test_fewer_gaussians_than_receivers():
     start = random_gaussians([TILTED, UPSIDE_DOWN], 1, np.random.default_rng(0))
     assert start.count == 1
     assert np.isfinite(start.position_m).all()
 
 
-def test_initial_geometry() -> None:
+def test_initial_geometry():
     start = random_gaussians([TILTED], 9, np.random.default_rng(2), opacity=0.3)
     weights = start.geometry()
     np.testing.assert_allclose(weights["position"].T, start.position_m, rtol=FLOAT32_EPS)
@@ -318,7 +307,7 @@ def test_initial_geometry() -> None:
     np.testing.assert_allclose(sigmoid(start.opacity_logit()), 0.3, rtol=FLOAT32_EPS)
 
 
-def test_initial_scale_is_the_gap_to_neighbours() -> None:
+def test_initial_scale_is_the_gap_to_neighbours():
     """A square grid's nearest three points lie one step away (at a corner two, and one across)."""
     grid = np.stack(np.meshgrid(np.arange(5), np.arange(5), [2.0], indexing="ij"), axis=-1).reshape(-1, 3) * 0.5
     start = gaussians_from_points(grid, 25, np.random.default_rng(0))
@@ -329,7 +318,7 @@ def test_initial_scale_is_the_gap_to_neighbours() -> None:
     np.testing.assert_allclose(start.scale_m[order], expected)
 
 
-def test_initial_positions_are_points_of_the_cloud() -> None:
+def test_initial_positions_are_points_of_the_cloud():
     cloud = np.random.default_rng(3).normal(size=(50, 3))
     first = gaussians_from_points(cloud, 10, np.random.default_rng(4))
     assert len({tuple(p) for p in first.position_m} & {tuple(p) for p in cloud}) == 10
@@ -349,7 +338,7 @@ def test_initial_positions_are_points_of_the_cloud() -> None:
         (np.where(np.arange(27).reshape(9, 3) == 13, np.nan, 1.0), 4, "row 5: not a number"),
     ],
 )
-def test_invalid_point_clouds_are_refused(points: np.ndarray, count: int, message: str) -> None:
+def test_invalid_point_clouds_are_refused(points, count, message):
     with pytest.raises(InputError, match=message):
         gaussians_from_points(points, count, np.random.default_rng(0))
 
@@ -367,14 +356,14 @@ def write_points(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cloud.ply", "cloud.xyz", "cloud.npz"])
-def test_points_are_read(name: str, tmp_path: Path) -> None:
+def test_points_are_read(name, tmp_path):
     write_points(tmp_path / name)
     points = read_points(tmp_path / name)
     assert points.dtype == np.float64
     np.testing.assert_allclose(points, POINTS, rtol=FLOAT32_EPS)
 
 
-def test_points_far_from_the_origin_are_no_start(tmp_path: Path) -> None:
+def test_points_far_from_the_origin_are_no_start(tmp_path):
     """Their Gaussians would lie on steps of half a metre."""
     np.savez(tmp_path / "utm.npz", points=POINTS + np.array([701_362.56, 4_485_513.72, 0.0]))
     config = InitialConfig(points=str(tmp_path / "utm.npz"))
@@ -383,7 +372,7 @@ def test_points_far_from_the_origin_are_no_start(tmp_path: Path) -> None:
         initial_gaussians(config, record, np.arange(1), np.random.default_rng(0))
 
 
-def test_mesh_vertices_are_read_as_points(tmp_path: Path) -> None:
+def test_mesh_vertices_are_read_as_points(tmp_path):
     box = trimesh.creation.box((1.0, 2.0, 3.0))
     box.export(tmp_path / "box.obj")
     points = read_points(tmp_path / "box.obj")
@@ -401,7 +390,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
-def test_files_without_points_are_refused(name: str, tmp_path: Path) -> None:
+def test_files_without_points_are_refused(name, tmp_path):
     content, message = BAD_FILES[name]
     (tmp_path / name).write_bytes(content)
     assert str(tmp_path / name) in refusal(read_points, tmp_path / name, message)
@@ -417,13 +406,13 @@ def test_files_without_points_are_refused(name: str, tmp_path: Path) -> None:
         ({"points": np.where(POINTS == -7.75, np.inf, POINTS)}, "point 3: not finite"),
     ],
 )
-def test_arrays_without_points_are_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+def test_arrays_without_points_are_refused(arrays, message, tmp_path):
     np.savez(tmp_path / "cloud.npz", **arrays)
     with pytest.raises(InputError, match=message):
         read_points(tmp_path / "cloud.npz")
 
 
-def test_missing_and_damaged_files_are_refused(tmp_path: Path) -> None:
+def test_missing_and_damaged_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_points(tmp_path / "none.ply")
     write_points(tmp_path / "cloud.ply")

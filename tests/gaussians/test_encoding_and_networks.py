@@ -1,7 +1,5 @@
 """Positional encoding against its closed form, and the two fields' networks against the paper's description."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -49,7 +47,7 @@ def paper_encoding(t: np.ndarray, octaves: int) -> np.ndarray:
     octaves=st.integers(1, 10),
     scale_m=st.floats(0.1, 20),
 )
-def test_encoding_matches_the_formula_of_the_paper(points: np.ndarray, octaves: int, scale_m: float) -> None:
+def test_encoding_matches_the_formula_of_the_paper(points, octaves, scale_m):
     encoded = encode(doubles(points), octaves, scale_m).numpy()
     assert encoded.shape == (encoded_size(octaves), points.shape[1])
     # The tolerance grows with the number of turns, whose rounding NumPy's sine sees.
@@ -64,9 +62,7 @@ def test_encoding_matches_the_formula_of_the_paper(points: np.ndarray, octaves: 
     axis=st.integers(0, 2),
     octaves=st.integers(1, 10),
 )
-def test_unambiguous_scale_separates_all_positions(
-    extent_m: np.ndarray, origin_m: np.ndarray, axis: int, octaves: int
-) -> None:
+def test_unambiguous_scale_separates_all_positions(extent_m, origin_m, axis, octaves):
     """Two of a room's positions a multiple of two metres apart are one at 1 m a unit, whatever the octaves."""
     ends = origin_m + np.stack([np.zeros(3), extent_m])
     twins = np.stack([ends[0], ends[0]])
@@ -81,19 +77,19 @@ def test_unambiguous_scale_separates_all_positions(
     assert scale == 1.0 or scale <= extent_m.max()
 
 
-def test_encoding_in_float32_is_accurate_at_large_distances() -> None:
+def test_encoding_in_float32_is_accurate_at_large_distances():
     """At 100 m the tenth octave has 25,600 whole turns: taken off exactly, they cost no digit."""
     points = np.float32(np.random.default_rng(0).uniform(90, 100, (3, 500)))
     encoded = encode(to_tensor(points), 10, 1.0).numpy()
     np.testing.assert_allclose(encoded, paper_encoding(points.astype(float), 10), atol=FLOAT32_TOLERANCE)
 
 
-def test_encoding_of_zero_octaves_is_empty() -> None:
+def test_encoding_of_zero_octaves_is_empty():
     assert encode(to_tensor(np.ones((3, 4), np.float32)), 0, 1.0).shape == (0, 4)
 
 
 @pytest.mark.gradcheck
-def test_gradient_of_the_encoding() -> None:
+def test_gradient_of_the_encoding():
     """Removing whole turns leaves the derivative as it is: d sin(2^k pi x / s) / dx = 2^k pi / s cos."""
     x = np.random.default_rng(1).uniform(-5, 5, (3, 7))
     points = doubles(x)
@@ -105,7 +101,7 @@ def test_gradient_of_the_encoding() -> None:
     np.testing.assert_allclose(dr.grad(points).numpy(), expected, rtol=FLOAT64_TOLERANCE)
 
 
-def test_position_encoding_does_not_move_gaussians() -> None:
+def test_position_encoding_does_not_move_gaussians():
     points = doubles(np.ones((3, 2)))
     dr.enable_grad(points)
     assert not dr.grad_enabled(Encoding().position(points))
@@ -121,7 +117,7 @@ def draw_layer(name: str, inputs: dict[str, int], outputs: int) -> tuple[dict[st
 
 
 @pytest.mark.parametrize("with_hidden", [False, True])
-def test_layer_in_parts_equals_layer_of_the_concatenation(with_hidden: bool) -> None:
+def test_layer_in_parts_equals_layer_of_the_concatenation(with_hidden):
     sizes = {"position": 60, "transmitter": 60} | ({"hidden": 23} if with_hidden else {})
     weights, params = draw_layer("layer", sizes, 11)
     rng = np.random.default_rng(6)
@@ -138,7 +134,7 @@ def test_layer_in_parts_equals_layer_of_the_concatenation(with_hidden: bool) -> 
             np.testing.assert_allclose(out[:, b * n + i], np.maximum(expected, 0), rtol=PRODUCT_TOLERANCE)
 
 
-def test_linear_and_dense() -> None:
+def test_linear_and_dense():
     weights, params = draw_layer("layer", {"hidden": 9}, 4)
     x = np.random.default_rng(7).standard_normal((9, 6))
     out = linear(params, "layer", doubles(x)).numpy()
@@ -149,7 +145,7 @@ def test_linear_and_dense() -> None:
 @pytest.mark.gradcheck
 @pytest.mark.parametrize("batch", [1, 3])
 @pytest.mark.parametrize("with_hidden", [False, True])
-def test_gradient_of_a_hidden_layer_matches_its_parts(batch: int, with_hidden: bool) -> None:
+def test_gradient_of_a_hidden_layer_matches_its_parts(batch, with_hidden):
     """The derivative that sums rows against the one of Dr.Jit, of the same sum written out."""
     n, rng = 5, np.random.default_rng(11)
     _, params = draw_layer("layer", {"position": 4, "transmitter": 3} | ({"hidden": 2} if with_hidden else {}), 7)
@@ -177,7 +173,7 @@ def test_gradient_of_a_hidden_layer_matches_its_parts(batch: int, with_hidden: b
         np.testing.assert_allclose(ours, expected, rtol=PRODUCT_TOLERANCE, atol=PRODUCT_TOLERANCE)
 
 
-def test_initial_weights_have_the_deviation_of_he_et_al() -> None:
+def test_initial_weights_have_the_deviation_of_he_et_al():
     """Normal weights of deviation sqrt(2 / inputs), the inputs of all parts together; zero bias."""
     weights = init_layer("layer", {"hidden": 256, "position": 60, "transmitter": 60}, 256, np.random.default_rng(8))
     for part in ("hidden", "position", "transmitter"):
@@ -194,7 +190,7 @@ def shapes(weights: dict[str, np.ndarray], prefix: str) -> dict[str, tuple[int, 
     return {k.removeprefix(prefix): v.shape for k, v in weights.items() if k.startswith(prefix) and "bias" not in k}
 
 
-def test_wrf_gs_has_the_layers_of_the_paper() -> None:
+def test_wrf_gs_has_the_layers_of_the_paper():
     """Section IV-B: eight layers of 128 see the centre; 128 and 64 see features and transmitter (L = 9: 60 each)."""
     weights = start(WrfGs())
     attenuation = {"0.position": (128, 60)} | {f"{i}.hidden": (128, 128) for i in range(1, 8)}
@@ -208,7 +204,7 @@ def test_wrf_gs_has_the_layers_of_the_paper() -> None:
     assert set(WrfGs.per_gaussian) == {name for name in weights if "." not in name}
 
 
-def test_wrf_gs_plus_has_the_layers_of_the_paper() -> None:
+def test_wrf_gs_plus_has_the_layers_of_the_paper():
     """Section V-A: eight layers of 256, the input again at the fifth; three heads without activation."""
     weights = start(WrfGsPlus())
     layers = {f"{i}.hidden": (256, 256) for i in range(1, 8)}
@@ -219,7 +215,7 @@ def test_wrf_gs_plus_has_the_layers_of_the_paper() -> None:
 
 
 @pytest.mark.parametrize("model", FIELDS)
-def test_every_weight_has_a_bias_and_a_gradient(model: str) -> None:
+def test_every_weight_has_a_bias_and_a_gradient(model):
     """No matrix is left out of the network: each one's gradient differs from zero."""
     field, weights = FIELDS[model](), start(FIELDS[model](), seed=3)
     layers = {name.rsplit(".", 1)[0] for name in weights if "." in name}
@@ -248,7 +244,7 @@ def reference_network(weights: dict[str, np.ndarray], column: np.ndarray, sizes:
     }
 
 
-def test_wrf_gs_plus_adds_offsets_of_its_network() -> None:
+def test_wrf_gs_plus_adds_offsets_of_its_network():
     """Signal = static + offset; rotation likewise before it is normalised; scale in its logarithm."""
     field, n, batch = WrfGsPlus(width=40), 3, 2
     weights = {name: values.astype(float) for name, values in start(field, n).items()}
@@ -269,7 +265,7 @@ def test_wrf_gs_plus_adds_offsets_of_its_network() -> None:
     np.testing.assert_allclose(g.opacity.numpy(), np.tile(opacity, batch), rtol=PRODUCT_TOLERANCE)
 
 
-def test_attenuation_stays_below_one() -> None:
+def test_attenuation_stays_below_one():
     """Complex delta, |delta| < 1 whatever the network says, nearly transparent at the start, free in phase."""
     field, weights = WrfGs(), start(WrfGs(), 200)
 
@@ -290,7 +286,7 @@ def test_attenuation_stays_below_one() -> None:
 
 
 @pytest.mark.parametrize("model", FIELDS)
-def test_signals_are_signed(model: str) -> None:
+def test_signals_are_signed(model):
     """Real and imaginary parts of either sign: nothing clamps what is to interfere."""
     weights = start(FIELDS[model](), 100)
     params = {k: to_tensor(v) for k, v in weights.items()}
@@ -300,7 +296,7 @@ def test_signals_are_signed(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+"])
-def test_field_without_transmitter_octaves_is_constant(model: str) -> None:
+def test_field_without_transmitter_octaves_is_constant(model):
     """Zero octaves leave the transmitter out: all its positions see the same field."""
     field = FIELDS[model](encoding=Encoding(tx_octaves=0))
     params = {k: to_tensor(v) for k, v in start(field, 5).items()}
@@ -310,7 +306,7 @@ def test_field_without_transmitter_octaves_is_constant(model: str) -> None:
         np.testing.assert_array_equal(part.numpy()[:5], part.numpy()[5:])
 
 
-def test_factorised_field_refuses_zero_transmitter_octaves() -> None:
+def test_factorised_field_refuses_zero_transmitter_octaves():
     """It has nothing else to tell one transmitter from another."""
     with pytest.raises(InputError, match=r"encoding\.tx_octaves: 0 leaves factorised nothing to see"):
         FIELDS["factorised"](encoding=Encoding(tx_octaves=0))

@@ -1,7 +1,5 @@
 """The linear map from signals to pixels: equal to blending on hard fields, and linear."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr
@@ -15,9 +13,7 @@ from wrf_mi_bench import field_oracle as oracle
 from wrf_mi.backend.device import on_device
 from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
-from wrf_mi.gaussians import (
-    Gaussians,
-)
+from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights
 from wrf_mi.gaussians.tiles import TiledPlane, perception_plane
@@ -76,7 +72,7 @@ def error(found: Any, expected: Any) -> float:
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("product", [True, False])
 @pytest.mark.parametrize("single", [True, False])
-def test_weights_times_signals_equal_blending(product: bool, size: tuple[int, int], single: bool) -> None:
+def test_weights_times_signals_equal_blending(product, size, single):
     floats = mi.Float if single else Float64
     gaussians, signal = hard(product, floats)
     plane = perception_plane(*size, floats)
@@ -97,7 +93,7 @@ def test_weights_times_signals_equal_blending(product: bool, size: tuple[int, in
 
 
 @pytest.mark.parametrize("product", [True, False])
-def test_weights_match_the_oracle(product: bool) -> None:
+def test_weights_match_the_oracle(product):
     gaussians, signal = hard(product, Float64)
     weights = pixel_weights(gaussians, device_pose(RECEIVER, Float64), perception_plane(45, 120, Float64))
 
@@ -114,7 +110,7 @@ def test_weights_match_the_oracle(product: bool) -> None:
 
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**31), product=st.booleans(), height=st.integers(1, 12), width=st.integers(1, 40))
-def test_any_field_and_size(seed: int, product: bool, height: int, width: int) -> None:
+def test_any_field_and_size(seed, product, height, width):
     gaussians, signal = hard(product, Float64, n=12, seed=seed)
     plane = perception_plane(height, width, Float64)
     weights = pixel_weights(gaussians, device_pose(RECEIVER, Float64), plane)
@@ -122,7 +118,7 @@ def test_any_field_and_size(seed: int, product: bool, height: int, width: int) -
     np.testing.assert_allclose(weights @ signal, direct, atol=1e-12 * np.abs(signal).sum())
 
 
-def test_operator_without_visible_gaussians_is_zero() -> None:
+def test_operator_without_visible_gaussians_is_zero():
     """Far below the horizon: no weights, and dark."""
     gaussians, signal = hard(False, mi.Float)
     below = RECEIVER.position_m - 90 * RECEIVER.to_world[:, 2]
@@ -133,7 +129,7 @@ def test_operator_without_visible_gaussians_is_zero() -> None:
 
 
 @pytest.mark.parametrize("product", [True, False])
-def test_no_gaussians(product: bool) -> None:
+def test_no_gaussians(product):
     """All pruned: dark as well."""
 
     def none() -> Any:
@@ -149,7 +145,7 @@ def test_no_gaussians(product: bool) -> None:
     assert not operator.magnitude(np.zeros((2, 0), np.complex64)).any()
 
 
-def test_batches_and_factors() -> None:
+def test_batches_and_factors():
     """More transmitters than a block, one by one and together, through factors and without; all linear."""
     gaussians, _ = hard(True, mi.Float)
     operator = operator_of(gaussians, device_pose(RECEIVER, mi.Float), perception_plane(23, 61, mi.Float))
@@ -168,7 +164,7 @@ def test_batches_and_factors() -> None:
     assert error(mixed, 2 * operator.field(a) - 3j * operator.field(b)) < SINGLE
 
 
-def test_operator_refuses_excess_memory_and_several_transmitters() -> None:
+def test_operator_refuses_excess_memory_and_several_transmitters():
     gaussians, _ = hard(False, mi.Float)
     plane = perception_plane(23, 61, mi.Float)
     with pytest.raises(MemoryError, match="weights of 40 Gaussians take more than 0 MB"):

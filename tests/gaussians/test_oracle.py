@@ -1,7 +1,5 @@
 """The NumPy oracle against closed forms, symmetries and sampling."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -73,10 +71,7 @@ def turned(field, quaternion, shift):
     turn = rotation_matrix(quaternion)
     x, y, z, w = quaternion
     product = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
-    return field | {
-        "mean_m": field["mean_m"] @ turn.T + shift,
-        "quaternion_xyzw": field["quaternion_xyzw"] @ product.T,
-    }
+    return field | {"mean_m": field["mean_m"] @ turn.T + shift, "quaternion_xyzw": field["quaternion_xyzw"] @ product.T}
 
 
 @pytest.mark.parametrize("centre_deg", [(0, 0), (359.5, 20), (123, 78), (40, 90), (200, -5)])

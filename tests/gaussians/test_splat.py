@@ -1,7 +1,5 @@
 """Splatting against the float64 oracle, and every gradient against finite differences."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr
@@ -12,12 +10,7 @@ from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
-from wrf_mi.gaussians import (
-    FIELDS,
-    Encoding,
-    Gaussians,
-    random_gaussians,
-)
+from wrf_mi.gaussians import FIELDS, Encoding, Gaussians, random_gaussians
 from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
@@ -84,7 +77,7 @@ def through_oracle(gaussians: Any, b: int, height: int, width: int) -> np.ndarra
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+"])
 @pytest.mark.parametrize("size", [(90, 360), (23, 61)])
 @pytest.mark.parametrize("single", [True, False])
-def test_splat_matches_the_oracle(model: str, size: tuple[int, int], single: bool) -> None:
+def test_splat_matches_the_oracle(model, size, single):
     tensor = mi.TensorXf if single else Tensor64
     batch, floats = 2, dr.array_t(tensor)
     field, params = make(model, 60, tensor)
@@ -101,7 +94,7 @@ def test_splat_matches_the_oracle(model: str, size: tuple[int, int], single: boo
         assert error < (FLOAT32_TOLERANCE if single else FLOAT64_TOLERANCE)
 
 
-def test_seam_and_zenith() -> None:
+def test_seam_and_zenith():
     """One Gaussian across the azimuth seam and one on the zenith: as round on the sphere as anywhere else."""
     plane = perception_plane(90, 360, Float64)
     for azimuth, elevation in ((0.0, 0.3), (1.0, 1.55), (3.1, 0.02)):
@@ -125,7 +118,7 @@ def test_seam_and_zenith() -> None:
         np.testing.assert_allclose(im.numpy().reshape(90, 360), 0.35 * footprint, atol=1e-6)
 
 
-def test_splat_is_invariant_to_storage_order() -> None:
+def test_splat_is_invariant_to_storage_order():
     """Equal depths too: ties go by position."""
     field, params = make("wrf-gs+", 40, Tensor64)
     rng = np.random.default_rng(3)
@@ -142,7 +135,7 @@ def test_splat_is_invariant_to_storage_order() -> None:
     np.testing.assert_allclose(images[0], images[1], atol=1e-12)
 
 
-def test_splat_without_visible_gaussians_is_zero() -> None:
+def test_splat_without_visible_gaussians_is_zero():
     """Gaussians far below the horizon reach no pixel; nor does one that contains the receiver."""
     field, params = make("wrf-gs", 5, mi.TensorXf)
     below = RECEIVER.position_m - RECEIVER.to_world @ np.array([0.0, 0.0, 5.0])
@@ -161,7 +154,7 @@ def test_splat_without_visible_gaussians_is_zero() -> None:
 
 @pytest.mark.gradcheck
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+"])
-def test_gradients_match_finite_differences(model: str) -> None:
+def test_gradients_match_finite_differences(model):
     # An encoding of positions that hardly changes: it is detached on purpose, so differences alone would see it change.
     field, params = make(model, 30, Tensor64, position_octaves=1, position_scale_m=1e12)
     rng = np.random.default_rng(1)

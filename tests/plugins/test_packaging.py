@@ -1,7 +1,5 @@
 """The wheel, installed somewhere else, holds everything and runs from there."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -61,21 +59,21 @@ def files_of(package: Path) -> Iterator[str]:
             yield file.relative_to(package.parent).as_posix()
 
 
-def test_wheel_holds_every_file_and_nothing_else(wheel: Path) -> None:
+def test_wheel_holds_every_file_and_nothing_else(wheel):
     expected = {name for package in PACKAGES.values() for name in files_of(package)}
     packed = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert packed == expected
     assert any(name.startswith("wrf_mi_scenes/") and not name.endswith(".py") for name in packed)
 
 
-def test_packages_come_from_the_wheel(site: Path, tmp_path: Path) -> None:
+def test_packages_come_from_the_wheel(site, tmp_path):
     printed = run_installed(
         site, f"import {', '.join(PACKAGES)}; print({'.__file__, '.join(PACKAGES)}.__file__)", tmp_path
     )
     assert [Path(name).parent for name in printed.split()] == [site / name for name in PACKAGES]
 
 
-def test_command_and_version(site: Path, tmp_path: Path) -> None:
+def test_command_and_version(site, tmp_path):
     code = """
 from importlib.metadata import distribution
 found = distribution("wrf-mi")
@@ -87,7 +85,7 @@ assert wrf_mi.__version__ == found.version
     assert run_installed(site, code, tmp_path).split()[1:] == ["wrf-mi", "main"]
 
 
-def test_installed_backend_computes(site: Path, tmp_path: Path) -> None:
+def test_installed_backend_computes(site, tmp_path):
     code = """
 from wrf_mi.backend import init
 init()
@@ -97,7 +95,7 @@ assert dr.all(dr.minimum(dr.arange(mi.Float, 4), 2) == mi.Float([0, 1, 2, 2]))
     run_installed(site, code, tmp_path)
 
 
-def test_installed_package_trains_a_step(site: Path, tmp_path: Path) -> None:
+def test_installed_package_trains_a_step(site, tmp_path):
     code = """
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What docs/plugins.md shows runs, and its tables are those of the plugins."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path
@@ -42,7 +40,7 @@ def names(one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> dict
     return found
 
 
-def test_traced_scene(names: dict[str, Any]) -> None:
+def test_traced_scene(names):
     """The picture follows the transmitter, and the dictionary is the XML's scene."""
     field, moved = plain(names["field"]), plain(names["moved"])
     assert field.shape == moved.shape == (90, 360, 2)
@@ -56,7 +54,7 @@ def test_traced_scene(names: dict[str, Any]) -> None:
     np.testing.assert_allclose(plain(mi.render(of_dict)), field, atol=1e-6)
 
 
-def test_documented_gradient_by_the_transmitter(names: dict[str, Any]) -> None:
+def test_documented_gradient_by_the_transmitter(names):
     """What the page prints is the slope of the power that is received."""
     gradient = plain(names["position"].grad)[:, 0]
     params, start = mi.traverse(names["scenes"][2]), np.array([0.5, -0.6, 1.0])
@@ -72,7 +70,7 @@ def test_documented_gradient_by_the_transmitter(names: dict[str, Any]) -> None:
     assert (power(1e-3) - power(-1e-3)) / 2e-3 == pytest.approx(np.linalg.norm(gradient), rel=0.03)
 
 
-def test_powers_and_transmittance(names: dict[str, Any]) -> None:
+def test_powers_and_transmittance(names):
     powers = plain(names["powers"])
     assert powers.max() > 0.01
     assert powers.min() >= 0
@@ -88,7 +86,7 @@ def test_powers_and_transmittance(names: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_documented_tables_match_the_plugins(name: str) -> None:
+def test_documented_tables_match_the_plugins(name):
     """The same parameters in the page and in the docstring, in the same order."""
     module, kind = CLASSES[name].split(".")
     documented = getattr(importlib.import_module(f"wrf_mi_plugins.{module}"), kind).__doc__

@@ -1,7 +1,5 @@
 """The emitter: what the shape holds follows the field, gradients flow, and stock integrators see powers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr
@@ -60,7 +58,7 @@ def assert_shape_holds(scene: Any, expected: dict[str, np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_shape_follows_transmitter_and_weights(model: str) -> None:
+def test_shape_follows_transmitter_and_weights(model):
     scene = scene_of(made(model))
     before = expected_parameters(model, TX)
     assert_shape_holds(scene, before)
@@ -80,7 +78,7 @@ def test_shape_follows_transmitter_and_weights(model: str) -> None:
     assert_shape_holds(scene, changed)
 
 
-def test_unchanged_geometry_is_not_updated() -> None:
+def test_unchanged_geometry_is_not_updated():
     """Under WRF-GS the transmitter changes signals alone, so what was traced still holds."""
     scene = scene_of(made("wrf-gs"))
     params = mi.traverse(scene)
@@ -91,7 +89,7 @@ def test_unchanged_geometry_is_not_updated() -> None:
     assert [name for name in before if before[name] != after[name]] == ["signal"]
 
 
-def test_number_of_gaussians_may_change() -> None:
+def test_number_of_gaussians_may_change():
     scene = scene_of(made("wrf-gs+"))
     params = mi.traverse(scene)
     for name, values in weights_of("wrf-gs+").items():
@@ -109,7 +107,7 @@ def test_number_of_gaussians_may_change() -> None:
     assert len(found) > 1
 
 
-def test_moved_gaussians_are_traced_again() -> None:
+def test_moved_gaussians_are_traced_again():
     scene = scene_of(made("wrf-gs+"))
     params = mi.traverse(scene)
     params["transmitter.position"] = to_tensor(params["transmitter.position"].numpy() + np.array([[0], [0], [100]]))
@@ -122,7 +120,7 @@ def test_moved_gaussians_are_traced_again() -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_parameters_and_flags(model: str) -> None:
+def test_parameters_and_flags(model):
     params = mi.traverse(scene_of(made(model)))
     mine = {key.removeprefix("transmitter."): key for key in params.keys() if key.startswith("transmitter.")}  # noqa: SIM118
     expected = {"tx_position", *(name.replace(".", "_") for name in weights_of(model))}
@@ -146,7 +144,7 @@ def test_parameters_and_flags(model: str) -> None:
         ("wrf-gs+", "signal"),
     ],
 )
-def test_gradients_reach_the_parameters(model: str, name: str) -> None:
+def test_gradients_reach_the_parameters(model, name):
     """From the shape's attributes, as an integrator reads them, back to what the emitter holds."""
     scene = scene_of(made(model))
     params = mi.traverse(scene)
@@ -198,7 +196,7 @@ def oracle_power(shape: dict[str, np.ndarray], origin: np.ndarray, direction: np
 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("integrator", ["path", "volpath"])
-def test_stock_integrators_add_powers(model: str, integrator: str) -> None:
+def test_stock_integrators_add_powers(model, integrator):
     # Mitsuba's path tracer drops rays that end on null surfaces alone.
     black = {"type": "diffuse", "reflectance": 0.0}
     sky = {"type": "sphere", "radius": 200.0, "bsdf": {"type": "twosided", "inside": black}}
@@ -220,7 +218,7 @@ def test_stock_integrators_add_powers(model: str, integrator: str) -> None:
             assert (row, column) == (0, 0) or dr.all(radiance[row][column][0] == 0)  # unpolarised
 
 
-def test_light_on_a_wall_is_found_without_sampling_the_emitter() -> None:
+def test_light_on_a_wall_is_found_without_sampling_the_emitter():
     """Power that a diffuse wall reflects: the integral over its hemisphere, though the emitter is never sampled."""
     emitter = made("wrf-gs+")
     wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3]).scale(0.1)}
@@ -248,7 +246,7 @@ def test_light_on_a_wall_is_found_without_sampling_the_emitter() -> None:
     assert error < 0.05 * seen.mean()
 
 
-def test_emitter_belongs_to_one_shape() -> None:
+def test_emitter_belongs_to_one_shape():
     emitter = made("wrf-gs+")
     assert "WrfGsPlus, 6 Gaussians, transmitter at (0.4, -0.7, 1.1) m" in str(emitter)
     shape = scene_of(emitter).shapes()[0]

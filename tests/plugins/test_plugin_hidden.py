@@ -1,7 +1,5 @@
 """Gaussians behind opaque walls are left out, and the field changes by no more than is stated."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr
@@ -63,7 +61,7 @@ def rendered(blending: str, seed: int, power: float, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("blending", ["alpha", "product"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_error_is_within_the_bound(blending: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_is_within_the_bound(blending, seed, monkeypatch):
     """Metal hides at any bound and changes nothing; masonry that passes a sixth of the power does so at 0.2."""
     strength = np.linalg.norm(any_field(COUNT, seed, 0.05)["signal"], axis=1)
     largest = strength.max() if blending == "alpha" else strength.sum()
@@ -77,7 +75,7 @@ def test_error_is_within_the_bound(blending: str, seed: int, monkeypatch: pytest
     assert 1e-3 < error <= np.sqrt(0.2) * largest
 
 
-def test_gaussians_before_walls_are_kept() -> None:
+def test_gaussians_before_walls_are_kept():
     """A sheet behind all Gaussians hides none, and of a scene without walls nothing is left out."""
     field = gaussians_of(any_field(COUNT, 0, 0.1), "alpha")
     traced = {"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ}
@@ -91,6 +89,6 @@ def test_gaussians_before_walls_are_kept() -> None:
 
 
 @pytest.mark.parametrize("power", [-0.1, 1.0])
-def test_invalid_opaque_power_is_refused(power: float) -> None:
+def test_invalid_opaque_power_is_refused(power):
     with pytest.raises((InputError, RuntimeError), match="opaque_power"):
         mi.load_dict({"type": "wrf_traced", "opaque_power": power})

@@ -1,8 +1,5 @@
 """The traced integrator in Mitsuba: images, derivatives through ``mi.render``, what it keeps, bad scenes."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -54,7 +51,7 @@ def complex_image(tensor: Any) -> np.ndarray:
 
 @pytest.mark.parametrize("blending", ["alpha", "product"])
 @pytest.mark.parametrize("coverage", ["hemisphere", "sphere"])
-def test_image_matches_the_definition(blending: str, coverage: str) -> None:
+def test_image_matches_the_definition(blending, coverage):
     """``mi.render`` against float64 NumPy, and the film's channels; Gaussians of all shapes all around."""
     field = any_field(50)
     to_world = receiver_to_world(RECEIVER.position_m, RECEIVER.orientation_xyzw)
@@ -73,7 +70,7 @@ def test_image_matches_the_definition(blending: str, coverage: str) -> None:
     np.testing.assert_array_equal(developed[..., 1:], tensor.numpy())
 
 
-def test_crop_and_xml(tmp_path: Path) -> None:
+def test_crop_and_xml(tmp_path):
     """A crop is a part of the image. The integrator of a scene file is found and set."""
     gaussians = gaussians_of(any_field(20), "alpha", mi.Float)
     whole = mi.render(scene_of(gaussians)).numpy()
@@ -87,7 +84,7 @@ def test_crop_and_xml(tmp_path: Path) -> None:
     assert "frequency_hz = 9e+08" in str(mi.load_file(str(tmp_path / "scene.xml")).integrator())
 
 
-def test_perspective_camera() -> None:
+def test_perspective_camera():
     """Any sensor that is a point: a camera of one sample a pixel sees what the rays it draws see."""
     field = any_field(40, size=0.1)
     look = mi.ScalarTransform4f().look_at(
@@ -109,7 +106,7 @@ def test_perspective_camera() -> None:
     assert mi.render(scene, spp=16).shape == (20, 30, 2)
 
 
-def test_traced_hits_are_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_traced_hits_are_cached(monkeypatch):
     """New signals trace nothing; new geometry or a new pose does, and the image is as that of a new scene."""
     calls = []
     real = integrator_module.traced_lists
@@ -136,7 +133,7 @@ def test_traced_hits_are_cached(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("blending", ["alpha", "product"])
-def test_derivatives_through_render(blending: str) -> None:
+def test_derivatives_through_render(blending):
     """Backward of ``mi.render`` is that of the plain function in float64; forward agrees with backward."""
     field, rng = any_field(20, seed=3, size=0.2), np.random.default_rng(0)
     scene = scene_of(gaussians_of(field, blending, mi.Float))
@@ -178,7 +175,7 @@ def test_derivatives_through_render(blending: str) -> None:
     assert abs(np.sum(slope * weight) - backward) < GRADIENT_TOLERANCE * np.abs(slope * weight).sum()
 
 
-def test_derivative_by_the_receiver_position() -> None:
+def test_derivative_by_the_receiver_position():
     """Moving the receiver one way is moving all Gaussians the other way."""
     scene = scene_of(gaussians_of(any_field(20, seed=3, size=0.2), "alpha", mi.Float))
     params = mi.traverse(scene)
@@ -203,7 +200,7 @@ def test_derivative_by_the_receiver_position() -> None:
         ({"sensor": {"type": "orthographic", "film": film(4, 4)}}, "do not start at one point"),
     ],
 )
-def test_invalid_scenes_are_refused(more: dict[str, Any], text: str) -> None:
+def test_invalid_scenes_are_refused(more, text):
     scene = scene_of(gaussians_of(any_field(5), "alpha", mi.Float), **more)
     with pytest.raises(InputError, match=text):
         scene.integrator().render(scene)

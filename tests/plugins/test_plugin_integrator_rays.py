@@ -1,7 +1,5 @@
 """The traced evaluation as a plain function: responses, lists, blending and derivatives."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr
@@ -80,7 +78,7 @@ def image(parts: tuple[Any, Any]) -> np.ndarray:
 
 @pytest.mark.parametrize("blending", BLENDINGS)
 @pytest.mark.parametrize("directions", [pixel_directions(90, 360)[::7, ::11], equirectangular_sphere(90, 360)[::9]])
-def test_response_is_the_maximum_along_the_ray(blending: str, directions: np.ndarray) -> None:
+def test_response_is_the_maximum_along_the_ray(blending, directions):
     """Against the definition: needles, discs, Gaussians behind and around the receiver; one and many rays a bundle."""
     field = any_field(60)
     found = image(brute(gaussians_of(field, blending), pose_of(), bundles_of(directions)))
@@ -89,7 +87,7 @@ def test_response_is_the_maximum_along_the_ray(blending: str, directions: np.nda
 
 
 @pytest.mark.parametrize("blending", BLENDINGS)
-def test_response_without_lean_and_depth_equals_splatting(blending: str) -> None:
+def test_response_without_lean_and_depth_equals_splatting(blending):
     """With k1 = k2 = 1 / L^2 = 0 the traced sum is the splatted one: same cut-off, low-pass and order."""
     field = any_field(80, size=0.1)
     gaussians, pose = gaussians_of(field, blending), pose_of()
@@ -105,7 +103,7 @@ def test_response_without_lean_and_depth_equals_splatting(blending: str) -> None
 
 
 @pytest.mark.parametrize(("size", "shape"), [(0.02, (90, 360)), (0.3, (90, 360)), (0.1, (12, 31))])
-def test_traced_lists_are_complete(size: float, shape: tuple[int, int]) -> None:
+def test_traced_lists_are_complete(size, shape):
     """Lists from the BVH give bit for bit what lists of all Gaussians give; no entry comes twice."""
     field = any_field(1500, 1, size)
     # Coincident Gaussians: each entry and exit is shared.
@@ -128,7 +126,7 @@ def test_traced_lists_are_complete(size: float, shape: tuple[int, int]) -> None:
         assert len(index) < 0.2 * 1500 * len(begin)
 
 
-def test_traced_lists_of_overlapping_gaussians_are_complete() -> None:
+def test_traced_lists_of_overlapping_gaussians_are_complete():
     """Tens of thousands of hits: some share their entry with another, and only the way back finds them."""
     field = any_field(2000)
     gaussians, pose = gaussians_of(field, "alpha", mi.Float), pose_of(mi.Float)
@@ -152,7 +150,7 @@ def test_traced_lists_of_overlapping_gaussians_are_complete() -> None:
     assert listed[met].all()
 
 
-def test_float32_matches_float64() -> None:
+def test_float32_matches_float64():
     field = any_field(200, 2, 0.05)
     directions = pixel_directions(45, 180)
     single, double = (
@@ -165,7 +163,7 @@ def test_float32_matches_float64() -> None:
     assert np.linalg.norm((single - double)[~off]) < FLOAT32_TOLERANCE * np.linalg.norm(double)
 
 
-def test_invisible_and_faint_gaussians() -> None:
+def test_invisible_and_faint_gaussians():
     """Only a Gaussian nearer than 5 cm: dark. One behind the receiver that contains it: exp(-L^2 / 2) in front."""
     directions = pixel_directions(90, 360)
     field = {name: values[:1].copy() for name, values in any_field(2).items()}
@@ -184,7 +182,7 @@ def test_invisible_and_faint_gaussians() -> None:
 @pytest.mark.gradcheck
 @pytest.mark.parametrize("blending", BLENDINGS)
 @pytest.mark.parametrize("with_walls", [False, True])
-def test_derivatives(blending: str, with_walls: bool) -> None:
+def test_derivatives(blending, with_walls):
     """Backward and forward against central differences in float64, for each parameter, the pose and the walls."""
     rng = np.random.default_rng(3)
     directions = pixel_directions(16, 48)
@@ -247,7 +245,7 @@ def test_derivatives(blending: str, with_walls: bool) -> None:
 
 
 @pytest.mark.parametrize("blending", BLENDINGS)
-def test_walls_attenuate_gaussians_behind_them(blending: str) -> None:
+def test_walls_attenuate_gaussians_behind_them(blending):
     """One crossing a ray: Gaussians whose strongest point lies behind it are multiplied, the others are not."""
     field = any_field(40, 5, 0.1)
     directions = pixel_directions(18, 40)
@@ -269,7 +267,7 @@ def test_walls_attenuate_gaussians_behind_them(blending: str) -> None:
     assert np.abs(found - expected).max() < FLOAT64_TOLERANCE * np.abs(expected).max()
 
 
-def test_gradients_match_splatting_for_small_gaussians() -> None:
+def test_gradients_match_splatting_for_small_gaussians():
     """Gradients of both ways agree as their images do: Gaussians of 1 degree, axes up to 2 : 1."""
     rng = np.random.default_rng(7)
     field = any_field(120, 8, 0.0)

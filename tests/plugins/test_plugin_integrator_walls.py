@@ -1,7 +1,5 @@
 """Walls before Gaussians in the traced integrator: what passes them, against Sionna RT."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +86,7 @@ def at_pixels(**more: Any) -> np.ndarray:
     return complex_image(mi.render(scene_of(gaussians, sensor=sensor, **more)))[ROWS, COLUMNS]
 
 
-def test_wall_transmission_matches_sionna_rt(tmp_path: Path) -> None:
+def test_wall_transmission_matches_sionna_rt(tmp_path):
     """The factor of a wall is that of Sionna RT's path straight through it: oblique, both polarisations mixed."""
     from sionna import rt
 
@@ -109,7 +107,7 @@ def test_wall_transmission_matches_sionna_rt(tmp_path: Path) -> None:
     np.testing.assert_allclose(through, expected, rtol=SIONNA_TOLERANCE, atol=SIONNA_TOLERANCE)
 
 
-def test_default_polarisation_is_vertical_for_any_sensor_rotation() -> None:
+def test_default_polarisation_is_vertical_for_any_sensor_rotation():
     """A stated polarisation turns with the sensor; the default does not."""
     gaussians, sensor, _ = behind_the_wall(turn_deg=90)
     columns_now = (COLUMNS - 90) % 360
@@ -124,7 +122,7 @@ def test_default_polarisation_is_vertical_for_any_sensor_rotation() -> None:
     assert np.abs(turned(polarization=mi.ScalarVector3f(0, 1, 0)) / upright - 1).max() > 0.05
 
 
-def test_only_walls_before_a_gaussian_attenuate_it() -> None:
+def test_only_walls_before_a_gaussian_attenuate_it():
     """Two walls multiply; one behind the Gaussians does nothing; ``walls: false`` leaves them out."""
     integrator = {"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ}
     own: dict[str, Any] = {"brick": BRICK, "wall": wall(), "integrator": integrator}
@@ -139,7 +137,7 @@ def test_only_walls_before_a_gaussian_attenuate_it() -> None:
     np.testing.assert_array_equal(without, free)
 
 
-def test_derivative_by_wall_material(tmp_path: Path) -> None:
+def test_derivative_by_wall_material(tmp_path):
     """Permittivity, conductivity and thickness of a radio material: backward against differences."""
     sionna_scene = sionna_wall(tmp_path)
     gaussians, sensor, _ = behind_the_wall()
@@ -176,7 +174,7 @@ PAINT = {"type": "diffuse", "id": "paint"}
         ({"brick": BRICK, "wall": wall(), "integrator": CARRIER | {"frequency_hz": 1e5}}, "mat-itu_brick at 100000 Hz"),
     ],
 )
-def test_walls_of_unknown_material_are_refused(more: dict[str, Any], text: str) -> None:
+def test_walls_of_unknown_material_are_refused(more, text):
     scene = scene_of(gaussians_of(any_field(5), "alpha", mi.Float), **more)
     with pytest.raises(InputError, match=text):
         scene.integrator().render(scene)

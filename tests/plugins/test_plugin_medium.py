@@ -1,7 +1,5 @@
 """The medium: Mitsuba's own volumetric path tracer finds the transmittance that the closed form says."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr
@@ -93,7 +91,7 @@ def traced(scene: Any, origin: np.ndarray, direction: np.ndarray, samples: int) 
         ("plain", 0.0, 12, 64),
     ],
 )
-def test_volpath_agrees_with_the_closed_form(kind: str, opacity: float | None, rays: int, samples: int) -> None:
+def test_volpath_agrees_with_the_closed_form(kind, opacity, rays, samples):
     """A known sky behind the Gaussians, seen from outside and from within them."""
     values = arrays(kind, opacity)
     scene = scene_of(medium_of(values), sky={"type": "constant", "radiance": 2.5})
@@ -111,7 +109,7 @@ def test_volpath_agrees_with_the_closed_form(kind: str, opacity: float | None, r
         assert (exact == 2.5).all() if opacity == 0 else exact.min() < 1e-3
 
 
-def test_rendered_transmittance_agrees_with_the_closed_form() -> None:
+def test_rendered_transmittance_agrees_with_the_closed_form():
     """Through `mi.render`, with an area emitter behind the Gaussians and a sensor that stands among them."""
     values = arrays()
     centre, towards = np.array([0.1, -0.2, 0.3]), np.array([6.0, 1.0, 0.5])
@@ -139,7 +137,7 @@ def test_rendered_transmittance_agrees_with_the_closed_form() -> None:
     assert abs(found - exact) < STANDARD_ERRORS * np.sqrt(exact * (radiance - exact) / samples)
 
 
-def test_extinction_of_thin_needles_is_found() -> None:
+def test_extinction_of_thin_needles_is_found():
     """Needles of 1 mm among round Gaussians: the extinction found where they are, and the bound above it."""
     values = arrays("needles")
     values["scales"][:, :2] = 0.001
@@ -157,7 +155,7 @@ def test_extinction_of_thin_needles_is_found() -> None:
     assert (depth >= -np.log1p(-values["opacity"][np.arange(60) % COUNT]) * (1 - 1e-2)).all()
 
 
-def test_half_of_a_gaussian_that_contains_the_origin() -> None:
+def test_half_of_a_gaussian_that_contains_the_origin():
     values = {
         "centers": np.zeros((1, 3)),
         "scales": np.full((1, 3), 2.0),
@@ -171,7 +169,7 @@ def test_half_of_a_gaussian_that_contains_the_origin() -> None:
     assert found.mean() == pytest.approx(np.sqrt(0.2), abs=STANDARD_ERRORS * 0.5 / np.sqrt(1 << 15))
 
 
-def test_parameters_and_flags() -> None:
+def test_parameters_and_flags():
     params = mi.traverse(scene_of(medium_of(arrays())))
     for name, discontinuous in (
         ("centers", True),
@@ -188,7 +186,7 @@ def test_parameters_and_flags() -> None:
 @pytest.mark.gradcheck
 @pytest.mark.parametrize("name", ["centers", "scales", "quaternions", "opacity", "scale"])
 @pytest.mark.parametrize("what", ["optical depth", "extinction"])
-def test_gradients_reach_the_parameters(name: str, what: str) -> None:
+def test_gradients_reach_the_parameters(name, what):
     values = arrays()
     scene = scene_of(medium_of(values))
     params, medium = mi.traverse(scene), medium_in(scene)
@@ -227,7 +225,7 @@ def test_gradients_reach_the_parameters(name: str, what: str) -> None:
 
 
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+"])
-def test_medium_follows_its_emitter(model: str) -> None:
+def test_medium_follows_its_emitter(model):
     emitter = emitter_plugin.gaussian_emitter(FIELDS[model], weights_of(model), (0.4, -0.7, 1.1))
     scene = scene_of(
         {"type": "wrf_gaussian_medium", "transmitter": emitter},
@@ -264,7 +262,7 @@ def test_medium_follows_its_emitter(model: str) -> None:
     assert (extinction <= air.majorant_per_m).all()
 
 
-def test_scale_multiplies_depth_and_phase_has_no_effect() -> None:
+def test_scale_multiplies_depth_and_phase_has_no_effect():
     """Twice the depth for powers; a phase of delta changes nothing."""
     values = arrays()
     ray = ray_of(*rays_through(values, 30))
@@ -277,7 +275,7 @@ def test_scale_multiplies_depth_and_phase_has_no_effect() -> None:
     np.testing.assert_allclose(turned, once, rtol=FLOAT32_TOLERANCE, atol=FLOAT32_TOLERANCE)
 
 
-def test_invalid_arrays_are_refused() -> None:
+def test_invalid_arrays_are_refused():
     values = arrays()
 
     def spoil(row: int, by: float) -> np.ndarray:

@@ -1,7 +1,5 @@
 """Optical depth of Gaussians in closed form, their extinction, its cells and its bound, against NumPy and SciPy."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 
@@ -89,7 +87,7 @@ def cut_offs(values: dict[str, Any], o: np.ndarray, d: np.ndarray) -> list[float
     return found
 
 
-def test_closed_form_matches_the_integral() -> None:
+def test_closed_form_matches_the_integral():
     """From outside and inside, short and endless pieces, several Gaussians at a time."""
     rng = np.random.default_rng(0)
     values = random_values(4, rng)
@@ -120,7 +118,7 @@ def test_closed_form_matches_the_integral() -> None:
 @pytest.mark.parametrize("scale", [(0.3, 0.3, 0.3), (0.005, 0.005, 2.0), (0.001, 1.0, 3.0)])
 @pytest.mark.parametrize("opacity", [0.0, 0.3, 0.999999])
 @pytest.mark.parametrize("single", [True, False])
-def test_depth_through_the_centre_follows_from_opacity(scale: tuple, opacity: float, single: bool) -> None:
+def test_depth_through_the_centre_follows_from_opacity(scale, opacity, single):
     """1 - alpha = exp(-optical depth), from every direction and for every shape; half of it from the centre on."""
     rng = np.random.default_rng(1)
     values = random_values(1, rng) | {"scale": np.array(scale)[:, None], "opacity": np.array([opacity])}
@@ -137,7 +135,7 @@ def test_depth_through_the_centre_follows_from_opacity(scale: tuple, opacity: fl
     np.testing.assert_allclose(half, -np.log1p(-opacity) / 2, atol=tolerance)
 
 
-def test_phase_of_attenuation_has_no_effect() -> None:
+def test_phase_of_attenuation_has_no_effect():
     rng = np.random.default_rng(2)
     values = random_values(5, rng)
     magnitude, phase = 1 - values["opacity"], rng.uniform(0, 2 * np.pi, 5)
@@ -151,7 +149,7 @@ def test_phase_of_attenuation_has_no_effect() -> None:
     np.testing.assert_allclose(depths[0], depths[1], rtol=FLOAT64_TOLERANCE)
 
 
-def test_depth_is_additive_and_reciprocal() -> None:
+def test_depth_is_additive_and_reciprocal():
     rng = np.random.default_rng(3)
     of = attenuators(gaussians(random_values(8, rng)))
     origin, direction = rng.uniform(-2, 2, (30, 3)), units(30, rng)
@@ -166,7 +164,7 @@ def test_depth_is_additive_and_reciprocal() -> None:
     np.testing.assert_allclose(whole, back, atol=FLOAT64_TOLERANCE)
 
 
-def test_single_precision() -> None:
+def test_single_precision():
     """Needles and discs of 1 cm among others, and logarithms where the transmittance underflows."""
     rng = np.random.default_rng(4)
     values = random_values(300, rng, scale_m=(0.01, 1.0))
@@ -194,7 +192,7 @@ def test_single_precision() -> None:
 
 @pytest.mark.gradcheck
 @pytest.mark.parametrize("product", [False, True])
-def test_gradients(product: bool) -> None:
+def test_gradients(product):
     """Backwards and forwards with respect to everything, against central differences."""
     rng = np.random.default_rng(5)
     values = random_values(6, rng)
@@ -245,7 +243,7 @@ def test_gradients(product: bool) -> None:
 
 @pytest.mark.gradcheck
 @pytest.mark.parametrize("name", ["position", "scale", "opacity", "origin"])
-def test_forward_gradients_of_single_parameters(name: str) -> None:
+def test_forward_gradients_of_single_parameters(name):
     """With 5 Gaussians, 20 rays and all else constant: widths in the loop stay apart."""
     rng = np.random.default_rng(10)
     values = random_values(5, rng) | {"origin": rng.uniform(-1, 1, (3, 20))}
@@ -266,7 +264,7 @@ def test_forward_gradients_of_single_parameters(name: str) -> None:
     assert np.abs(got).max() > 0.1
 
 
-def test_opaque_beyond_float32_stays_finite() -> None:
+def test_opaque_beyond_float32_stays_finite():
     opacity = mi.Float([0.0, 1.0, 1.0 - 1e-8])
     g = gaussians(random_values(3, np.random.default_rng(6)), mi.Float)
     g.opacity = opacity
@@ -279,7 +277,7 @@ def test_opaque_beyond_float32_stays_finite() -> None:
 
 
 @pytest.mark.parametrize("scale_m", [(0.2, 0.8), (0.005, 1.5)])
-def test_cells_list_every_gaussian(scale_m: tuple[float, float]) -> None:
+def test_cells_list_every_gaussian(scale_m):
     """Extinction from each cell's list is the definition, at the centres, between them, and outside."""
     rng = np.random.default_rng(7)
     values = random_values(40, rng, scale_m)
@@ -298,7 +296,7 @@ def test_cells_list_every_gaussian(scale_m: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize(("n", "scale_m"), [(1, (0.5, 0.5)), (60, (0.3, 0.3)), (60, (0.005, 1.5))])
-def test_extinction_bound_is_valid_and_tight(n: int, scale_m: tuple[float, float]) -> None:
+def test_extinction_bound_is_valid_and_tight(n, scale_m):
     """No local maximum exceeds the bound; for round Gaussians it is within the stated factor."""
     rng = np.random.default_rng(8)
     values = random_values(n, rng, scale_m)
@@ -324,7 +322,7 @@ def test_extinction_bound_is_valid_and_tight(n: int, scale_m: tuple[float, float
     assert bound < 0.9 * host.peak.sum() or n == 1
 
 
-def test_several_transmitters_are_refused() -> None:
+def test_several_transmitters_are_refused():
     g = gaussians(random_values(2, np.random.default_rng(9)))
     g.batch = 2
     with pytest.raises(ValueError, match="2 transmitters"):

@@ -1,8 +1,5 @@
 """The perception plane as a Mitsuba sensor: its rays, its poses, and Mitsuba's own integrators through it."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -47,20 +44,20 @@ def rays(sensor: Any, height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("coverage", ["hemisphere", "sphere"])
-def test_rays_pass_through_pixel_points(coverage: str) -> None:
+def test_rays_pass_through_pixel_points(coverage):
     """Wherever in a pixel the sample lies: the one direction of `core.angles`, turned by the quaternion."""
     sensor = mi.load_dict(plane(9, 36, coverage=coverage))
     expected = {"hemisphere": pixel_directions, "sphere": equirectangular_sphere}[coverage](9, 36)
     np.testing.assert_allclose(rays(sensor, 9, 36), expected @ TURN.T, atol=FLOAT32)
 
 
-def test_rows_of_the_sphere() -> None:
+def test_rows_of_the_sphere():
     azimuth, elevation = azimuth_elevation(equirectangular_sphere(18, 36))
     np.testing.assert_allclose(np.degrees(elevation[:, 5]), -90 + 10 * np.arange(18), atol=1e-6)
     np.testing.assert_allclose(np.degrees(azimuth[3]), 10 * np.arange(36), atol=1e-6)
 
 
-def test_crop_is_part_of_the_film() -> None:
+def test_crop_is_part_of_the_film():
     crop = {"crop_width": 10, "crop_height": 4, "crop_offset_x": 7, "crop_offset_y": 3}
     sensor = mi.load_dict(plane(9, 36, crop))
     expected = pixel_directions(9, 36)[3:7, 7:17]
@@ -69,7 +66,7 @@ def test_crop_is_part_of_the_film() -> None:
     np.testing.assert_allclose(own, expected, atol=FLOAT32)
 
 
-def test_parameters() -> None:
+def test_parameters():
     """What ``mi.traverse`` lists, and that a new pose and a new size are taken over, with derivatives."""
     sensor = mi.load_dict(plane())
     params = mi.traverse(sensor)
@@ -90,7 +87,7 @@ def test_parameters() -> None:
     )
 
 
-def test_xml_and_depth(tmp_path: Path) -> None:
+def test_xml_and_depth(tmp_path):
     """From a scene file, with Mitsuba's own depth integrator: the distances to a sphere around the origin."""
     (tmp_path / "scene.xml").write_text(
         """<scene version="3.0.0">
@@ -113,7 +110,7 @@ def test_xml_and_depth(tmp_path: Path) -> None:
     np.testing.assert_allclose(image, -x + np.sqrt(x * x + 8), rtol=1e-5)
 
 
-def test_volpath_renders_through_it() -> None:
+def test_volpath_renders_through_it():
     """A purely absorbing medium: Beer's law along each ray."""
     absorbing = {"type": "homogeneous", "albedo": 0.0, "sigma_t": 0.5}
     ball = {"type": "sphere", "center": POSITION.tolist(), "radius": 2.0, "bsdf": {"type": "null"}}
@@ -143,12 +140,12 @@ def test_volpath_renders_through_it() -> None:
         ({"to_world": mi.ScalarTransform4f().scale([1.0, 1.0, -1.0])}, "not a rotation and a translation"),
     ],
 )
-def test_bad_input(more: dict[str, Any], text: str) -> None:
+def test_bad_input(more, text):
     with pytest.raises(RuntimeError, match=text):  # Mitsuba wraps a plugin's error
         mi.load_dict(plane(**more))
 
 
-def test_bad_pose() -> None:
+def test_bad_pose():
     with pytest.raises(InputError, match="unit quaternion"):
         receiver_to_world(POSITION, [0, 0, 0, 2])
     with pytest.raises(InputError, match="three finite coordinates"):

@@ -1,7 +1,5 @@
 """Scenes from XML files and dictionaries are the same scenes; registration; plugins beside Sionna RT."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -84,7 +82,7 @@ def held(scene: Any) -> dict[str, np.ndarray]:
     return {key: plain(value) for key, value in mi.traverse(scene) if hasattr(value, "numpy")}
 
 
-def test_xml_and_dictionary_are_the_same_scene(run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_xml_and_dictionary_are_the_same_scene(run, monkeypatch, tmp_path):
     """The XML names the run folder relative to itself, whatever the working folder is."""
     xml = run.parents[1] / "scene.xml"
     xml.write_text(XML.format(run="runs/first"))
@@ -108,7 +106,7 @@ def test_xml_and_dictionary_are_the_same_scene(run: Path, monkeypatch: pytest.Mo
         np.testing.assert_allclose(inside, 2 * outside, rtol=1e-6)
 
 
-def test_shape_holds_the_gaussians_of_the_run_folder(run: Path) -> None:
+def test_shape_holds_the_gaussians_of_the_run_folder(run):
     """The parameters of the fitted model, through the model that the configuration names."""
     scene = mi.load_dict(as_dict(str(run)))
     trained = open_run(run).field
@@ -119,7 +117,7 @@ def test_shape_holds_the_gaussians_of_the_run_folder(run: Path) -> None:
         np.testing.assert_allclose(plain(got[f"gaussians.{name}"]), plain(values), rtol=1e-5, atol=1e-6)
 
 
-def test_bad_runs_are_named(run: Path, tmp_path: Path) -> None:
+def test_bad_runs_are_named(run, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     damaged = tmp_path / "damaged"
@@ -136,7 +134,7 @@ def test_bad_runs_are_named(run: Path, tmp_path: Path) -> None:
         mi.load_dict({"type": "wrf_gaussian_emitter", "run": str(run)})
 
 
-def test_settings_of_the_encoding_are_kept(one_gateway: Record, tmp_path: Path) -> None:
+def test_settings_of_the_encoding_are_kept(one_gateway, tmp_path):
     """A run says which encoding its networks expect."""
     folder = write_run(tmp_path / "run", one_gateway, "wrf-gs+", "encoding.position_octaves=2", "encoding.tx_scale_m=3")
     emitter = mi.load_dict({"type": "wrf_gaussian_emitter", "run": str(folder), "tx_position": list(TX)})
@@ -151,7 +149,7 @@ def child(code: str) -> str:
     return done.stdout
 
 
-def test_registration_needs_a_variant() -> None:
+def test_registration_needs_a_variant():
     code = """
 import wrf_mi_plugins
 def refused():
@@ -183,7 +181,7 @@ except RuntimeError as error:
 
 
 @pytest.mark.parametrize("first", ["plugins", "sionna"])
-def test_plugins_work_in_one_process_with_sionna_rt(first: str) -> None:
+def test_plugins_work_in_one_process_with_sionna_rt(first):
     """One process traces paths and renders a plugin's scene, whichever is imported first."""
     code = f"""
 import warnings

@@ -1,7 +1,5 @@
 """Views in a browser: Chromium without a window, where it is installed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -96,9 +94,7 @@ def opened(browser: Browser, folder: Path, content: ViewContent, size: tuple[int
 
 
 @pytest.mark.parametrize(("size", "observed"), [(LAPTOP, "image"), (PHONE, "level")])
-def test_views_need_no_network_and_answer_their_controls(
-    browser: Browser, tmp_path: Path, size: tuple[int, int], observed: str
-) -> None:
+def test_views_need_no_network_and_answer_their_controls(browser, tmp_path, size, observed):
     content = made_view(observed)
     tab, first = opened(browser, tmp_path, content, size)
     assert first == {
@@ -127,7 +123,7 @@ def test_views_need_no_network_and_answer_their_controls(
     tab.close()
 
 
-def test_channels_are_drawn_over_subcarriers(browser: Browser, tmp_path: Path) -> None:
+def test_channels_are_drawn_over_subcarriers(browser, tmp_path):
     content = replace(made_view("curve"), scene=None, gaussians=None, paths=None, maps=[])
     tab, first = opened(browser, tmp_path, content, PHONE)
     assert (first["images"], first["lines"], first["layers"]) == (0, [8, 8], 3)
@@ -135,7 +131,7 @@ def test_channels_are_drawn_over_subcarriers(browser: Browser, tmp_path: Path) -
     tab.close()
 
 
-def test_a_map_alone_is_seen_from_further_back(browser: Browser, tmp_path: Path) -> None:
+def test_a_map_alone_is_seen_from_further_back(browser, tmp_path):
     """Plotly draws flat scenes wider than rooms: their corners would lie outside the picture."""
     whole = made_view()
     low = whole.receivers_m * [1, 1, 0] + [0, 0, 0.5]

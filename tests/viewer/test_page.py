@@ -1,7 +1,5 @@
 """The page of a view: self-contained, escaped, complete, and small."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json
@@ -70,7 +68,7 @@ def text() -> str:
 
 @example(np.full((3, 4), 5e-324) * np.eye(3, 4))
 @given(arrays(float, (3, 4), elements=st.floats(-1e6, 1e6) | st.just(np.nan)))
-def test_packed_numbers_keep_half_a_step(values: np.ndarray) -> None:
+def test_packed_numbers_keep_half_a_step(values):
     found = unpacked(packed(values))
     np.testing.assert_array_equal(np.isnan(found), np.isnan(values))
     known = values[np.isfinite(values)]
@@ -79,13 +77,13 @@ def test_packed_numbers_keep_half_a_step(values: np.ndarray) -> None:
         np.testing.assert_allclose(found[np.isfinite(values)], known, rtol=1e-12, atol=atol)
 
 
-def test_packed_integers_are_exact() -> None:
+def test_packed_integers_are_exact():
     values = np.array([[-3, 0], [7, LARGEST - 3]])
     np.testing.assert_array_equal(unpacked(packed(values)), values)
     assert unpacked(packed(np.zeros((0, 3)))).shape == (0, 3)
 
 
-def test_page_holds_plotly_and_refers_to_nothing_else(text: str) -> None:
+def test_page_holds_plotly_and_refers_to_nothing_else(text):
     assert text.count(plotly_js()) == 1
     assert re.search(r"plotly\.js v\d", text)
     own = text.replace(plotly_js(), "")
@@ -101,7 +99,7 @@ def test_page_holds_plotly_and_refers_to_nothing_else(text: str) -> None:
     assert "http" not in policy
 
 
-def test_markup_in_names_is_text(text: str) -> None:
+def test_markup_in_names_is_text(text):
     parsed = Elements(text.replace(plotly_js(), ""))
     assert parsed.heading == f"made {MARKUP}"
     assert [tag for tag, _ in parsed.found].count("script") == 3
@@ -110,7 +108,7 @@ def test_markup_in_names_is_text(text: str) -> None:
     assert data["notes"] == [f"A note {MARKUP}."]
 
 
-def test_page_holds_the_numbers_of_the_content(text: str) -> None:
+def test_page_holds_the_numbers_of_the_content(text):
     content, data = made_view(), data_of(text)
     assert content.scene is not None
     assert content.rows is not None
@@ -138,7 +136,7 @@ def test_page_holds_the_numbers_of_the_content(text: str) -> None:
     assert low < high
 
 
-def test_images_of_spectra_have_the_highest_elevation_at_the_top() -> None:
+def test_images_of_spectra_have_the_highest_elevation_at_the_top():
     grey = np.zeros((4, 6))
     grey[3, 2] = 1.0
     uri = png(grey)
@@ -149,20 +147,20 @@ def test_images_of_spectra_have_the_highest_elevation_at_the_top() -> None:
     assert png(np.full((4, 6), np.nan)) is None
 
 
-def test_views_display_themselves_in_notebooks(text: str) -> None:
+def test_views_display_themselves_in_notebooks(text):
     shown = View(made_view())._repr_html_()
     (tag, attributes), *more = Elements(shown).found
     assert (tag, more) == ("iframe", [])
     assert attributes["srcdoc"] == text
 
 
-def test_pages_have_a_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pages_have_a_largest_size(monkeypatch):
     monkeypatch.setattr(view_module, "LARGEST_BYTES", 1_000_000)
     with pytest.raises(InputError, match=r"view: \d\.\d MB, the limit is 1 MB; lower --transmitters"):
         _ = View(made_view()).html
 
 
-def test_missing_plotly_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_plotly_is_named(monkeypatch):
     page_module.plotly_js.cache_clear()
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     with pytest.raises(InputError, match=r"views need plotly; install it: pip install 'wrf-mi\[view\]'"):

@@ -1,7 +1,5 @@
 """Views of scenes, runs and maps: what they show is what these hold."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import sys
@@ -63,7 +61,7 @@ def write_map(path: Path, height_m: float = 1.0) -> Path:
     return path
 
 
-def test_scenes_by_name_folder_file_and_object_show_every_triangle(room: Path, tmp_path: Path) -> None:
+def test_scenes_by_name_folder_file_and_object_show_every_triangle(room, tmp_path):
     scene = open_scene(room, 2.4e9)
     triangles = scene_surfaces(scene).triangles
     for source in (room, room / "scene.xml", scene):
@@ -85,7 +83,7 @@ def test_scenes_by_name_folder_file_and_object_show_every_triangle(room: Path, t
         assert len(found.content.scene.edges_m) == 12  # those of a box, without diagonals
 
 
-def test_the_largest_triangles_are_kept(room: Path) -> None:
+def test_the_largest_triangles_are_kept(room):
     surfaces, materials = surfaces_in(open_scene(room, 2.4e9))
     content, note = scene_content(surfaces, materials, most=4)
     every = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
@@ -95,7 +93,7 @@ def test_the_largest_triangles_are_kept(room: Path) -> None:
     assert note == f"Mesh: the largest 4 of {len(every)} triangles."
 
 
-def test_a_traced_run_shows_its_held_out_rows_and_stored_paths(traced: Path) -> None:
+def test_a_traced_run_shows_its_held_out_rows_and_stored_paths(traced):
     results, content = read_run(traced), wrf_mi.view(traced).content
     rows, paths = content.rows, content.paths
     assert rows is not None
@@ -115,7 +113,7 @@ def test_a_traced_run_shows_its_held_out_rows_and_stored_paths(traced: Path) -> 
     assert set(paths.kinds) == {"line of sight", "reflection", "reflection, reflection"}
 
 
-def test_the_strongest_paths_of_each_pair_are_kept(traced: Path) -> None:
+def test_the_strongest_paths_of_each_pair_are_kept(traced):
     stored = load_trace(traced / "paths.npz")
     kept, every = path_layer(stored, 2), path_layer(stored, 10**6)
     for tx in range(stored.paths.n_tx):
@@ -124,7 +122,7 @@ def test_the_strongest_paths_of_each_pair_are_kept(traced: Path) -> None:
             assert np.sort(kept.gain_db[(kept.tx == tx) & (kept.rx == rx)]) == pytest.approx(best)
 
 
-def test_a_joint_run_shows_gaussians_and_paths_of_its_settings(joint: Path) -> None:
+def test_a_joint_run_shows_gaussians_and_paths_of_its_settings(joint):
     view = wrf_mi.view(joint, transmitters=3, gaussians=5)
     content, run = view.content, open_run(joint)
     gaussians, rows = content.gaussians, content.rows
@@ -144,7 +142,7 @@ def test_a_joint_run_shows_gaussians_and_paths_of_its_settings(joint: Path) -> N
         assert words in text
 
 
-def test_layers_of_two_runs_of_the_same_data_are_combined(traced: Path, joint: Path, field: Path) -> None:
+def test_layers_of_two_runs_of_the_same_data_are_combined(traced, joint, field):
     both = wrf_mi.view(traced, joint)
     assert {"triangles", "gaussians", "paths", "held_out_rows"} <= both.counts.keys()
     assert both.content.rows is not None
@@ -154,7 +152,7 @@ def test_layers_of_two_runs_of_the_same_data_are_combined(traced: Path, joint: P
     assert "field: of other data than the first run; only its scene is shown." in other.notes
 
 
-def test_a_field_of_spectra_shows_them(field: Path) -> None:
+def test_a_field_of_spectra_shows_them(field):
     content, results = wrf_mi.view(open_run(field)).content, read_run(field)
     assert content.rows is not None
     observed = content.rows.observed
@@ -167,7 +165,7 @@ def test_a_field_of_spectra_shows_them(field: Path) -> None:
 
 
 @pytest.mark.parametrize("placed", [True, False])
-def test_channels_are_curves_where_positions_are_known(placed: bool, tmp_path: Path) -> None:
+def test_channels_are_curves_where_positions_are_known(placed, tmp_path):
     record = channels(placed)
     model = "idw" if placed else "linear"
     folder = wrf_mi.train(record, tmp_path / "run", model).folder
@@ -183,14 +181,14 @@ def test_channels_are_curves_where_positions_are_known(placed: bool, tmp_path: P
     assert power_db(read_run(folder).truth) == pytest.approx(10 * np.log10(power))
 
 
-def test_representative_rows_span_the_scores() -> None:
+def test_representative_rows_span_the_scores():
     score = np.array([[5.0, 1.0, 3.0, np.nan, 2.0, 4.0], [5.0, 1.0, 3.0, np.nan, 2.0, np.nan]])
     np.testing.assert_array_equal(representative(score, 3), [0, 1, 2])  # best, worst and median
     np.testing.assert_array_equal(representative(score, 9), np.arange(6))
     np.testing.assert_array_equal(representative(np.full((1, 4), np.nan), 2), [0])
 
 
-def test_maps_are_shown_with_their_heights(traced: Path, tmp_path: Path) -> None:
+def test_maps_are_shown_with_their_heights(traced, tmp_path):
     files = [write_map(tmp_path / f"at{height}.nc", height) for height in (0.5, 1.5)]
     content = wrf_mi.view(traced, *files).content
     assert content.counts["maps"] == 2
@@ -205,7 +203,7 @@ def test_maps_are_shown_with_their_heights(traced: Path, tmp_path: Path) -> None
     assert tuple(alone.receivers) == first.receivers
 
 
-def test_maps_of_surfaces_and_datasets_are_points(tmp_path: Path) -> None:
+def test_maps_of_surfaces_and_datasets_are_points(tmp_path):
     xarray = pytest.importorskip("xarray")
     places = np.random.default_rng(2).uniform(size=(3, 20))
     points = {axis: ("point", values) for axis, values in zip("xyz", places, strict=True)}
@@ -218,7 +216,7 @@ def test_maps_of_surfaces_and_datasets_are_points(tmp_path: Path) -> None:
     assert note == "Maps: every 2th position along each axis (every 4th point of a surface)."
 
 
-def test_a_chunk_that_ends_its_decompressor_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_chunk_that_ends_its_decompressor_is_refused_in_one_line(tmp_path):
     xarray, folder = pytest.importorskip("xarray"), tmp_path / "map.zarr"
     pytest.importorskip("zarr")
     power = np.random.default_rng(0).uniform(-90, -40, (2, 7, 8)).astype(np.float32)
@@ -235,7 +233,7 @@ def test_a_chunk_that_ends_its_decompressor_is_refused_in_one_line(tmp_path: Pat
         read_map(folder)
 
 
-def test_large_maps_are_thinned(tmp_path: Path) -> None:
+def test_large_maps_are_thinned(tmp_path):
     found, _ = read_map(write_map(tmp_path / "map.nc"))
     (thin,), notes = thinned([found], most=20)
     assert thin.values["power_dbm"].shape == (2, 2, 3)
@@ -245,7 +243,7 @@ def test_large_maps_are_thinned(tmp_path: Path) -> None:
     assert thinned([found])[0] == [found]
 
 
-def test_command_writes_one_file(traced: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_one_file(traced, room, tmp_path, capsys):
     out = tmp_path / "new" / "view.html"
     status, printed, err = call(["view", traced, "--out", out, "--transmitters", 2, "--paths", 1], capsys)
     assert status == 0
@@ -258,9 +256,7 @@ def test_command_writes_one_file(traced: Path, room: Path, tmp_path: Path, capsy
     assert found["bytes"] < 15e6
 
 
-def test_command_refuses_in_one_line(
-    traced: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_command_refuses_in_one_line(traced, tmp_path, capsys, monkeypatch):
     out = tmp_path / "view.html"
     refused(["view", tmp_path / "no", "--out", out], "no: no such file; give a run folder, a map or a scene", capsys)
     refused(["view", tmp_path / "no.nc", "--out", out], "no.nc: no such file", capsys)
@@ -278,5 +274,5 @@ def test_command_refuses_in_one_line(
         refused(["view", tmp_path / file, "--out", out], rf"need {package}: pip install 'wrf-mi\[view\]'", capsys)
 
 
-def test_options_have_the_documented_defaults() -> None:
+def test_options_have_the_documented_defaults():
     assert ViewOptions() == ViewOptions(transmitters=40, gaussians=1000, paths=200)
