@@ -3,9 +3,9 @@
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
+from made_fields import SIZE, Float64
 
 from wrf_mi.core import Receiver
 from wrf_mi.gaussians import Encoding, Factorised, Gaussians, WrfGs, WrfGsPlus, random_gaussians, tiles
@@ -15,10 +15,7 @@ from wrf_mi.training.step import device_pose
 
 pytestmark = pytest.mark.all_threads
 
-Float64 = dr.float64_array_t(mi.Float)
 Tensor64 = dr.tensor_t(Float64)
-SIZE = 23, 61
-"""No whole number of tiles either way."""
 TOLERANCE = 1e-12
 """Float64 sums of 60 Gaussians, and of as many pixels, in another order."""
 RECEIVER = Receiver("gateway1", np.array([5.0, 0.3, 0.0]), np.array([0.0, 0.6, 0.0, 0.8]))
@@ -47,13 +44,13 @@ def test_shared_geometry_equals_repeated_geometry(name, batch):
     plane, rng = perception_plane(*SIZE, Float64), np.random.default_rng(3)
     weight = [Float64(rng.standard_normal(batch * plane.pixels)) for _ in range(2)]
     images, slopes = [], []
-    for spread in (False, True):
+    for repeated in (False, True):
         params, tx_pos = drawn(name, batch)
         dr.enable_grad(params)
         gaussians: Gaussians = FIELDS[name].gaussians(params, tx_pos)
         assert gaussians.shared
-        gaussians = gaussians.spread() if spread else gaussians
-        assert gaussians.shared != spread
+        gaussians = gaussians.spread() if repeated else gaussians
+        assert gaussians.shared != repeated
         re, im = splat(gaussians, device_pose(RECEIVER, Float64), plane)
         dr.backward(dr.sum(re * weight[0] + im * weight[1]))
         images.append(np.concatenate([re.numpy(), im.numpy()]))

@@ -1,14 +1,13 @@
 """Chunked evaluation equals evaluation at once: lists of tiles, networks of many Gaussians."""
 
-from dataclasses import fields as fields_of
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from made_fields import device_gaussians
 from made_spectra import RECEIVERS, SIZE, true_field
 
-from wrf_mi.backend.device import to_float, to_tensor
+from wrf_mi.backend.device import to_tensor
 from wrf_mi.core import InputError
 from wrf_mi.gaussians import FIELDS, Gaussians, random_gaussians, tiles
 from wrf_mi.gaussians.footprint import depth_order, project
@@ -26,16 +25,11 @@ ROUNDING = 1e-5
 
 
 def gaussians(batch: int, count: int, size: float) -> Gaussians:
-    rng = np.random.default_rng(3)
-    return Gaussians(
-        position=[to_float(x) for x in rng.normal(0, 2, (3, count))],
-        scale=[mi.Float(np.full(batch * count, size, np.float32)) for _ in range(3)],
-        rotation=[to_float(x) for x in rng.normal(size=(4, batch * count))],
-        signal=[to_float(x) for x in rng.normal(size=(2, batch * count))],
-        opacity=to_float(rng.uniform(0, 0.9, batch * count)),
-        attenuation=None,
-        batch=batch,
-    )
+    rng, total = np.random.default_rng(3), batch * count
+    position, rotation = rng.normal(0, 2, (3, count)), rng.normal(size=(4, total))
+    signal = rng.normal(size=total) + 1j * rng.normal(size=total)
+    arrays = {"position": position, "rotation": rotation, "signal": signal, "opacity": rng.uniform(0, 0.9, total)}
+    return device_gaussians(mi.Float, batch, scale=np.full((3, total), size), **arrays)
 
 
 def members(lists: TileLists, n: int) -> list[list[int]]:
@@ -57,9 +51,7 @@ def test_counted_lists_equal_allocated_lists(monkeypatch, size):
     assert reserved.start is None
     assert counted.start is not None
     assert members(counted, count) == members(reserved, count)
-    room = dr.width(counted.index)
-    assert room == int(counted.length.numpy().sum())
-    assert room < dr.width(reserved.index)
+    assert dr.width(counted.index) == int(counted.length.numpy().sum()) < dr.width(reserved.index)
 
 
 def test_lists_without_visible_gaussians_are_empty(monkeypatch):
@@ -75,11 +67,10 @@ def test_lists_without_visible_gaussians_are_empty(monkeypatch):
 def test_operator_is_the_same_with_counted_lists(monkeypatch):
     """Its strips are planes of a row of tiles each."""
     field, pose, plane = gaussians(1, 60, 0.3), device_pose(RECEIVERS[0]), perception_plane(23, 61, mi.Float)
-    whole = pixel_weights(field, pose, plane).toarray()
+    weights = pixel_weights(field, pose, plane).toarray()
     monkeypatch.setattr(tiles, "RESERVED", 0)
-    counted = pixel_weights(field, pose, plane).toarray()
-    np.testing.assert_array_equal(counted, whole)
-    assert whole.any()
+    np.testing.assert_array_equal(pixel_weights(field, pose, plane).toarray(), weights)
+    assert weights.any()
 
 
 def test_more_entries_than_32_bits_count_are_refused():
@@ -91,20 +82,17 @@ def test_more_entries_than_32_bits_count_are_refused():
 
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+", "factorised"])
 @pytest.mark.parametrize("batch", [1, 2])
-def test_networks_in_chunks_equal_the_whole(model, batch):
-    field = FIELDS[model]()
-    rng = np.random.default_rng(0)
-    start = random_gaussians([RECEIVERS[0]], 23, rng)
-    params = {name: to_tensor(values) for name, values in field.init(start, rng).items()}
-    tx = to_tensor(rng.normal(size=(3, batch)))
-    whole, parts = field.gaussians(params, tx), gaussians_in_parts(field, params, tx, 7 * batch)
-    assert (parts.count, parts.batch) == (23, batch)
-    for one in fields_of(Gaussians):
-        if one.name == "batch" or getattr(whole, one.name) is None:
-            assert getattr(parts, one.name) == getattr(whole, one.name)
-            continue
-        for a, b in zip(*(np.atleast_2d(np.array(getattr(g, one.name))) for g in (parts, whole)), strict=True):
-            np.testing.assert_allclose(a, b, rtol=ROUNDING, atol=ROUNDING)
+def test_networks_in_chunks_equal_networks_at_once(model, batch):
+    field, rng = FIELDS[model](), np.random.default_rng(0)
+    weights = field.init(random_gaussians([RECEIVERS[0]], 23, rng), rng)
+    params, tx = {name: to_tensor(values) for name, values in weights.items()}, to_tensor(rng.normal(size=(3, batch)))
+    expected, parts = vars(field.gaussians(params, tx)), vars(gaussians_in_parts(field, params, tx, 7 * batch))
+    assert parts["position"][0].numpy().shape == (23,)
+    for name, values in expected.items():
+        if name == "batch" or values is None:
+            assert parts[name] == values
+        else:
+            np.testing.assert_allclose(np.array(parts[name]), np.array(values), rtol=ROUNDING, atol=ROUNDING)
 
 
 def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch):
@@ -118,4 +106,4 @@ def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch):
     parts = Predictor.of_field(field, params, RECEIVERS, *SIZE)
     np.testing.assert_allclose(parts(tx), expected, atol=ROUNDING)
     assert not parts.evaluate.recordings
-    assert all(one.frozen.n_recordings > 0 for one in recorded.evaluate.recordings.values())
+    assert all(recording.frozen.n_recordings > 0 for recording in recorded.evaluate.recordings.values())

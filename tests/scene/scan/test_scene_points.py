@@ -1,4 +1,4 @@
-"""Point clouds and bare meshes from files; `test_density_and_initial.py` has further formats and damaged files."""
+"""Point clouds and bare meshes from files; `test_initial.py` has further formats and damaged files."""
 
 from __future__ import annotations
 
