@@ -4,6 +4,10 @@ import re
 from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parents[1]
+README, DOCS = CHECKOUT / "README.md", CHECKOUT / "docs"
+_MADE = {"_build", "api", "notebooks"}
+PAGES = [README, *sorted(page for page in DOCS.rglob("*.md") if page.relative_to(DOCS).parts[0] not in _MADE)]
+PAGE_NAMES = [str(page.relative_to(CHECKOUT)) for page in PAGES]
 
 
 def blocks(path: Path, language: str) -> list[str]:

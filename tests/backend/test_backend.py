@@ -1,4 +1,5 @@
 import os
+import re
 import subprocess
 import sys
 import time
@@ -54,40 +55,26 @@ def good_if(*versions: tuple[int, ...]):
 
 
 def real_llvm(major: int) -> libraries.LlvmLibrary:
-    found = [library for library in backend.find_llvm(ignore_variable=True) if library.version[:1] == (major,)]
-    if not found:
+    of_major = [library for library in backend.find_llvm(ignore_variable=True) if library.version[:1] == (major,)]
+    if not of_major:
         pytest.skip(f"LLVM {major} is not installed here")
-    return found[0]
+    return of_major[0]
 
 
 def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        timeout=SECONDS_PER_CHILD,
-    )
+    pipes = {"capture_output": True, "text": True, "timeout": SECONDS_PER_CHILD}
+    return subprocess.run([sys.executable, "-c", code], env=os.environ | environment, **pipes)
 
 
-@pytest.mark.parametrize(
-    ("name", "version"),
-    [
-        ("libLLVM-14.so.1", (14,)),
-        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
-        ("libLLVM-17.so", (17,)),
-        ("libLLVM.so.19.1", (19, 1)),
-        ("libLLVM-19.dylib", (19,)),
-        ("libLLVM.19.1.dylib", (19, 1)),
-        ("libLLVM.so", ()),
-        ("libLLVM.so.1", ()),
-        ("libLLVM.dylib", ()),
-        ("libLLVM.so.19.1-rust-1.83.0-stable", None),
-        ("libLLVMCore.a", None),
-        ("libLLVMSPIRVLib.so.15", None),
-        ("libLLVM-C.so", None),
-    ],
-)
+VERSIONS = {
+    **{"libLLVM-14.so.1": (14,), "libLLVM-14.0.6.so.1": (14, 0, 6), "libLLVM-17.so": (17,), "libLLVM.so.19.1": (19, 1)},
+    **{"libLLVM-19.dylib": (19,), "libLLVM.19.1.dylib": (19, 1)},
+    **dict.fromkeys(("libLLVM.so", "libLLVM.so.1", "libLLVM.dylib"), ()),
+    **dict.fromkeys(("libLLVM.so.19.1-rust-1.83.0-stable", "libLLVMCore.a", "libLLVMSPIRVLib.so.15", "libLLVM-C.so")),
+}
+
+
+@pytest.mark.parametrize(("name", "version"), VERSIONS.items())
 def test_version_from_file_name(name, version):
     assert libraries.version_from_name(name) == version
 
@@ -101,8 +88,8 @@ def test_version_round_trips_through_a_file_name(major, minor, patch):
 def test_newest_first_each_file_once(only):
     folder = only("libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM.so.9.1", "libLLVM-19.1.7.so", "libLLVMCore.a")
     (folder / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
-    found = [(library.version, library.path.name) for library in backend.find_llvm()]
-    assert found == [
+    libraries_found = [(library.version, library.path.name) for library in backend.find_llvm()]
+    assert libraries_found == [
         ((19, 1, 7), "libLLVM-19.1.7.so"),
         ((19, 1), "libLLVM.so.19.1"),
         ((14,), "libLLVM-14.so.1"),
@@ -134,15 +121,13 @@ def test_old_llvm_is_refused_without_a_trial(only, major, monkeypatch):
     assert "\n" not in str(caught.value)
 
 
-def test_no_llvm_at_all(only):
-    only()
-    with pytest.raises(BackendError, match=r"no usable LLVM \(none was found\): .*install"):
-        backend.choose("llvm")
-
-
-def test_invalid_library_is_refused(only):
-    only("libLLVM.so.19.1")
-    with pytest.raises(BackendError, match=r"LLVM 19\.1 .* fails") as caught:
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [([], r"no usable LLVM \(none was found\): .*install"), (["libLLVM.so.19.1"], r"LLVM 19\.1 .* fails")],
+)
+def test_missing_and_invalid_libraries_are_refused(names, message, only):
+    only(*names)
+    with pytest.raises(BackendError, match=message) as caught:
         backend.choose("llvm")
     assert "\n" not in str(caught.value)
 
@@ -159,9 +144,7 @@ def test_trial_reports_an_abort():
     verdict, final = probe._run_trial(backend.VARIANTS["llvm"], libraries.LLVM_VARIABLE, real_llvm(15).path)
     assert final
     assert not verdict.usable
-    assert "SIGABRT" in verdict.reason
-    assert "fminimum" in verdict.reason
-    assert "0x" not in verdict.reason
+    assert re.search("(?=.*SIGABRT)(?=.*fminimum)(?!.*0x)", verdict.reason)
 
 
 def test_verdicts_are_cached_until_the_file_changes(only, monkeypatch):
@@ -200,19 +183,15 @@ def test_verdicts_of_hidden_and_visible_devices_differ(tmp_path, monkeypatch):
     assert tried == [None, ""]
 
 
-def test_cached_failures_expire():
+def test_cached_failures_expire_and_a_damaged_cache_counts_as_empty():
     probe.remember("short", {"usable": False}, seconds=-1)
     probe.remember("long", {"usable": True})
     assert probe.recall("short") is None
     assert probe.recall("long") == {"usable": True}
-
-
-def test_damaged_cache_counts_as_empty():
-    probe.remember("key", {"usable": True})
-    probe.cache_file().write_text('{"key": {"usa')
-    assert probe.recall("key") is None
-    probe.remember("key", {"usable": True})
-    assert probe.recall("key") == {"usable": True}
+    probe.cache_file().write_text('{"long": {"usa')
+    assert probe.recall("long") is None
+    probe.remember("long", {"usable": True})
+    assert probe.recall("long") == {"usable": True}
 
 
 def test_unwritable_cache_is_ignored(tmp_path, monkeypatch):
@@ -243,8 +222,7 @@ def test_process_with_an_old_llvm_ends_with_one_line(major, imported_before):
     assert libraries.LLVM_VARIABLE in last or "install" in last
 
 
-def test_init_in_a_new_process():
-    code = """
+IN_A_NEW_PROCESS = """
 import os, sys
 import wrf_mi.backend as b
 assert "drjit" not in sys.modules
@@ -262,12 +240,7 @@ except b.BackendError as error:
 else:
     raise AssertionError
 """
-    ended = run_python(code)
-    assert ended.returncode == 0, ended.stderr
-
-
-def test_init_after_drjit_was_imported():
-    code = """
+AFTER_DRJIT = """
 import warnings
 import mitsuba
 mitsuba.set_variant("scalar_rgb")
@@ -279,6 +252,10 @@ assert mitsuba.variant() == chosen.variant
 assert any("from scalar_rgb to llvm_ad_mono_polarized" in str(warning.message) for warning in caught)
 assert chosen.llvm_version and "LLVM" in (chosen.llvm_path or "libLLVM")
 """
+
+
+@pytest.mark.parametrize("code", [IN_A_NEW_PROCESS, AFTER_DRJIT], ids=["first", "after Dr.Jit"])
+def test_init_in_a_new_process(code):
     ended = run_python(code)
     assert ended.returncode == 0, ended.stderr
 
@@ -304,8 +281,10 @@ def test_cuda_is_preferred_where_it_works():
     assert backend.choose("auto").name == "cuda"
 
 
-def test_arguments_are_checked():
-    with pytest.raises(InputError, match="backend: 'opencl' is none of"):
-        backend.init("opencl")
-    with pytest.raises(InputError, match="threads: must be at least 1, got 0"):
-        backend.init(threads=0)
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [({"backend": "opencl"}, "backend: 'opencl' is none of"), ({"threads": 0}, "threads: must be at least 1, got 0")],
+)
+def test_arguments_are_checked(arguments, message):
+    with pytest.raises(InputError, match=message):
+        backend.init(**arguments)

@@ -3,10 +3,13 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import pytest
 from documents import CHECKOUT, marked
+from wrf_mi_bench import bench as bench_module
 from wrf_mi_bench import scene as bench_scene
+from wrf_mi_bench import sources
 from wrf_mi_bench.bench import (
     CASES,
     CHECKS,
@@ -105,6 +108,24 @@ def test_bench_on_workers_writes_figures_and_reports_failures(two, tmp_path, cap
     (case_folder(runs, "demo") / "config.yaml").write_text("nonsense")
     with pytest.raises(BenchFailed, match=r"^bench demo: .* ended with status 2 wrf-mi: .*config.yaml: not readable"):
         bench(["flat-plan", "demo"], out, runs, two)
+
+
+@pytest.mark.parametrize("name", ["wrf-gs+-paper", "flat-plan"])
+def test_case_folder_depends_on_data_versions_and_arguments(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_module, "dataset_files", lambda dataset: [tmp_path])
+    folders = [case_folder(tmp_path, name)]
+    assert case_folder(tmp_path, name) == folders[0]
+    (tmp_path / "rows.csv").write_text("1")
+    folders.append(case_folder(tmp_path, name))
+    versions = sources.versions() | {"drjit": "0.1"}
+    monkeypatch.setattr(sources, "versions", lambda: versions)
+    folders.append(case_folder(tmp_path, name))
+    if name in CASES:
+        other = replace(CASES[name], arguments=(*CASES[name].arguments, "--seed", "3"))
+        monkeypatch.setattr(bench_module, "CASES", {name: other})
+        folders.append(case_folder(tmp_path, name))
+    assert len(set(folders)) == len(folders)
+    assert all(folder.name.startswith(f"{name}-") for folder in folders)
 
 
 def test_documents_show_the_stored_results():

@@ -1,12 +1,13 @@
 """Sentinels: which stored figures they are, when a figure counts as kept, and that a stopped call goes on."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from calling import call
+from documents import CHECKOUT
 from wrf_mi_bench import bench, check
 from wrf_mi_bench import sentinels as bench_sentinels
 from wrf_mi_bench.bench import CHECKS
@@ -17,15 +18,10 @@ from wrf_mi_bench.tables import FOLDER
 from wrf_mi.core import InputError
 from wrf_mi.tasks import TASKS
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 SSIM = Figure("room: field, median SSIM", 0.90, 0.88, 0.92, True)
 ERROR = Figure("flat: field, median absolute error (dB)", 3.0, 2.8, 3.2, False)
 OTHERS_S = 300
 """Image method, integrator and stress: 30 s, 30 s and 75 s were seen while another process had half of the cores."""
-
-
-def stored_rows() -> list[dict]:
-    return [json.loads((CHECKOUT / STORED / FOLDER / f"{name}-100-seed0.json").read_text()) for name in TABLE_ROWS]
 
 
 def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeypatch):
@@ -36,13 +32,13 @@ def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeyp
     assert len(known) == len({group.name for group in known})
     assert all(figure.low <= figure.stored <= figure.high for figure in figures)
     assert {name.partition("-")[0] for name in TABLE_ROWS} == set(TASKS)
-    assert OTHERS_S + sum(row["wall_seconds"] for row in stored_rows()) < 40 * 60
+    rows = [json.loads((STORED / FOLDER / f"{name}-100-seed0.json").read_text()) for name in TABLE_ROWS]
+    assert OTHERS_S + sum(row["wall_seconds"] for row in rows) < 40 * 60
 
 
 @pytest.mark.parametrize("count", [40, 400])
 def test_interval_of_a_median_has_its_nominal_coverage(count):
-    rng = np.random.default_rng(1)
-    inside = 0
+    rng, inside = np.random.default_rng(1), 0
     for _ in range(400):
         low, high = median_interval(list(np.quantile(rng.normal(size=count), np.linspace(0, 1, 101))), count)
         inside += low <= 0 <= high
@@ -51,59 +47,47 @@ def test_interval_of_a_median_has_its_nominal_coverage(count):
 
 
 @pytest.mark.parametrize(
-    ("figure", "measured", "verdict"),
+    ("figure", "verdicts"),
     [
-        (SSIM, 0.88, "equal"),
-        (SSIM, 0.93, "better"),
-        (SSIM, 0.87, "worse"),
-        (SSIM, float("nan"), "worse"),
-        (ERROR, 3.2, "equal"),
-        (ERROR, 2.7, "better"),
-        (ERROR, 3.3, "worse"),
-        (ERROR, float("inf"), "worse"),
+        (SSIM, {0.88: "equal", 0.93: "better", 0.87: "worse", float("nan"): "worse"}),
+        (ERROR, {3.2: "equal", 2.7: "better", 3.3: "worse", float("inf"): "worse"}),
     ],
 )
-def test_a_figure_is_worse_outside_its_interval_on_the_bad_side(figure, measured, verdict):
-    assert figure.verdict(measured) == verdict
+def test_a_figure_is_worse_outside_its_interval_on_the_bad_side(figure, verdicts):
+    assert [figure.verdict(measured) for measured in verdicts] == list(verdicts.values())
 
 
-class Made:
+class MadeGroups:
     """Three groups that take no time: a good figure, one as it is asked for, and one without data."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, runs: Path) -> None:
         self.asked: list[str] = []
         self.error: float | Exception | type[BaseException] = 3.0
         known = [
-            Group("good", (SSIM,), self.values("good", lambda: [0.9])),
-            Group("other", (ERROR,), self.values("other", self.other)),
-            Group("far", (ERROR,), self.values("far", lambda: [3.0]), present=False),
+            Group("good", (SSIM,), lambda _: self.measured("good", 0.9)),
+            Group("other", (ERROR,), lambda _: self.measured("other", self.error)),
+            Group("far", (ERROR,), lambda _: self.measured("far", 3.0), present=False),
         ]
         monkeypatch.setattr(bench_sentinels, "groups", lambda: known)
         monkeypatch.setattr(bench_sentinels, "RUNS", runs)
 
-    def values(self, name: str, found: Callable[[], Sequence[float]]) -> Callable[[Path], Sequence[float]]:
-        def measure(_: Path) -> Sequence[float]:
-            self.asked.append(name)
-            return found()
-
-        return measure
-
-    def other(self) -> list[float]:
-        if isinstance(self.error, float):
-            return [self.error]
-        raise self.error
+    def measured(self, name: str, value: float | Exception | type[BaseException]) -> list[float]:
+        self.asked.append(name)
+        if isinstance(value, float):
+            return [value]
+        raise value
 
 
 @pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Made:
-    return Made(monkeypatch, tmp_path / "sentinels")
+def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> MadeGroups:
+    return MadeGroups(monkeypatch, tmp_path / "sentinels")
 
 
 def test_equal_figures_pass_and_missing_data_are_reported(made):
-    found = main()
-    assert "failed" not in found
-    assert [row["verdict"] for row in found["rows"]] == ["equal", "equal", "not on this machine"]
-    lines = bench_sentinels.table(found["rows"]).splitlines()
+    result = main()
+    assert "failed" not in result
+    assert [row["verdict"] for row in result["rows"]] == ["equal", "equal", "not on this machine"]
+    lines = bench_sentinels.table(result["rows"]).splitlines()
     assert lines[2] == "| room: field, median SSIM | 0.9 | 0.88 to 0.92 | 0.9 | equal |"
     assert lines[4] == "| flat: field, median absolute error (dB) | 3 | 2.8 to 3.2 |  | not on this machine |"
 
@@ -128,9 +112,9 @@ def test_changed_code_is_measured_again(made, monkeypatch, tmp_path):
 
 
 def test_source_files_are_the_packages_without_compiled_files():
-    found = source_files()
-    assert {"wrf_mi/runs/folder.py", "wrf_mi_plugins/shape.py", "wrf_mi_scenes/registry.py"} <= set(found)
-    assert not [name for name in found if name.endswith(".pyc")]
+    names = source_files()
+    assert {"wrf_mi/runs/folder.py", "wrf_mi_plugins/shape.py", "wrf_mi_scenes/registry.py"} <= set(names)
+    assert not [name for name in names if name.endswith(".pyc")]
 
 
 @pytest.mark.parametrize(
@@ -138,10 +122,9 @@ def test_source_files_are_the_packages_without_compiled_files():
 )
 def test_worse_or_failed_figure_is_named_after_all_were_measured(made, error, value):
     made.error = error
-    found = main()
+    failed = main()["failed"]
     assert made.asked == ["good", "other"]
-    begin = f"1 of 3 figures got worse or were not measured, first {ERROR.name}: {value}"
-    assert found["failed"].startswith(begin)
+    assert failed.startswith(f"1 of 3 figures got worse or were not measured, first {ERROR.name}: {value}")
 
 
 def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_worse(monkeypatch, tmp_path, capsys):
@@ -155,6 +138,7 @@ def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_wo
         return 0, ""
 
     monkeypatch.setattr(bench, "run_module", run_module)
+    monkeypatch.setattr(bench, "source_digests", lambda *modules: {})
     asked = ["bench", "sentinels", "--out", tmp_path / "out", "--runs", tmp_path / "runs"]
     status, out, err = call(asked, capsys)
     assert status == 1

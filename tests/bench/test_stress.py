@@ -1,5 +1,6 @@
 """The stress benchmark with a case or two of each row."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -17,27 +18,23 @@ from wrf_mi_bench.stress_rows import held, worst_of
 from wrf_mi.cli.main import main as cli
 from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT, PlaneTables
 
+FEW = [pytest.param(part, few, id=part.__name__) for part, _, few in bench_stress.PARTS]
 
-@pytest.mark.parametrize(
-    ("part", "few"), [pytest.param(part, few, id=part.__name__) for part, _, few in bench_stress.PARTS]
-)
+
+@pytest.mark.parametrize(("part", "few"), FEW)
 def test_few_cases_of_each_part_keep_their_bounds(part, few):
     rows = part(*few)
     assert rows
     for row in rows:
         assert held(row), row
-
-
-@pytest.mark.parametrize("name", HARD)
-def test_images_of_ill_conditioned_fields_equal_the_reference(name):
-    for seed in range(2):
-        field = HARD[name](np.random.default_rng(seed))
-        for blending in stress_fields.BLENDINGS:
-            truth, clear = reference(field, blending, (30, 60))
-            found = image(field, blending, (30, 60))
-            assert np.isfinite(found).all()
-            assert np.linalg.norm((found - truth)[clear]) <= stress_rows.IMAGE * np.linalg.norm(truth)
-            assert clear.mean() > 0.9
+        edges = re.search(r"([\d.]+)% of the pixels lie on an edge", row["value"])
+        assert edges is None or float(edges[1]) < 10
+    first = rows[0]["value"]
+    if part is phases:  # those of lengths in float32 exceed the bound
+        assert float(first.split()[-2]) > stress_rows.PHASE
+    if part is bench_stress.fits:  # some name the group that is not finite
+        assert first.endswith(" 0 did neither")
+        assert "4 ended finite" not in first
 
 
 def test_order_of_ties_in_depth_equals_the_reference():
@@ -49,48 +46,34 @@ def test_order_of_ties_in_depth_equals_the_reference():
     np.testing.assert_allclose(image(opaque, "alpha", (30, 60))[clear], truth[clear], atol=1e-5)
 
 
-def test_image_of_an_empty_field_is_zero():
-    for blending in stress_fields.BLENDINGS:
-        found = image(made(0, np.random.default_rng(0)), blending, (3, 5))
-        assert found.shape == (3, 5)
-        assert not found.any()
-
-
-def test_image_of_one_pixel_equals_the_reference():
+@pytest.mark.parametrize("blending", stress_fields.BLENDINGS)
+def test_images_of_no_gaussians_and_of_one_pixel_equal_the_reference(blending):
+    empty = image(made(0, np.random.default_rng(0)), blending, (3, 5))
+    assert empty.shape == (3, 5)
+    assert not empty.any()
     for seed in range(5):
         field = made(40, np.random.default_rng(seed))
-        for blending in stress_fields.BLENDINGS:
-            truth, clear = reference(field, blending, (1, 1))
-            np.testing.assert_allclose(image(field, blending, (1, 1))[clear], truth[clear], rtol=1e-4)
+        truth, clear = reference(field, blending, (1, 1))
+        np.testing.assert_allclose(image(field, blending, (1, 1))[clear], truth[clear], rtol=1e-4)
 
 
-def test_phases_of_lengths_in_float32_exceed_the_bound():
-    assert float(phases(5)[0]["value"].split()[-2]) > stress_rows.PHASE
+OTHER_CASES = (*(name for name in stress_joint.CASES if name != stress_joint.COPLANAR), "many paths")
 
 
-def test_fits_end_finite_or_name_the_group_that_is_not():
-    value = bench_stress.fits(4)[0]["value"]
-    assert value.endswith(" 0 did neither")
-    assert "4 ended finite" not in value
-
-
-def assert_joint_rows_are_held(rows: list[dict[str, str]], count: int) -> None:
-    assert len(rows) == 2 * count
+@pytest.mark.parametrize(
+    ("names", "models"),
+    [
+        ([stress_joint.COPLANAR], ("array", "pixel", "CSI")),
+        # Four cases compile some 600 kernels, 15 seconds. The same code and bounds, as in `wrf-mi bench stress`.
+        pytest.param(OTHER_CASES, ("array", "RSSI"), marks=pytest.mark.slow),
+    ],
+)
+def test_joint_graph_keeps_its_bounds(names, models):
+    """Values and derivatives; `stress.PARTS` has the power of coplanar planes."""
+    rows = joint(2, names, models)
+    assert len(rows) == 2 * len(names)
     for row in rows:
         assert held(row), row
-
-
-def test_joint_graph_keeps_its_bounds():
-    """Values and derivatives with coplanar planes, by all receiver models."""
-    assert_joint_rows_are_held(joint(2, [stress_joint.COPLANAR]), 1)
-
-
-# Four cases compile some 600 kernels, 15 seconds. The same code and bounds as above, and as in `wrf-mi bench stress`.
-@pytest.mark.slow
-def test_joint_graph_keeps_its_bounds_in_the_other_cases():
-    """Values and derivatives, by two receiver models."""
-    others = [*(name for name in stress_joint.CASES if name != stress_joint.COPLANAR), "many paths"]
-    assert_joint_rows_are_held(joint(2, others, ("array", "RSSI")), len(others))
 
 
 def test_joint_rows_detect_a_wrong_shift_and_a_missing_gradient(monkeypatch):

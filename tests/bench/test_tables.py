@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from documents import CHECKOUT, marked
-from wrf_mi_bench import table_pages, tables
+from wrf_mi_bench import bench, sources, table_pages, tables
 from wrf_mi_bench.bench import BenchFailed
-from wrf_mi_bench.table_plan import PARTS, QUICK_PARTS, Part, Row, plan
+from wrf_mi_bench.table_pages import LEAST, Points, front, fronts, pareto_figure, points_of, read_points
+from wrf_mi_bench.table_plan import PARTS, QUICK_PARTS, Row, TablePart, plan
 
 from wrf_mi.core import InputError
 from wrf_mi.models import MODELS
@@ -23,7 +24,7 @@ PAPER = {
 }
 
 
-def part_of(dataset: str) -> Part:
+def part_of(dataset: str) -> TablePart:
     return next(part for part in PARTS if part.dataset == dataset)
 
 
@@ -137,6 +138,32 @@ def test_scenes_are_made_once_and_can_be_opened(flat_folder, monkeypatch, tmp_pa
         assert {file: file.stat().st_mtime_ns for file in Path(path).rglob("*")} == before
 
 
+def test_runs_of_rows_are_used_again_but_for_other_data_or_versions(tmp_path, monkeypatch, capsys):
+    row, data, asked = Row(part_of("flat-ble"), "idw", 1.0, 0), tmp_path / "data", []
+    data.mkdir()
+    metrics = dict.fromkeys(tables.KEPT, 1)
+
+    def run(module, arguments):
+        asked.append(Path(arguments[-1]))
+        asked[-1].mkdir(parents=True)
+        (asked[-1] / "metrics.json").write_text(json.dumps(metrics))
+        return 0, ""
+
+    monkeypatch.setattr(tables, "dataset_files", lambda dataset: [data])
+    monkeypatch.setattr(bench, "run_module", run)
+    monkeypatch.setattr(tables, "read_run", lambda folder: SimpleNamespace(score=np.ones((1, 3)), metrics=metrics))
+    first = tables.measure(tmp_path, row)
+    assert tables.measure(tmp_path, row)["data"] == first["data"]
+    assert len(asked) == 1
+    assert f"{row.name}: finished before in {asked[0]}" in capsys.readouterr().err
+    (data / "rows.csv").write_text("1")
+    assert tables.measure(tmp_path, row)["data"] != first["data"]
+    versions = sources.versions() | {"drjit": "0.1"}
+    monkeypatch.setattr(sources, "versions", lambda: versions)
+    tables.measure(tmp_path, row)
+    assert len(set(asked)) == 3
+
+
 def test_no_row_begins_after_the_time_limit(short_plan, monkeypatch, tmp_path):
     monkeypatch.setattr(tables, "measure", lambda runs, row: pytest.fail("begun"))
     assert tables.tables(tmp_path, tmp_path / "runs", most_s=-1.0) == []
@@ -229,3 +256,52 @@ def test_a_corrected_scene_is_made_once_and_its_time_counts(flat_folder, monkeyp
     scene = tables.scene_of(part, tmp_path / "scenes")
     assert calls[0] == ["correct", str(scene), "flat-ble", "--split", "official", "--seed", "0"]
     assert Path(calls[1][calls[1].index("--scene") + 1]).name.startswith("corrected-flat-ble-")
+
+
+RFID = next(part for part in PARTS if part.dataset == "rfid-lab" and part.split == "official")
+POINTS: Points = {
+    "slow": {"score": 0.99, "ms_per_sample": 10, "train_seconds": 0},
+    "fast": {"score": 0.70, "ms_per_sample": 1, "train_seconds": 9},
+    "middle": {"score": 0.90, "ms_per_sample": 3, "train_seconds": 5},
+    "beaten": {"score": 0.80, "ms_per_sample": 5, "train_seconds": 7},
+}
+
+
+def test_front_holds_the_pareto_optimal_methods_from_cheap_to_costly():
+    assert front(POINTS, "ms_per_sample", True) == ["fast", "middle", "slow"]
+    assert front(POINTS, "train_seconds", True) == ["slow"]
+    assert front(POINTS, "ms_per_sample", False) == ["fast"]
+    # As good in one and better in the other is better.
+    even = {name: {"score": score, "ms": ms} for name, score, ms in (("a", 0.2, 1), ("b", 0.1, 1), ("c", 0.1, 2))}
+    assert front(even, "ms", False) == ["b"]
+
+
+def test_points_are_means_of_medians_over_seeds_of_all_training_rows():
+    rows = [Row(RFID, "vae", 1.0, 0), Row(RFID, "vae", 1.0, 1), Row(RFID, "vae", 1.0, 2), Row(RFID, "kriging", 0.1, 0)]
+    stored = {
+        row.name: {"score": {"median": 0.1 * k}, "ms_per_sample": 10.0**k, "train_seconds": 2.0 * k}
+        for k, row in enumerate(rows)
+    }
+    assert points_of(RFID, stored) == {
+        "vae": {"score": pytest.approx(0.1), "ms_per_sample": 10.0, "train_seconds": 2.0}
+    }
+
+
+def test_text_and_picture_show_both_fronts():
+    rows = fronts({RFID: POINTS})
+    assert [row["what"] for row in rows] == ["rfid-lab, SSIM, prediction of a sample", "rfid-lab, SSIM, training"]
+    assert rows[0]["value"] == "fast 0.700 in 1 ms, middle 0.900 in 3 ms, slow 0.990 in 10 ms"
+    assert rows[1]["value"] == "slow 0.990 in 0 s"
+    figure = pareto_figure({RFID: POINTS, PARTS[1]: POINTS})
+    assert len(figure.axes) == 4
+    assert {axes.get_xscale() for axes in figure.axes} == {"log"}
+    assert [text.get_text() for text in figure.legends[0].texts] == list(POINTS)
+    (step,) = figure.axes[0].lines
+    assert (step.get_xdata()[-1], step.get_ydata()[-1]) == (10, 0.99)
+    # A method without training lies at the left end.
+    assert figure.axes[1].lines[0].get_xdata()[0] == LEAST
+
+
+def test_missing_rows_are_reported(tmp_path):
+    with pytest.raises(InputError, match="no stored rows; call it in a checkout that has them, or run wrf-mi bench"):
+        read_points(tmp_path)

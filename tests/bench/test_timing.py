@@ -1,12 +1,30 @@
-"""How calls are timed, split and compared, on calls whose cost is known."""
+"""How calls are timed, split and compared, on calls whose cost is known; exponents of growth; times of a GPU."""
 
 import itertools
+import json
+import os
+import sys
 import time
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
-from wrf_mi_bench import timing
-from wrf_mi_bench.timing import Interval, bootstrap, exponent, history_of, interleaved, larger_half, memory_mb, ratio
+from wrf_mi_bench import gpu, gpu_job, timing
+from wrf_mi_bench.bench import all_here
+from wrf_mi_bench.check import main as check_main
+from wrf_mi_bench.scaling import Axis, rows, scale, verdict
+from wrf_mi_bench.timing import (
+    Interval,
+    bootstrap,
+    exponent,
+    history_of,
+    interleaved,
+    larger_half,
+    memory_mb,
+    n_log_n,
+    ratio,
+)
 from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 BUSY_S = 0.02
@@ -41,14 +59,11 @@ def test_calls_take_turns_and_warm_up_is_not_timed(clock):
 
     def call(name: str, cost: float) -> None:
         order.append(name)
-        # The first call of each compiles.
-        clock[0] += cost if order.count(name) > 1 else 100.0
+        clock[0] += cost if order.count(name) > 1 else 100.0  # the first call of each compiles
 
-    calls = {"a": lambda: call("a", 0.002), "b": lambda: call("b", 0.001)}
-    times = interleaved(calls, repeats=4, warm_up=1)
+    times = interleaved({"a": lambda: call("a", 0.002), "b": lambda: call("b", 0.001)}, repeats=4, warm_up=1)
     assert order == [*"ab", *"abba" * 2]
-    np.testing.assert_allclose(times["a"], [2] * 4)
-    np.testing.assert_allclose(times["b"], [1] * 4)
+    np.testing.assert_allclose([times["a"], times["b"]], [[2] * 4, [1] * 4])
 
 
 def test_rounds_end_when_time_is_up_but_three_are_timed(clock):
@@ -61,23 +76,19 @@ def test_rounds_end_when_time_is_up_but_three_are_timed(clock):
 
 def test_what_slows_both_calls_leaves_their_ratio(clock):
     load = itertools.count(1)
-    calls = {"ours": 0.003, "theirs": 0.001}
 
     def cost(seconds: float) -> None:
         clock[0] += seconds * ((next(load) + 1) // 2)  # the same within a round, ever more
 
-    times = interleaved({name: lambda s=s: cost(s) for name, s in calls.items()}, repeats=20, warm_up=1)
+    times = interleaved({"ours": lambda: cost(0.003), "theirs": lambda: cost(0.001)}, repeats=20, warm_up=1)
     assert times["ours"].max() > 5 * times["ours"].min()
-    found = ratio(times["ours"], times["theirs"])
-    np.testing.assert_allclose([found.low, found.value, found.high], 3)
+    interval = ratio(times["ours"], times["theirs"])
+    np.testing.assert_allclose([interval.low, interval.value, interval.high], 3)
     with pytest.raises(ValueError, match="as many of both"):
         ratio([1, 2], [1])
 
 
 def test_history_holds_the_kernels_of_a_call():
-    import drjit as dr
-    import mitsuba as mi
-
     total_ms, history = history_of(busy)
     assert total_ms >= 1e3 * BUSY_S
     assert history == []
@@ -87,16 +98,12 @@ def test_history_holds_the_kernels_of_a_call():
 
 
 def test_memory_is_what_a_call_needs_beyond_what_was_there():
-    import drjit as dr
-    import mitsuba as mi
-
-    held = array()
+    before = array()
     for _ in range(2):  # the second time, Dr.Jit has freed arrays in store
-        assert ARRAY_MB - PAGES_MB <= memory_mb(array) < ARRAY_MB + SLACK_MB
-        own = memory_mb(lambda: dr.arange(mi.Float, ARRAY_MB * 1_000_000 // 4) + 1)
-        assert ARRAY_MB - PAGES_MB <= own < ARRAY_MB + SLACK_MB
+        for call in (array, lambda: dr.arange(mi.Float, ARRAY_MB * 1_000_000 // 4) + 1):
+            assert ARRAY_MB - PAGES_MB <= memory_mb(call) < ARRAY_MB + SLACK_MB
     assert memory_mb(lambda: None) < SLACK_MB
-    assert held.nbytes == 1e6 * ARRAY_MB
+    assert before.nbytes == 1e6 * ARRAY_MB
 
 
 def test_without_linux_memory_is_watched(monkeypatch, tmp_path):
@@ -113,12 +120,9 @@ def test_without_linux_memory_is_watched(monkeypatch, tmp_path):
 def test_exponent_is_that_of_the_larger_half():
     sizes = [10**k for k in range(1, 7)]
     cost = [[1000 + n**1.5] * 3 for n in sizes]  # the overhead hides the growth at first
-    found = exponent(sizes, cost)
-    np.testing.assert_allclose([found.low, found.value, found.high], 1.5, atol=0.01)
-    assert larger_half(6) == slice(3, 6)
-    assert larger_half(4) == slice(1, 4)
-    assert larger_half(3) == slice(1, 3)
-    assert larger_half(2) == slice(0, 2)
+    power = exponent(sizes, cost)
+    np.testing.assert_allclose([power.low, power.value, power.high], 1.5, atol=0.01)
+    assert [larger_half(n) for n in (6, 4, 3, 2)] == [slice(3, 6), slice(1, 4), slice(1, 3), slice(0, 2)]
     with pytest.raises(ValueError, match="two or more"):
         exponent([10], [[1.0]])
 
@@ -144,3 +148,52 @@ def test_rooms_of_a_number_of_triangles(count):
     corners = np.asarray(clutter.vertices)[len(divided_room(12).vertices) :]
     assert np.linalg.norm(corners - clear, axis=1).min() > 1.0
     np.testing.assert_allclose(clutter.area - walls.area, 60, rtol=1e-6)
+
+
+def test_growth_beyond_n_log_n_is_reported(clock):
+    def axis(power: float) -> Axis:
+        def make(n: int):
+            def call() -> None:
+                clock[0] += 1e-7 * n**power
+
+            return call
+
+        return Axis("a", "made up", "things", (10, 100, 1000, 10000), make)
+
+    for power, said in ((1.0, "holds"), (2.0, "does not hold")):
+        growth = scale(axis(power))
+        assert growth["sizes"] == [10, 100, 1000, 10000]
+        assert rows([growth])[0]["asked"].endswith(f": {said}")
+    assert verdict(Interval(1.1, 1.0, 1.3), n_log_n([100, 1000])) == "holds within its interval"
+    # What would take too long is left out, and said.
+    slow = scale(axis(2.0), call_s=1e-3)
+    assert slow["left_out"] == [1000, 10000]
+    assert "1,000 left out" in rows([slow])[0]["what"]
+
+
+def test_without_a_gpu_it_is_one_line(tmp_path, capsys):
+    assert check_main("wrf_mi_bench.gpu:main", str(tmp_path / "out.json")) == 2
+    assert capsys.readouterr().err.startswith("wrf-mi: bench gpu: CUDA cannot be used")
+    assert "gpu" not in all_here()
+
+
+def test_rows_have_the_times_of_both(monkeypatch, tmp_path):
+    """Both jobs are measured on the CPU, each in its own process, as no test has a GPU."""
+    small = tmp_path / "small_job.py"
+    sizes = {"gaussians-splat": (20, 40)}
+    small.write_text(
+        "import sys\nfrom wrf_mi_bench import gpu_job\n"
+        f"gpu_job.SIZES, gpu_job.STEP_SIZES = {sizes}, (8, 16)\ngpu_job.job(sys.argv[1], 'llvm')\n"
+    )
+    monkeypatch.setattr(gpu, "JOB", "small_job")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, sys.path)]))
+    monkeypatch.setattr(gpu, "choose", lambda backend: None)
+    measured = gpu.main()["rows"]
+    sizes |= {f"step-{model}": (8, 16) for model in gpu_job.STEPS_OF}
+    titles = {"gaussians-splat": "splatting"}
+    titles |= {f"step-{model}": f"training step of {title}" for model, title in gpu_job.STEPS_OF.items()}
+    expected = [f"{titles[name]}, {size} Gaussians" for name, each in sizes.items() for size in each]
+    assert [row["what"] for row in measured] == expected
+    lines = gpu.table(json.loads(json.dumps(measured))).splitlines()
+    assert lines[2].startswith("| splatting, 20 Gaussians | ")
+    assert len(lines) == 2 + len(expected)

@@ -8,14 +8,9 @@ from typing import Any
 
 import pytest
 import yaml
+from documents import CHECKOUT, PAGE_NAMES, PAGES
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
-PAGES = [
-    CHECKOUT / "README.md",
-    *sorted((CHECKOUT / "docs").glob("*.md")),
-    *sorted((CHECKOUT / "docs").glob("howto/*.md")),
-]
 UNIT = r"(?:ms|s|min|minutes?|seconds?|hours?|dB|%|kB|MB|GB|GiB|MiB|times|mm|cm|m)(?!\w)"
 FIGURE = re.compile(
     rf"(?<![\w.^/-])-?\d[\d,]*(?:\.\d+(?:e-?\d+)?(?![\w.]*\.\d)| (?=(?:to|and) \d[\d,.]* {UNIT})| {UNIT})"
@@ -49,9 +44,9 @@ def stated(page: Path) -> list[dict[str, Any]]:
 def numbers(value: Any) -> Iterator[float]:
     """All numbers in a result, those in its texts included."""
     if isinstance(value, dict | list):
-        inner = [one for key, one in value.items() if key not in ABOUT] if isinstance(value, dict) else value
-        for one in inner:
-            yield from numbers(one)
+        inner = [entry for key, entry in value.items() if key not in ABOUT] if isinstance(value, dict) else value
+        for entry in inner:
+            yield from numbers(entry)
     elif isinstance(value, str):
         yield from (float(one) for one in re.findall(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?", value.replace(",", "")))
     elif isinstance(value, int | float) and not isinstance(value, bool):
@@ -69,7 +64,7 @@ def unfounded(text: str, found: list[float]) -> list[str]:
     return missing
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(CHECKOUT)))
+@pytest.mark.parametrize("page", PAGES, ids=PAGE_NAMES)
 def test_figures_have_a_source(page):
     left = prose(page.read_text(encoding="utf-8"))
     for entry in stated(page):
@@ -77,10 +72,9 @@ def test_figures_have_a_source(page):
         assert text in left, f"no longer in {page.name}: {text}"
         left = left.replace(text, "…", 1)
         if "result" in entry:
-            files = [
-                RESULTS / name for name in ([entry["result"]] if isinstance(entry["result"], str) else entry["result"])
-            ]
-            found = [number for file in files for number in numbers(json.loads(file.read_text(encoding="utf-8")))]
+            names = [entry["result"]] if isinstance(entry["result"], str) else entry["result"]
+            results = [json.loads((RESULTS / name).read_text(encoding="utf-8")) for name in names]
+            found = [number for result in results for number in numbers(result)]
             assert unfounded(text, found) == [], f"not in {entry['result']}: {text}"
         else:
             assert entry["is"] in KINDS, entry

@@ -10,14 +10,12 @@ from typing import Any
 
 import pytest
 import yaml
-from documents import blocks
+from documents import CHECKOUT, DOCS, blocks
 
 import wrf_mi
 from wrf_mi import models
 from wrf_mi.graph import receivers
 
-CHECKOUT = Path(__file__).resolve().parents[2]
-DOCS = CHECKOUT / "docs"
 WORKFLOWS = sorted((CHECKOUT / ".github" / "workflows").glob("*.yml"))
 PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+")
 MINUTES = re.compile(r"^(wrf-mi train .+?) --out \S+\s+# ([\d.]+) min$", re.MULTILINE)

@@ -145,7 +145,9 @@ def test_derivatives(blending, with_walls):
     weight = [Float64(rng.standard_normal(rays)) for _ in range(2)]
 
     def on_columns(arrays: dict[str, np.ndarray]) -> dict[str, list[Any]]:
-        return {name: [Float64(column.copy()) for column in array.T] for name, array in arrays.items()}
+        columns = {name: [Float64(column.copy()) for column in array.T] for name, array in arrays.items()}
+        dr.make_opaque(columns)  # one kernel for all values
+        return columns
 
     def loss(p: dict[str, list[Any]]) -> Any:
         of_gaussians = {name: p[name] for name in ("position", "scale", "rotation", "signal")}
