@@ -1,17 +1,20 @@
-"""What comes from NumPy is Dr.Jit's own: nothing is read beyond its end, nothing is wrapped elsewhere."""
+"""What comes from NumPy is Dr.Jit's own, not read beyond its end; recordings and sums where threads change."""
 
 import ast
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from wrf_mi.backend.device import ALIGNED_BYTES, PACKET, on_device, to_tensor, to_vectors, with_room
+from wrf_mi.backend import set_threads
+from wrf_mi.backend.device import ALIGNED_BYTES, PACKET, Recorded, on_device, to_tensor, to_vectors, with_room
 
 SIZES = (0, 1, 5, 16, 1000, 70_001)
 ROOT = Path(__file__).parents[2]
@@ -87,3 +90,47 @@ def test_only_the_device_module_wraps_numpy():
         calls = (node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call))
         found += [f"{path.name}:{call.lineno}: {code}" for call in calls if wraps(code := ast.unparse(call))]
     assert not found
+
+
+TERMS, SUMS = 1 << 20, 4096
+CALLS = 30
+"""On four threads, most calls went wrong while sums had room for one."""
+
+
+def sums(value: Any) -> Any:
+    """[SUMS] sums of TERMS / SUMS equal terms."""
+    found = dr.zeros(mi.Float, SUMS)
+    dr.scatter_reduce(
+        dr.ReduceOp.Add, found, value + dr.zeros(mi.Float, TERMS), dr.arange(mi.UInt32, TERMS) & (SUMS - 1)
+    )
+    return found
+
+
+def always(call: Callable[[], Any]) -> None:
+    """Each call gives the sums of ones."""
+    for _ in range(CALLS):
+        np.testing.assert_array_equal(call().numpy(), TERMS / SUMS)
+
+
+def test_functions_are_recorded_again_for_more_threads():
+    recorded, one = Recorded(sums), dr.opaque(mi.Float, 1)
+    set_threads(1)
+    always(lambda: recorded(one))
+    assert recorded.frozen.n_recordings == 1
+    set_threads(4)
+    always(lambda: recorded(one))
+    assert recorded.frozen.n_recordings == 1
+    set_threads(2)
+    always(lambda: recorded(one))
+    assert recorded.frozen.n_recordings == 1
+
+
+@pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1)])
+def test_pending_sums_are_evaluated_before_threads_change(before, after):
+    def waited() -> Any:
+        set_threads(before)
+        found = sums(mi.Float(1))
+        set_threads(after)
+        return found
+
+    always(waited)

@@ -10,17 +10,7 @@ from documents import CHECKOUT, marked
 from wrf_mi_bench import bench as bench_module
 from wrf_mi_bench import scene as bench_scene
 from wrf_mi_bench import sources
-from wrf_mi_bench.bench import (
-    CASES,
-    CHECKS,
-    BenchFailed,
-    bench,
-    case_folder,
-    check_table,
-    own_table,
-    read_results,
-    table,
-)
+from wrf_mi_bench.bench import CASES, CHECKS, BenchFailed, bench, case_folder, check_table, read_results
 from wrf_mi_bench.check import main
 from wrf_mi_bench.stress_rows import FITS, STAGES, stages
 from wrf_mi_bench.table_pages import fronts, read_points
@@ -61,7 +51,7 @@ def test_table_has_a_line_for_each_result_in_the_order_of_the_cases(tmp_path):
         (tmp_path / f"{case}.json").write_text(json.dumps(result(case, median)))
     trained = read_results(tmp_path)[0]
     assert [r["case"] for r in trained] == ["wrf-gs+-paper", "demo"]
-    lines = table(trained).splitlines()
+    lines = bench_module.table(trained).splitlines()
     assert len(lines) == 4
     cells = "WRF-GS+, L = 9 as the paper | **0.910** | 0.800 | 0.700 | 0.950 | 0.978 | 1,234 | 1.5 min | 8.5 | 346 MB"
     assert lines[2] == f"| {cells} |"
@@ -132,9 +122,12 @@ def test_documents_show_the_stored_results():
     trained, checked = read_results(RESULTS)
     for row in checked:
         if page := ON_PAGE.get(row["case"]):
-            assert f"<!-- {row['case']} -->\n{own_table(row)}\n<!-- /" in (CHECKOUT / "docs" / page).read_text()
+            assert (
+                f"<!-- {row['case']} -->\n{bench_module.own_table(row)}\n<!-- /"
+                in (CHECKOUT / "docs" / page).read_text()
+            )
     others = [row for row in checked if row["case"] not in ON_PAGE]
-    for name, text in (("figures", table(trained)), ("checks", check_table(others))):
+    for name, text in (("figures", bench_module.table(trained)), ("checks", check_table(others))):
         assert text in marked("docs/results.md", name)
     rows = fronts(read_points(RESULTS / "tables"))
     shown = check_table([{"title": CHECKS["pareto"].title, "figures": {"rows": rows}}])

@@ -1,31 +1,25 @@
-"""How calls are timed, split and compared, on calls whose cost is known; exponents of growth; times of a GPU."""
+"""How calls are timed, split and compared, on calls of known cost; growth; work of a training step; times of a GPU."""
 
 import itertools
 import json
 import os
 import sys
 import time
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from wrf_mi_bench import gpu, gpu_job, timing
+from small_fits import official, settings
+from wrf_mi_bench import gpu, gpu_job, timing, training
 from wrf_mi_bench.bench import all_here
 from wrf_mi_bench.check import main as check_main
 from wrf_mi_bench.scaling import Axis, rows, scale, verdict
-from wrf_mi_bench.timing import (
-    Interval,
-    bootstrap,
-    exponent,
-    history_of,
-    interleaved,
-    larger_half,
-    memory_mb,
-    n_log_n,
-    ratio,
-)
+from wrf_mi_bench.timing import Interval, bootstrap, exponent, interleaved, larger_half, memory_mb, ratio
 from wrf_mi_scenes.divided import cluttered_room, divided_room
+
+from wrf_mi.training.trainer import Trainer
 
 BUSY_S = 0.02
 ARRAY_MB = 64
@@ -89,10 +83,10 @@ def test_what_slows_both_calls_leaves_their_ratio(clock):
 
 
 def test_history_holds_the_kernels_of_a_call():
-    total_ms, history = history_of(busy)
+    total_ms, history = timing.history_of(busy)
     assert total_ms >= 1e3 * BUSY_S
     assert history == []
-    total_ms, (kernel,) = history_of(lambda: dr.sin(dr.arange(mi.Float, 3_000_000) + 1.25))
+    total_ms, (kernel,) = timing.history_of(lambda: dr.sin(dr.arange(mi.Float, 3_000_000) + 1.25))
     assert kernel["cache_hit"]
     assert 0 < kernel["execution_time"] <= total_ms
 
@@ -164,7 +158,7 @@ def test_growth_beyond_n_log_n_is_reported(clock):
         growth = scale(axis(power))
         assert growth["sizes"] == [10, 100, 1000, 10000]
         assert rows([growth])[0]["asked"].endswith(f": {said}")
-    assert verdict(Interval(1.1, 1.0, 1.3), n_log_n([100, 1000])) == "holds within its interval"
+    assert verdict(Interval(1.1, 1.0, 1.3), timing.n_log_n([100, 1000])) == "holds within its interval"
     # What would take too long is left out, and said.
     slow = scale(axis(2.0), call_s=1e-3)
     assert slow["left_out"] == [1000, 10000]
@@ -197,3 +191,75 @@ def test_rows_have_the_times_of_both(monkeypatch, tmp_path):
     lines = gpu.table(json.loads(json.dumps(measured))).splitlines()
     assert lines[2].startswith("| splatting, 20 Gaussians | ")
     assert len(lines) == 2 + len(expected)
+
+
+SMALL = ("network.width=16", "network.layers=2", "encoding.tx_octaves=3", "encoding.position_octaves=2", "steps=1000")
+ONCE = training.FORWARD + training.BACKWARD
+
+
+def test_operations_follow_from_the_shapes(one_gateway):
+    """WRF-GS+ of 8 Gaussians, two layers of 16 that both see 12 and 18 numbers, nine outputs."""
+    trainer, n, width = Trainer(one_gateway, official(one_gateway), settings(*SMALL)), 8, 16
+    encoded = 2 * (2 * width * 12 * n + 2 * width * 18)  # twice: encodings have no derivative
+    hidden, heads = 3 * 2 * width * width * n, 3 * 2 * 9 * width * n
+    assert training.work_of(trainer).network_gflop * 1e9 == pytest.approx(2 * encoded + hidden + heads, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("model", "walks"),
+    [("wrf-gs+", 4 * ONCE), ("factorised", ONCE + 3 * (training.SHARED_FORWARD + training.SHARED_BACKWARD))],
+)
+def test_static_geometry_is_walked_once_per_batch(model, walks, one_gateway):
+    one, four = (
+        training.work_of(
+            Trainer(one_gateway, official(one_gateway), settings("steps=9", f"batch={batch}", model=model))
+        )
+        for batch in (1, 4)
+    )
+    assert four.splat_gflop / one.splat_gflop == pytest.approx(walks / ONCE)
+    assert one.splat_gflop > 0
+    assert one.moved_gb < four.moved_gb < 4 * one.moved_gb
+
+
+def test_shares_of_a_step_sum_to_one(one_gateway):
+    trainer = Trainer(one_gateway, official(one_gateway), settings(*SMALL))
+    of_step = training.shares(training.some_steps(trainer, 3))
+    assert trainer.state.step == 6
+    assert sum(of_step.values()) >= 1 - 1e-9
+    assert min(of_step.values()) >= 0
+    assert of_step[training.PRODUCTS] > 0
+    assert of_step[training.WALKS] > 0
+
+
+def test_reference_calls_compute_a_product_and_a_copy():
+    rng = np.random.default_rng(0)
+    a, b = (rng.standard_normal((32, 32)) for _ in range(2))
+    np.testing.assert_allclose(training.product_call(32)().numpy(), a @ b, atol=1e-4)
+    assert dr.width(training.stream_call(1000)()) == 1000
+
+
+def test_fit_of_a_subprocess_has_its_time_and_scores(monkeypatch):
+    def run_command(arguments: tuple[str, ...], folder: Path, where: str) -> None:
+        assert arguments == ("train", training.DATA, "--model", "wrf-gs")
+        folder.mkdir()
+        metrics = {"train_seconds": 9.0, "peak_memory_mb": 80.0, "ssim": {"median": 0.9}, "gaussians": 7, "steps": 3}
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+
+    monkeypatch.setattr(training, "run_command", run_command)
+    fit = training.fit("wrf-gs")
+    assert fit["processor_seconds"] >= 0
+    assert (fit["seconds"], fit["peak_memory_mb"], fit["gaussians"]) == (9.0, 80.0, 7)
+
+
+def test_lines_state_the_share_of_the_limit():
+    fit = {"seconds": 90.4, "processor_seconds": 170.0, "peak_memory_mb": 380.2, "ssim": {"median": 0.9731}}
+    work = {"network_gflop": 0.9, "splat_gflop": 0.1, "moved_gb": 0.02}
+    step = {"ms": {"value": 10.0, "low": 9.0, "high": 11.0}, "work": work, "shares": {"products of networks": 0.6}}
+    machine = {"product_gflop_s": 200.0, "stream_gb_s": 20.0}
+    lines = {line["what"]: line for line in training.rows({"wrf-gs+": fit}, {"WRF-GS+, 1": step}, machine)}
+    fitted = lines["WRF-GS+, fit to its final accuracy"]
+    assert fitted["value"] == "90 s, of processors 170 s; 380 MB; median SSIM 0.973"
+    assert fitted["asked"] == "180 s, 2048 MB"
+    # 1 GFLOP at 200 GFLOP/s are 5 ms, 20 MB at 20 GB/s one.
+    assert lines["WRF-GS+, a step of 1 transmitter"]["value"].endswith("at least 5.00 ms, 50 %")
+    assert lines["WRF-GS+, a step of 1 transmitter: where its time goes"]["value"] == "products of networks 60 %"

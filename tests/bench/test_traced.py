@@ -6,7 +6,7 @@ from wrf_mi_bench import traced as bench_traced
 pytestmark = pytest.mark.all_threads
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(6))
 def test_traced_equals_splatted_for_small_gaussians(seed):
     """Gaussians of up to 2 degrees and axes up to 2 : 1, one on the zenith, one on the seam; random poses."""
     for blending in bench_traced.BLENDINGS:

@@ -5,15 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
-from wrf_mi_bench.field_oracle import (
-    blend_alpha,
-    blend_product,
-    covariance_matrix,
-    footprint,
-    project,
-    render,
-    tangent_basis,
-)
+from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.core import Receiver, azimuth_elevation, pixel_directions, rotation_matrix, unit_vectors
 from wrf_mi.core.angles import FloatArray
@@ -50,7 +42,7 @@ def at(azimuth_deg, elevation_deg):
 
 def single(direction, depth_m, scale_m, quaternion=PLAIN):
     """Projection of one Gaussian; ``scale_m`` a number or three."""
-    return project(np.atleast_2d(direction) * depth_m, np.broadcast_to(scale_m, (1, 3)), quaternion, ORIGIN)
+    return oracle.project(np.atleast_2d(direction) * depth_m, np.broadcast_to(scale_m, (1, 3)), quaternion, ORIGIN)
 
 
 def random_field(rng, n):
@@ -65,7 +57,7 @@ def random_field(rng, n):
 
 
 def image_of(field, receiver=ORIGIN, size=(9, 36), **blending):
-    return render(**field, receiver=receiver, directions=pixel_directions(*size), **blending)
+    return oracle.render(**field, receiver=receiver, directions=pixel_directions(*size), **blending)
 
 
 def random_delta(rng, n):
@@ -88,7 +80,9 @@ def test_isotropic_gaussian_has_the_closed_form(centre_deg, scale_m, depth_m):
     tangent_squared = np.maximum(1 / cosine**2 - 1, 0)
     squared = tangent_squared / ((scale_m / depth_m) ** 2 + LOW_PASS_RAD**2)
     expected = np.where((cosine > MIN_COSINE) & (squared < CUTOFF**2), np.exp(-squared / 2), 0)
-    assert footprint(single(at(*centre_deg), depth_m, scale_m), 0, directions) == pytest.approx(expected, abs=POSED)
+    assert oracle.footprint(single(at(*centre_deg), depth_m, scale_m), 0, directions) == pytest.approx(
+        expected, abs=POSED
+    )
 
 
 def test_footprint_is_cut_at_three_standard_deviations():
@@ -96,7 +90,7 @@ def test_footprint_is_cut_at_three_standard_deviations():
     gaussian = single([1, 0, 0], 1.0, np.sqrt(sigma**2 - LOW_PASS_RAD**2))
     for factor, expected in [(2.999, np.exp(-(2.999**2) / 2)), (3.001, 0.0)]:
         azimuth = np.degrees(np.arctan(factor * sigma))
-        assert footprint(gaussian, 0, at(azimuth, 0)) == pytest.approx(expected, abs=EXACT)
+        assert oracle.footprint(gaussian, 0, at(azimuth, 0)) == pytest.approx(expected, abs=EXACT)
 
 
 def test_footprint_axes_follow_the_gaussian_axes():
@@ -111,7 +105,7 @@ def test_footprint_axes_follow_the_gaussian_axes():
 def test_covariance_is_that_of_sampled_directions():
     rng, mean = np.random.default_rng(0), np.array([1.0, 2.0, 3.0])
     scale, quaternion = np.array([[0.01, 0.03, 0.02]]), rng.standard_normal((1, 4))
-    projected = project(mean[None], scale, quaternion, ORIGIN)
+    projected = oracle.project(mean[None], scale, quaternion, ORIGIN)
     points = mean + rng.standard_normal((200_000, 3)) * scale @ rotation_matrix(quaternion[0]).T
     plane = points @ projected.basis[0].T / (points @ projected.direction[0])[:, None]
     expected = projected.covariance[0] - LOW_PASS_RAD**2 * np.eye(2)
@@ -120,34 +114,34 @@ def test_covariance_is_that_of_sampled_directions():
 
 def test_large_gaussian_does_not_reach_behind():
     directions = pixel_directions(30, 60)
-    reached = footprint(single([1, 0, 0], 1.0, 50.0), 0, directions) > 0
+    reached = oracle.footprint(single([1, 0, 0], 1.0, 50.0), 0, directions) > 0
     assert np.array_equal(reached, directions[..., 0] > MIN_COSINE)
 
 
 def test_only_gaussians_nearer_than_the_limit_are_skipped():
     near, far = single([0, 0, 1], NEAR_M * 0.999, 1.0), single([0, 0, 1], NEAR_M * 1.001, 1.0)
     assert len(near.order) == 0
-    assert not footprint(near, 0, pixel_directions(10, 10)).any()
-    assert footprint(far, 0, at(0, 90)) == pytest.approx(1, abs=EXACT)
-    at_receiver = project(np.zeros((1, 3)), np.ones((1, 3)), PLAIN, ORIGIN)
+    assert not oracle.footprint(near, 0, pixel_directions(10, 10)).any()
+    assert oracle.footprint(far, 0, at(0, 90)) == pytest.approx(1, abs=EXACT)
+    at_receiver = oracle.project(np.zeros((1, 3)), np.ones((1, 3)), PLAIN, ORIGIN)
     assert len(at_receiver.order) == 0
 
 
 def test_centre_below_the_horizon_reaches_above_it():
-    image = footprint(single(at(30, -3), 1.0, 0.1), 0, pixel_directions(90, 360))
+    image = oracle.footprint(single(at(30, -3), 1.0, 0.1), 0, pixel_directions(90, 360))
     assert image.max() == image[0, 30] > 0.8
 
 
 def test_footprint_is_round_at_the_zenith_and_crosses_it_nearby():
-    overhead = footprint(single([0, 0, 1], 1.0, 0.1), 0, pixel_directions(90, 360))
+    overhead = oracle.footprint(single([0, 0, 1], 1.0, 0.1), 0, pixel_directions(90, 360))
     assert np.ptp(overhead, axis=1) == pytest.approx(0, abs=EXACT)
-    beyond = footprint(single(at(10, 88), 1.0, 0.1), 0, at(190, 88))
+    beyond = oracle.footprint(single(at(10, 88), 1.0, 0.1), 0, at(190, 88))
     assert beyond == pytest.approx(np.exp(-(np.tan(np.radians(4)) ** 2) / (0.01 + LOW_PASS_RAD**2) / 2), abs=EXACT)
 
 
 def test_tangent_basis_is_orthonormal_everywhere():
     directions = np.concatenate([pixel_directions(7, 12).reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]])
-    frame = np.concatenate([directions[:, None], tangent_basis(directions)], axis=1)
+    frame = np.concatenate([directions[:, None], oracle.tangent_basis(directions)], axis=1)
     assert frame @ np.swapaxes(frame, 1, 2) == pytest.approx(np.broadcast_to(np.eye(3), frame.shape), abs=EXACT)
     assert np.linalg.det(frame) == pytest.approx(1, abs=EXACT)
 
@@ -205,8 +199,10 @@ def test_field_is_linear_in_the_signal(seed, factor, product):
 def test_blending_of_two_gaussians_matches_the_formula():
     g, s = np.array([0.8, 0.5]), np.array([1 + 2j, -3j])
     delta, opacity = np.array([0.5j, 0.3]), np.array([0.9, 0.4])
-    assert blend_product(g, s, delta) == pytest.approx(0.8 * s[0] + 0.5 * s[1] * (1 - 0.8 * (1 - 0.5j)), abs=EXACT)
-    assert blend_alpha(g, s, opacity) == pytest.approx(0.72 * s[0] + 0.2 * s[1] * (1 - 0.72), abs=EXACT)
+    assert oracle.blend_product(g, s, delta) == pytest.approx(
+        0.8 * s[0] + 0.5 * s[1] * (1 - 0.8 * (1 - 0.5j)), abs=EXACT
+    )
+    assert oracle.blend_alpha(g, s, opacity) == pytest.approx(0.72 * s[0] + 0.2 * s[1] * (1 - 0.72), abs=EXACT)
 
 
 @settings(max_examples=50, deadline=None)
@@ -215,14 +211,14 @@ def test_blending_rules_agree_in_limits(seed):
     rng = np.random.default_rng(seed)
     g, s, opacity = rng.uniform(0, 1, (7, 4)), rng.standard_normal(7) + 1j, rng.uniform(0, 1, 7)
     # Attenuation zero is opacity one; attenuation one hides nothing; full footprints are the paper's equations.
-    assert blend_product(g, s, np.zeros(7)) == pytest.approx(blend_alpha(g, s, np.ones(7)), abs=EXACT)
-    assert blend_product(g, s, np.ones(7)) == pytest.approx(s @ g, abs=1e2 * EXACT)
+    assert oracle.blend_product(g, s, np.zeros(7)) == pytest.approx(oracle.blend_alpha(g, s, np.ones(7)), abs=EXACT)
+    assert oracle.blend_product(g, s, np.ones(7)) == pytest.approx(s @ g, abs=1e2 * EXACT)
     delta = random_delta(rng, 7)
     paper = sum(np.prod(delta[:i]) * s[i] for i in range(7))
-    assert blend_product(np.ones(7), s, delta) == pytest.approx(paper, abs=EXACT)
+    assert oracle.blend_product(np.ones(7), s, delta) == pytest.approx(paper, abs=EXACT)
     # Weights of the alpha blend are a partition: equal signals give that signal times the opaque share.
     covered = 1 - np.prod(1 - opacity[:, None] * g, axis=0)
-    assert blend_alpha(g, np.full(7, 2j), opacity) == pytest.approx(2j * covered, abs=EXACT)
+    assert oracle.blend_alpha(g, np.full(7, 2j), opacity) == pytest.approx(2j * covered, abs=EXACT)
 
 
 def test_render_requires_exactly_one_blending_rule():
@@ -241,7 +237,7 @@ def test_papers_jacobian_is_the_derivative_of_the_pixel_coordinates():
         return np.array(azimuth_elevation(point)) * [180 / (2 * np.pi), 45 / (np.pi / 2)]
 
     jacobian = np.stack([(pixels(centre + e) - pixels(centre - e)) / (2 * step) for e in step * np.eye(3)], axis=1)
-    sigma = covariance_matrix(rng.uniform(0.1, 1, (1, 3)), rng.standard_normal((1, 4)))
+    sigma = oracle.covariance_matrix(rng.uniform(0.1, 1, (1, 3)), rng.standard_normal((1, 4)))
     ours = paper_jacobian_covariance(centre[None], sigma, 45, 180)[0]
     assert ours == pytest.approx(jacobian @ sigma[0] @ jacobian.T, rel=1e-6)  # central differences in float64
 
@@ -252,16 +248,16 @@ def test_covariance_of_the_paper_is_stretched_in_azimuth(elevation_deg):
     rng = np.random.default_rng(2)
     mean = 3 * at(50, elevation_deg)[None]
     scale, quaternion = rng.uniform(0.01, 0.1, (1, 3)), rng.standard_normal((1, 4))
-    ours = project(mean, scale, quaternion, ORIGIN).covariance[0] - LOW_PASS_RAD**2 * np.eye(2)
+    ours = oracle.project(mean, scale, quaternion, ORIGIN).covariance[0] - LOW_PASS_RAD**2 * np.eye(2)
     stretch = np.diag([1 / np.cos(np.radians(elevation_deg)), 1]) * 180 / np.pi
-    paper = paper_jacobian_covariance(mean, covariance_matrix(scale, quaternion), 90, 360)[0]
+    paper = paper_jacobian_covariance(mean, oracle.covariance_matrix(scale, quaternion), 90, 360)[0]
     assert paper == pytest.approx(stretch @ ours @ stretch, rel=POSED)
 
 
 def both_footprints(elevation_deg, sigma_rad, directions):
     """Of a round Gaussian at azimuth 100: ours, and exp(-m^2 / 2) on the pixel plane with the paper's covariance."""
     centre = at(100, elevation_deg)
-    ours = footprint(single(centre, 2.0, 2.0 * np.sqrt(sigma_rad**2 - LOW_PASS_RAD**2)), 0, directions)
+    ours = oracle.footprint(single(centre, 2.0, 2.0 * np.sqrt(sigma_rad**2 - LOW_PASS_RAD**2)), 0, directions)
     covariance = paper_jacobian_covariance(2.0 * centre[None], (2.0 * sigma_rad) ** 2 * np.eye(3)[None], 90, 360)[0]
     azimuth, elevation = np.degrees(azimuth_elevation(directions))
     offset = np.stack([(azimuth + 80) % 360 - 180, elevation - elevation_deg], axis=-1)

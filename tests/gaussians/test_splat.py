@@ -1,4 +1,4 @@
-"""Splatting against the float64 oracle, and every gradient against finite differences."""
+"""Splatting against the float64 oracle, every gradient against finite differences, and batches that share geometry."""
 
 from typing import Any
 
@@ -6,17 +6,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from made_fields import Float64, device_gaussians, off_edges, oracle_image
+from made_fields import SIZE, Float64, device_gaussians, off_edges, oracle_image
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
-from wrf_mi.gaussians import FIELDS, Encoding, random_gaussians
-from wrf_mi.gaussians.blend import splat
+from wrf_mi.gaussians import FIELDS, Encoding, Factorised, Gaussians, WrfGs, WrfGsPlus, random_gaussians, tiles
+from wrf_mi.gaussians.blend import GROUP, group_size, splat
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 
 pytestmark = pytest.mark.all_threads
-
 FLOAT32_TOLERANCE = 1e-4
 """Relative L2 error of an image: float32 rounding of some ten operations, and pixels on the cut-off."""
 FLOAT64_TOLERANCE = 1e-12
@@ -27,13 +26,11 @@ cut-off, where the field jumps."""
 GRADIENT_TOLERANCE = 1e-6
 """Error of a derivative along a direction of standard normal numbers, relative to the gradient's norm: the standard
 deviation of such derivatives."""
-DIRECTIONS = 3
 SMALL: dict[str, Any] = {
     "wrf-gs": {"layers": 2, "width": 24, "signal_widths": (24, 12)},
     "wrf-gs+": {"layers": 3, "width": 24, "skip": 1},
 }
 """Networks for finite differences; test_encoding_and_networks.py has the derivatives of their layers."""
-
 Tensor64 = dr.tensor_t(Float64)
 RECEIVER = Receiver("r", np.array([5.0, 0.26, 0]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602]))
 
@@ -124,10 +121,72 @@ def test_gradients_match_finite_differences(model):
     params = {name: dr.detach(p) for name, p in params.items()}
     errors = {}
     for name, p in params.items():
-        for k in range(DIRECTIONS):
-            direction = rng.standard_normal(p.shape)
-            ends = [loss(params | {name: Tensor64(p.numpy() + s * STEP * direction)})[0] for s in (1, -1)]
-            numeric, analytic = (ends[0] - ends[1]) / (2 * STEP), float((gradient[name] * direction).sum())
-            errors[name, k] = abs(numeric - analytic) / np.linalg.norm(gradient[name])
+        direction = rng.standard_normal(p.shape)
+        ends = [loss(params | {name: Tensor64(p.numpy() + s * STEP * direction)})[0] for s in (1, -1)]
+        numeric, analytic = (ends[0] - ends[1]) / (2 * STEP), float((gradient[name] * direction).sum())
+        errors[name] = abs(numeric - analytic) / np.linalg.norm(gradient[name])
     # Comparisons with NaN, of a gradient that is NaN or vanishes, are false.
     assert all(error < GRADIENT_TOLERANCE for error in errors.values()), errors
+
+
+TOLERANCE = 1e-12
+"""Float64 sums of 60 Gaussians, and of as many pixels, in another order."""
+GATEWAY = Receiver("gateway1", np.array([5.0, 0.3, 0.0]), np.array([0.0, 0.6, 0.0, 0.8]))
+ENCODING = Encoding(2, 4.0, 2, 1.0)
+SHARED_FIELDS: dict[str, Any] = {
+    "wrf-gs": WrfGs(ENCODING, layers=2, width=16, signal_widths=(16, 8)),
+    "wrf-gs+": WrfGsPlus(ENCODING, layers=2, width=16, skip=1, static_geometry=True),
+    "factorised": Factorised(ENCODING, terms=4, layers=1, width=16),
+}
+
+
+def drawn(name: str, batch: int) -> tuple[dict[str, Any], Any]:
+    rng = np.random.default_rng(0)
+    weights = SHARED_FIELDS[name].init(random_gaussians([GATEWAY], 60, rng, size_deg=12.0), rng)
+    weights["rotation"] = rng.standard_normal(weights["rotation"].shape)
+    weights["log_scale"] = weights["log_scale"] + rng.normal(0, 0.3, weights["log_scale"].shape)
+    params = {key: Tensor64(np.asarray(value, float)) for key, value in weights.items()}
+    return params, Tensor64(rng.standard_normal((3, batch)))
+
+
+@pytest.mark.gradcheck
+@pytest.mark.parametrize("name", SHARED_FIELDS)
+@pytest.mark.parametrize("batch", [2, 5, 8])
+def test_shared_geometry_equals_repeated_geometry(name, batch):
+    """Spectra, and derivatives by every parameter; batches of half a group, of a prime number, of two groups."""
+    plane, rng = perception_plane(*SIZE, Float64), np.random.default_rng(3)
+    weight = [Float64(rng.standard_normal(batch * plane.pixels)) for _ in range(2)]
+    images, slopes = [], []
+    for repeated in (False, True):
+        params, tx_pos = drawn(name, batch)
+        dr.enable_grad(params)
+        gaussians: Gaussians = SHARED_FIELDS[name].gaussians(params, tx_pos)
+        assert gaussians.shared
+        gaussians = gaussians.spread() if repeated else gaussians
+        assert gaussians.shared != repeated
+        re, im = splat(gaussians, device_pose(GATEWAY, Float64), plane)
+        dr.backward(dr.sum(re * weight[0] + im * weight[1]))
+        images.append(np.concatenate([re.numpy(), im.numpy()]))
+        slopes.append({key: dr.grad(p).numpy().copy() for key, p in params.items()})
+    np.testing.assert_allclose(*images, atol=TOLERANCE * np.abs(images[1]).max())
+    for key, expected in slopes[1].items():
+        np.testing.assert_allclose(slopes[0][key], expected, atol=TOLERANCE * np.abs(expected).max(), err_msg=key)
+        assert expected.any(), key
+
+
+def test_counted_lists_give_the_same_image(monkeypatch):
+    """Counted lists of large fields serve all groups of transmitters."""
+    plane, images = perception_plane(*SIZE, Float64), []
+    params, tx_pos = drawn("factorised", 8)
+    gaussians = SHARED_FIELDS["factorised"].gaussians(params, tx_pos)
+    for reserved in (tiles.RESERVED, 1):
+        monkeypatch.setattr(tiles, "RESERVED", reserved)
+        images.append(splat(gaussians, device_pose(GATEWAY, Float64), plane)[0].numpy())
+    np.testing.assert_array_equal(*images)
+    assert images[0].any()
+
+
+def test_group_size_divides_the_batch():
+    sizes = [group_size(batch) for batch in range(1, 13)]
+    assert sizes == [1, 2, 3, 4, 1, 3, 1, 4, 3, 2, 1, 4]
+    assert max(sizes) == GROUP

@@ -4,21 +4,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import traced_fields
 import wrf_mi_plugins
 from made_fields import off_edges
-from traced_fields import (
-    RECEIVER,
-    any_field,
-    blended,
-    brute,
-    bundles_of,
-    complex_image,
-    film,
-    gaussians_of,
-    plane,
-    pose_of,
-    scene_of,
-)
+from traced_fields import RECEIVER, any_field, blended, complex_image, film, gaussians_of, plane, scene_of
 from wrf_mi_plugins import integrator as integrator_module
 from wrf_mi_plugins.sensor import equirectangular_sphere
 from wrf_mi_plugins.shape import gaussian_shape, shape_parameters
@@ -131,7 +120,7 @@ def test_derivatives_through_render(blending):
         blend: gaussians.attenuation or [gaussians.opacity],
     }
     dr.enable_grad(attached)
-    parts = brute(gaussians, pose_of(), bundles_of(pixel_directions(12, 40)))
+    parts = traced_fields.brute(gaussians, traced_fields.pose_of(), traced_fields.bundles_of(pixel_directions(12, 40)))
     dr.backward(sum(dr.sum(p * type(p)(weight[..., k].ravel())) for k, p in enumerate(parts)))
     for name, arrays in attached.items():
         expected = np.stack([dr.grad(a).numpy() for a in arrays], axis=1).ravel()

@@ -21,6 +21,7 @@ wrf_mi_plugins.register_all()
 SIONNA_TOLERANCE = 2e-5
 """Sionna RT computes the same coefficient in float32 from vertices some metres away."""
 FREQUENCY_HZ = 2.4e9
+PAINT = {"type": "diffuse", "id": "paint"}
 CARRIER = {"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ}
 BRICK = {"type": "twosided", "id": "mat-itu_brick", "bsdf": {"type": "diffuse"}}
 ROWS, COLUMNS = np.array([85, 60, 45, 70]), np.array([0, 30, 300, 180])
@@ -120,7 +121,8 @@ def test_only_walls_before_a_gaussian_attenuate_it():
 
 def test_derivative_by_wall_material(tmp_path):
     """Permittivity, conductivity and thickness of a radio material: backward against differences."""
-    scene = scene_at_wall(wall=sionna_wall(tmp_path).mi_scene.shapes()[0])
+    sionna_scene = sionna_wall(tmp_path)  # its materials live as long as it does
+    scene = scene_at_wall(wall=sionna_scene.mi_scene.shapes()[0])
     params = mi.traverse(scene)
     for name in ("eta_r", "sigma", "d"):
         key = next(key for key, _ in params if key.endswith(f".{name}"))
@@ -143,10 +145,7 @@ def test_derivative_by_wall_material(tmp_path):
     ("more", "text"),
     [
         ({"brick": BRICK, "wall": wall()}, "give frequency_hz, or set walls to false"),
-        (
-            {"wall": wall() | {"bsdf": {"type": "diffuse", "id": "paint"}}, "integrator": CARRIER},
-            "BSDF paint is no radio m",
-        ),
+        ({"wall": wall() | {"bsdf": PAINT}, "integrator": CARRIER}, "its BSDF paint is no radio material"),
         ({"brick": BRICK, "wall": wall(), "integrator": CARRIER | {"frequency_hz": 1e5}}, "mat-itu_brick at 100000 Hz"),
     ],
 )

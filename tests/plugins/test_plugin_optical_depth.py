@@ -62,29 +62,22 @@ def units(n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def oracle_extinction(values: dict[str, Any], x: np.ndarray, d: np.ndarray) -> float:
-    """The definition, written for reading: matrices and a loop."""
-    total = 0.0
-    for i in range(values["position"].shape[1]):
-        r = rotation_matrix(values["rotation"][:, i])
-        precision = r @ np.diag(values["scale"][:, i] ** -2.0) @ r.T
-        offset = x - values["position"][:, i]
-        square = offset @ precision @ offset
-        if square < CUTOFF**2:
-            weight = -np.log1p(-values["opacity"][i]) * np.sqrt(d @ precision @ d) / np.sqrt(2 * np.pi) / CENTRE_LINE
-            total += weight * np.exp(-square / 2)
-    return total
+    """The definition, with precision matrices."""
+    turn = rotation_matrix(values["rotation"].T)
+    precision = turn @ (np.swapaxes(turn, 1, 2) / values["scale"].T[:, :, None] ** 2)
+    offset = x - values["position"].T
+    square = np.einsum("ni,nij,nj->n", offset, precision, offset)
+    weight = -np.log1p(-values["opacity"]) * np.sqrt(d @ precision @ d) / np.sqrt(2 * np.pi) / CENTRE_LINE
+    return float(np.where(square < CUTOFF**2, weight * np.exp(-square / 2), 0).sum())
 
 
 def cut_offs(values: dict[str, Any], o: np.ndarray, d: np.ndarray) -> list[float]:
     """Distances at which a line enters or leaves a Gaussian's cut-off."""
-    edges: list[float] = []
-    for i in range(values["position"].shape[1]):
-        w = rotation_matrix(values["rotation"][:, i]).T / values["scale"][:, i][:, None]
-        p, q = w @ (o - values["position"][:, i]), w @ d
-        b, c = p @ q / (q @ q), (p @ p - CUTOFF**2) / (q @ q)
-        if b * b > c:
-            edges += [-b - np.sqrt(b * b - c), -b + np.sqrt(b * b - c)]
-    return edges
+    whiten = np.swapaxes(rotation_matrix(values["rotation"].T), 1, 2) / values["scale"].T[:, :, None]
+    p, q = np.einsum("nij,nj->ni", whiten, o - values["position"].T), whiten @ d
+    b, c = (p * q).sum(1) / (q * q).sum(1), ((p * p).sum(1) - CUTOFF**2) / (q * q).sum(1)
+    root = np.sqrt((b * b - c)[b * b > c])
+    return [*(-b[b * b > c] - root), *(-b[b * b > c] + root)]
 
 
 def test_closed_form_matches_the_integral():
