@@ -112,8 +112,8 @@ def plane(height: int = 12, width: int = 40, crop: dict[str, int] | None = None,
     return {"type": "wrf_perception_plane", "to_world": to_world, "film": film(height, width, **crop or {}), **more}
 
 
-def scene_of(gaussians: Gaussians, **more: Any) -> Any:
-    shape = {"gaussians": gaussian_shape(gaussians)}
+def scene_of(field: Gaussians, **more: Any) -> Any:
+    shape = {"gaussians": gaussian_shape(field)}
     return mi.load_dict({"type": "scene", "integrator": {"type": "wrf_traced"}, "sensor": plane()} | shape | more)
 
 

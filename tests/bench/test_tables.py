@@ -114,9 +114,8 @@ def test_rows_of_other_data_or_commands_are_measured_again_and_of_other_versions
         tables.tables(tmp_path, tmp_path / "runs")
         assert asked == [row.name for row in short_plan]
     assert "stored rows" not in capsys.readouterr().err
-    for row, changes in zip(
-        short_plan, ({"data": "other"}, {"versions": {"numpy": "0.1"}}, {"data": None}), strict=True
-    ):
+    older = {"data": "other"}, {"versions": {"numpy": "0.1"}}, {"data": None}
+    for row, changes in zip(short_plan, older, strict=True):
         change(row, **changes)
     tables.tables(tmp_path, tmp_path / "runs")
     assert asked[3:] == [short_plan[0].name]

@@ -83,16 +83,14 @@ def test_traced_hits_are_cached(monkeypatch):
     params, first = mi.traverse(scene), mi.render(scene).numpy()
     other = gaussians_of(any_field(30, seed=1), "alpha", mi.Float)
     for name, expected_calls in (("signal", 1), ("opacity", 1), ("data", 2)):
-        params[f"gaussians.{name}"] = shape_parameters(other)[name]
-        params.update()
+        params.update({f"gaussians.{name}": shape_parameters(other)[name]})
         again = mi.render(scene).numpy()
         assert len(calls) == expected_calls
     assert not np.allclose(first, again)
     np.testing.assert_array_equal(again, mi.render(scene_of(other)).numpy())
     calls.clear()
     pose = mi.AffineTransform4f(params["sensor.to_world"].matrix)
-    params["sensor.to_world"] = pose @ mi.AffineTransform4f().rotate([0, 0, 1], 9.0)  # one column
-    params.update()
+    params.update({"sensor.to_world": pose @ mi.AffineTransform4f().rotate([0, 0, 1], 9.0)})  # one column
     np.testing.assert_allclose(mi.render(scene).numpy(), np.roll(again, -1, axis=1), atol=1e-4)
     assert len(calls) == 1
 
@@ -145,8 +143,7 @@ def test_derivative_by_the_receiver_position():
     offset = dr.opaque(mi.Point3f, 0.0)
     dr.enable_grad(offset, params["gaussians.data"])
     pose = mi.AffineTransform4f(params["sensor.to_world"].matrix)
-    params["sensor.to_world"] = mi.AffineTransform4f().translate(offset) @ pose
-    params.update()
+    params.update({"sensor.to_world": mi.AffineTransform4f().translate(offset) @ pose})
     dr.backward(dr.sum(mi.render(scene, params) * weight, axis=None))
     of_positions = params["gaussians.data"].grad.numpy().reshape(20, 10)[:, :3]
     error = np.linalg.norm(offset.grad.numpy().ravel() + of_positions.sum(axis=0))

@@ -61,8 +61,7 @@ def test_parameters():
     height = mi.Float(3.0)
     dr.enable_grad(height)
     params["to_world"] = mi.AffineTransform4f().translate([0, 0, height])
-    params["film.size"] = [20, 5]
-    params.update()
+    params.update({"film.size": [20, 5]})
     ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.0, 0.0), mi.Point2f(0.5))
     dr.backward(ray.o.z * 2)
     assert height.grad == 2

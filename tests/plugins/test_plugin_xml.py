@@ -61,7 +61,8 @@ def as_dict(run: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=["wrf-gs", "wrf-gs+"])
 def run(request: pytest.FixtureRequest, one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_run(tmp_path_factory.mktemp("scene") / "runs" / "first", one_gateway, request.param)
+    encoding = "encoding.position_octaves=2", "encoding.tx_scale_m=3"
+    return write_run(tmp_path_factory.mktemp("scene") / "runs" / "first", one_gateway, request.param, *encoding)
 
 
 def numbers(scene: Any) -> dict[str, np.ndarray]:
@@ -90,8 +91,10 @@ def test_xml_and_dictionary_are_the_same_scene(run, monkeypatch, tmp_path):
 
 
 def test_shape_holds_the_gaussians_of_the_run_folder(run):
-    """The parameters of the fitted model, through the model that the configuration names."""
-    scene_numbers, trained = numbers(mi.load_dict(as_dict(str(run)))), open_run(run).field
+    """The parameters of the fitted model, through the model and the encoding that the configuration names."""
+    scene, trained = mi.load_dict(as_dict(str(run))), open_run(run).field
+    encoding, scene_numbers = scene.emitters()[0].source.field.encoding, numbers(scene)
+    assert (encoding.position_octaves, encoding.tx_scale_m) == (2, 3.0)
     params = {name: to_tensor(values) for name, values in trained.params.items()}
     gaussians = trained.field.gaussians(params, to_tensor(np.array(TX)[:, None]))
     for name, values in shape_parameters(gaussians).items():
@@ -111,14 +114,6 @@ def test_bad_runs_are_named(run, tmp_path):
             mi.load_dict({"type": "wrf_gaussian_emitter", "run": str(folder), "tx_position": list(TX)})
     with pytest.raises(RuntimeError, match="no tx_position; give x, y, z in metres"):
         mi.load_dict({"type": "wrf_gaussian_emitter", "run": str(run)})
-
-
-def test_settings_of_the_encoding_are_kept(one_gateway, tmp_path):
-    """A run says which encoding its networks expect."""
-    folder = write_run(tmp_path / "run", one_gateway, "wrf-gs+", "encoding.position_octaves=2", "encoding.tx_scale_m=3")
-    emitter = mi.load_dict({"type": "wrf_gaussian_emitter", "run": str(folder), "tx_position": list(TX)})
-    encoding = emitter.source.field.encoding
-    assert (encoding.position_octaves, encoding.tx_scale_m) == (2, 3.0)
 
 
 def child(code: str) -> str:
@@ -218,8 +213,7 @@ def test_traced_scene(names):
     assert np.abs(field - moved).max() > 1e-3
     _, of_xml, of_dict, _, _ = names["scenes"]
     params = mi.traverse(of_xml)
-    params["transmitter.tx_position"] = mi.Point3f(0.5, -0.6, 1.0)
-    params.update()
+    params.update({"transmitter.tx_position": mi.Point3f(0.5, -0.6, 1.0)})
     np.testing.assert_allclose(plain(mi.render(of_xml)), field, atol=1e-6)
     np.testing.assert_allclose(plain(mi.render(of_dict)), field, atol=1e-6)
 
@@ -232,8 +226,7 @@ def test_documented_gradient_by_the_transmitter(names):
 
     def power(distance_m: float) -> float:
         where = start + distance_m * direction
-        params["transmitter.tx_position"] = mi.Point3f(*where.tolist())
-        params.update()
+        params.update({"transmitter.tx_position": mi.Point3f(*where.tolist())})
         return float((plain(mi.render(names["scenes"][2])) ** 2).mean())
 
     # Pixels that cross a Gaussian's edge on the way, at a hundredth of its peak, have no derivative.

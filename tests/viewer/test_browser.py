@@ -112,14 +112,12 @@ def test_views_need_no_network_and_answer_their_controls(browser, tmp_path, size
     # The scene is drawn: neither text nor background has colours.
     part = tab.picture()[60 : size[1] // 2 + 100, : size[0] * 2 // 3].reshape(-1, 3).astype(int)
     assert (np.ptp(part, axis=1) > 40).mean() > 0.02
-    seen = tab.run(CONTROLS)
-    assert seen.pop("chosen").startswith("row 15, SSIM 0.")
-    ceiling = [3, 6, 6]
-    assert seen == {"heights": [1.5], "direct": [3], "fewer": [3, 6, 2 * ELLIPSOID], "ceiling": ceiling}
+    shown = tab.run(CONTROLS)
+    assert shown.pop("chosen").startswith("row 15, SSIM 0.")
+    assert shown == {"heights": [1.5], "direct": [3], "fewer": [3, 6, 2 * ELLIPSOID], "ceiling": [3, 6, 6]}
     assert tab.complaints() == []
-    assert [url for url in tab.requests() if not url.startswith(("data:", "blob:"))] == [
-        (tmp_path / "view.html").as_uri()
-    ]
+    requests = [url for url in tab.requests() if not url.startswith(("data:", "blob:"))]
+    assert requests == [(tmp_path / "view.html").as_uri()]
     tab.close()
 
 
@@ -133,15 +131,11 @@ def test_channels_are_drawn_over_subcarriers(browser, tmp_path):
 
 def test_a_map_alone_is_seen_from_further_back(browser, tmp_path):
     """Plotly draws flat scenes wider than rooms: their corners would lie outside the picture."""
-    whole = made_view()
-    low = whole.receivers_m * [1, 1, 0] + [0, 0, 0.5]
-    flat = replace(whole, receivers_m=low, scene=None, gaussians=None, paths=None, rows=None, maps=whole.maps[:1])
-    away = []
-    for number, content in enumerate((whole, flat)):
-        (tmp_path / str(number)).mkdir()
-        (tmp_path / str(number) / "view.html").write_text(page(content))
-        tab = browser.open(tmp_path / str(number) / "view.html", *LAPTOP)
-        assert tab.run(READY)
+    view, away = made_view(), []
+    low = view.receivers_m * [1, 1, 0] + [0, 0, 0.5]
+    flat = replace(view, receivers_m=low, scene=None, gaussians=None, paths=None, rows=None, maps=view.maps[:1])
+    for content in (view, flat):
+        tab, _ = opened(browser, tmp_path, content, LAPTOP)
         away.append(tab.run(EYE))
         assert tab.complaints() == []
         tab.close()
