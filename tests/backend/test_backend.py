@@ -48,10 +48,18 @@ def good_if(*versions: tuple[int, ...]):
     """Stands in for the trial: only these versions work."""
 
     def verdict(library: libraries.LlvmLibrary, *, fresh: bool = False) -> probe.Verdict:
-        usable = library.version in versions
-        return probe.Verdict(usable, "" if usable else "does not work", ".".join(map(str, library.version)))
+        reason = "" if library.version in versions else "does not work"
+        return probe.Verdict(not reason, reason, ".".join(map(str, library.version)))
 
     return verdict
+
+
+def refusal(name: str = "llvm") -> str:
+    """The one line with which a backend is refused."""
+    with pytest.raises(BackendError) as caught:
+        backend.choose(name)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def real_llvm(major: int) -> libraries.LlvmLibrary:
@@ -88,13 +96,9 @@ def test_version_round_trips_through_a_file_name(major, minor, patch):
 def test_newest_first_each_file_once(only):
     folder = only("libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM.so.9.1", "libLLVM-19.1.7.so", "libLLVMCore.a")
     (folder / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
-    libraries_found = [(library.version, library.path.name) for library in backend.find_llvm()]
-    assert libraries_found == [
-        ((19, 1, 7), "libLLVM-19.1.7.so"),
-        ((19, 1), "libLLVM.so.19.1"),
-        ((14,), "libLLVM-14.so.1"),
-        ((9, 1), "libLLVM.so.9.1"),
-    ]
+    names = ["libLLVM-19.1.7.so", "libLLVM.so.19.1", "libLLVM-14.so.1", "libLLVM.so.9.1"]
+    assert [library.path.name for library in backend.find_llvm()] == names
+    assert [library.version for library in backend.find_llvm()] == [(19, 1, 7), (19, 1), (14,), (9, 1)]
 
 
 def test_variable_excludes_all_others(only, tmp_path, monkeypatch):
@@ -116,34 +120,23 @@ def test_newest_good_library_is_chosen(only, monkeypatch):
 def test_old_llvm_is_refused_without_a_trial(only, major, monkeypatch):
     only(f"libLLVM-{major}.so.1")
     monkeypatch.setattr(probe, "_run_trial", lambda *arguments: pytest.fail("an old LLVM was loaded"))
-    with pytest.raises(BackendError, match=rf"LLVM {major} .* is too old .*: .*install") as caught:
-        backend.choose("llvm")
-    assert "\n" not in str(caught.value)
+    assert re.search(rf"LLVM {major} .* is too old .*: .*install", refusal())
 
 
-@pytest.mark.parametrize(
-    ("names", "message"),
-    [([], r"no usable LLVM \(none was found\): .*install"), (["libLLVM.so.19.1"], r"LLVM 19\.1 .* fails")],
-)
-def test_missing_and_invalid_libraries_are_refused(names, message, only):
-    only(*names)
-    with pytest.raises(BackendError, match=message) as caught:
-        backend.choose("llvm")
-    assert "\n" not in str(caught.value)
-
-
-def test_variable_names_a_bad_library_and_a_good_one_exists(only, monkeypatch):
-    folder = only("libLLVM.so.19.1", "libLLVM-15.so.1")
+def test_missing_and_invalid_libraries_are_refused(only, monkeypatch):
+    only()
+    assert re.search(r"no usable LLVM \(none was found\): .*install", refusal())
+    folder = only("libLLVM.so.19.1")
+    assert re.search(r"LLVM 19\.1 .* fails", refusal())
+    only("libLLVM-15.so.1")
     monkeypatch.setenv(libraries.LLVM_VARIABLE, str(folder / "libLLVM-15.so.1"))
     monkeypatch.setattr(backend, "try_llvm", good_if((19, 1)))
-    with pytest.raises(BackendError, match=r"LLVM 15 .* does not work: unset it, LLVM 19\.1 .* works"):
-        backend.choose("llvm")
+    assert re.search(r"LLVM 15 .* does not work: unset it, LLVM 19\.1 .* works", refusal())
 
 
 def test_trial_reports_an_abort():
     verdict, final = probe._run_trial(backend.VARIANTS["llvm"], libraries.LLVM_VARIABLE, real_llvm(15).path)
-    assert final
-    assert not verdict.usable
+    assert (final, verdict.usable) == (True, False)
     assert re.search("(?=.*SIGABRT)(?=.*fminimum)(?!.*0x)", verdict.reason)
 
 
@@ -156,11 +149,10 @@ def test_verdicts_are_cached_until_the_file_changes(only, monkeypatch):
         return probe.Verdict(True, version="19.1.0"), True
 
     monkeypatch.setattr(probe, "_run_trial", trial)
-    library = backend.find_llvm()[0]
+    (library,) = backend.find_llvm()
     assert probe.try_llvm(library) == probe.try_llvm(library)
     assert len(trials) == 1
     probe.try_llvm(library, fresh=True)
-    assert len(trials) == 2
     os.utime(file, ns=(1, 1))
     probe.try_llvm(library)
     assert len(trials) == 3
@@ -264,16 +256,14 @@ def test_cuda_with_a_driver_that_does_not_load(tmp_path, monkeypatch):
     driver = tmp_path / "libcuda.so.1"
     driver.write_text("not a library")
     monkeypatch.setenv(libraries.CUDA_VARIABLE, str(driver))
-    with pytest.raises(BackendError, match=r"CUDA cannot be used, .*libcuda\.so\.1 fails: .* or use the backend llvm"):
-        backend.choose("cuda")
+    assert re.search(r"CUDA cannot be used, .*libcuda\.so\.1 fails: .* or use the backend llvm", refusal("cuda"))
     assert backend.choose("auto").name == "llvm"
 
 
 def test_cuda_without_a_device():
     if backend.find_cuda():
         pytest.skip("there is a GPU here")
-    with pytest.raises(BackendError, match="CUDA cannot be used, no NVIDIA driver"):
-        backend.choose("cuda")
+    assert "CUDA cannot be used, no NVIDIA driver" in refusal("cuda")
 
 
 @pytest.mark.gpu
@@ -281,10 +271,8 @@ def test_cuda_is_preferred_where_it_works():
     assert backend.choose("auto").name == "cuda"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [({"backend": "opencl"}, "backend: 'opencl' is none of"), ({"threads": 0}, "threads: must be at least 1, got 0")],
-)
-def test_arguments_are_checked(arguments, message):
-    with pytest.raises(InputError, match=message):
-        backend.init(**arguments)
+def test_arguments_are_checked():
+    with pytest.raises(InputError, match="backend: 'opencl' is none of"):
+        backend.init("opencl")
+    with pytest.raises(InputError, match="threads: must be at least 1, got 0"):
+        backend.init(threads=0)

@@ -42,11 +42,11 @@ print(*on_device(values, mi.Float).numpy())
 @pytest.mark.parametrize("kind", [mi.Float, mi.UInt32, mi.Int32, mi.Bool, mi.Float64])
 def test_values_are_copied(size, kind):
     values = np.arange(size) % 7 - (3 if kind in (mi.Float, mi.Int32, mi.Float64) else 0)
-    found = on_device(values, kind)
-    expected = values.astype(found.numpy().dtype)
+    array = on_device(values, kind)
+    expected = values.astype(array.numpy().dtype)
     values[:] = 0
-    np.testing.assert_array_equal(found.numpy(), expected)
-    assert found.state in (dr.VarState.Evaluated, dr.VarState.Invalid)
+    np.testing.assert_array_equal(array.numpy(), expected)
+    assert array.state in (dr.VarState.Evaluated, dr.VarState.Invalid)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -62,8 +62,8 @@ def test_wrapped_arrays_are_padded_by_a_packet(size):
 def test_shapes_and_columns():
     values = np.arange(12.0).reshape(4, 3)
     np.testing.assert_array_equal(to_tensor(values).numpy(), values)
-    np.testing.assert_array_equal(to_vectors(values, mi.Point3f).numpy(), values.T)
-    np.testing.assert_array_equal(to_vectors(values[::2, :2], mi.Vector2f).numpy(), values[::2, :2].T)
+    for rows, kind in ((values, mi.Point3f), (values[::2, :2], mi.Vector2f)):
+        np.testing.assert_array_equal(to_vectors(rows, kind).numpy(), rows.T)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="protects a page by Linux's C library")
@@ -85,11 +85,11 @@ def wraps(code: str) -> bool:
 def test_only_the_device_module_wraps_numpy():
     assert wraps("mi.Float(x.astype(np.float32))")
     assert not wraps("mi.UInt32(np.asarray(rows).tolist())")
-    found = []
+    wrapped = []
     for path in (path for package in PACKAGES for path in package.rglob("*.py") if path.name != OWN):
         calls = (node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call))
-        found += [f"{path.name}:{call.lineno}: {code}" for call in calls if wraps(code := ast.unparse(call))]
-    assert not found
+        wrapped += [f"{path.name}:{call.lineno}: {code}" for call in calls if wraps(code := ast.unparse(call))]
+    assert not wrapped
 
 
 TERMS, SUMS = 1 << 20, 4096
@@ -99,11 +99,9 @@ CALLS = 30
 
 def sums(value: Any) -> Any:
     """[SUMS] sums of TERMS / SUMS equal terms."""
-    found = dr.zeros(mi.Float, SUMS)
-    dr.scatter_reduce(
-        dr.ReduceOp.Add, found, value + dr.zeros(mi.Float, TERMS), dr.arange(mi.UInt32, TERMS) & (SUMS - 1)
-    )
-    return found
+    total, index = dr.zeros(mi.Float, SUMS), dr.arange(mi.UInt32, TERMS) & (SUMS - 1)
+    dr.scatter_reduce(dr.ReduceOp.Add, total, value + dr.zeros(mi.Float, TERMS), index)
+    return total
 
 
 def always(call: Callable[[], Any]) -> None:
@@ -114,23 +112,18 @@ def always(call: Callable[[], Any]) -> None:
 
 def test_functions_are_recorded_again_for_more_threads():
     recorded, one = Recorded(sums), dr.opaque(mi.Float, 1)
-    set_threads(1)
-    always(lambda: recorded(one))
-    assert recorded.frozen.n_recordings == 1
-    set_threads(4)
-    always(lambda: recorded(one))
-    assert recorded.frozen.n_recordings == 1
-    set_threads(2)
-    always(lambda: recorded(one))
-    assert recorded.frozen.n_recordings == 1
+    for threads in (1, 4, 2):
+        set_threads(threads)
+        always(lambda: recorded(one))
+        assert recorded.frozen.n_recordings == 1
 
 
 @pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1)])
 def test_pending_sums_are_evaluated_before_threads_change(before, after):
     def waited() -> Any:
         set_threads(before)
-        found = sums(mi.Float(1))
+        total = sums(mi.Float(1))
         set_threads(after)
-        return found
+        return total
 
     always(waited)

@@ -13,6 +13,7 @@ from wrf_mi_plugins.blend_rays import Walls, blend_rays
 from wrf_mi_plugins.ray_response import hulls, ray_footprints
 from wrf_mi_plugins.sensor import equirectangular_sphere
 
+from wrf_mi.backend.device import on_device
 from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import pixel_directions, rotation_matrix
 from wrf_mi.gaussians import Gaussians
@@ -144,8 +145,9 @@ def test_derivatives(blending, with_walls):
     weight = [Float64(rng.standard_normal(rays)) for _ in range(2)]
 
     def on_columns(arrays: dict[str, np.ndarray]) -> dict[str, list[Any]]:
-        columns = {name: [Float64(column.copy()) for column in array.T] for name, array in arrays.items()}
-        dr.make_opaque(columns)  # one kernel for all values
+        # Aligned, and opaque where they are single numbers: one kernel serves all values.
+        columns = {name: [on_device(column, Float64) for column in array.T] for name, array in arrays.items()}
+        dr.make_opaque(columns)
         return columns
 
     def loss(p: dict[str, list[Any]]) -> Any:

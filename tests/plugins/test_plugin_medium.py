@@ -141,16 +141,6 @@ def test_extinction_of_thin_needles_is_found():
     assert (depth >= -np.log1p(-np.resize(values["opacity"], 60)) * (1 - 1e-2)).all()
 
 
-def test_half_of_a_gaussian_that_contains_the_origin():
-    values = {"centers": np.zeros((1, 3)), "scales": np.full((1, 3), 2.0), "opacity": np.array([0.8])}
-    line = values["centers"], np.array([[0, 0.6, 0.8]])
-    medium_entry = medium_of(values | {"quaternions": np.array([[0, 0, 0, 1.0]])})
-    scene, medium = scene_of(medium_entry, sky={"type": "constant", "radiance": 1.0})
-    assert plain(medium.optical_depth(ray_of(*line))) == pytest.approx(-np.log(0.2) / 2, rel=FLOAT32_TOLERANCE)
-    mean = traced(scene, medium, *line, 1 << 15)
-    assert mean == pytest.approx(np.sqrt(0.2), abs=STANDARD_ERRORS * 0.5 / np.sqrt(1 << 15))
-
-
 def test_parameters_and_flags():
     params = mi.traverse(scene_of(medium_of(arrays()))[0])
     for name in ("centers", "scales", "quaternions", "opacity", "scale"):
