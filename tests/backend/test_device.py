@@ -111,10 +111,10 @@ def always(call: Callable[[], Any]) -> None:
 
 
 def test_functions_are_recorded_again_for_more_threads():
-    recorded, one = Recorded(sums), dr.opaque(mi.Float, 1)
+    recorded, term = Recorded(sums), dr.opaque(mi.Float, 1)
     for threads in (1, 4, 2):
         set_threads(threads)
-        always(lambda: recorded(one))
+        always(lambda: recorded(term))
         assert recorded.frozen.n_recordings == 1
 
 

@@ -98,10 +98,10 @@ def test_paths_of_the_made_scene_equal_those_of_the_room(tmp_path):
     end = Receiver("end", np.array([1.1, 1.3, 2.0]), np.array([0.0, 0.0, 0.0, 1.0]))
     options = TraceOptions(depth=2, rays=1 << 15)
     truth, ours = (trace_paths(open_scene(xml, 2.4e9), positions, end, options).paths for xml in (xml, scanned.xml))
-    found, matched = match(truth, ours)
+    recalled, matched = match(truth, ours)
     power, power_ours = truth.length_m**-2, ours.length_m**-2
     assert len(truth) > 100
-    assert power[found].sum() > 0.95 * power.sum()
+    assert power[recalled].sum() > 0.95 * power.sum()
     assert power_ours[matched].sum() > 0.95 * power_ours.sum()
 
 

@@ -189,7 +189,7 @@ def test_source_of_a_result_has_what_its_module_imports_and_the_models_that_it_n
     rows = [
         needed_files(*modules_of_command(f"wrf-mi train rfid-lab --model {name}".split())) for name in ("idw", "fire")
     ]
-    assert ["wrf_mi/models/uplink/fire.py" in one for one in rows] == [False, True]
+    assert ["wrf_mi/models/uplink/fire.py" in files for files in rows] == [False, True]
 
 
 def test_results_of_changed_source_are_listed(tmp_path, capsys):
@@ -228,5 +228,5 @@ def test_results_without_digest_are_compared_with_the_source_of_their_date(tmp_p
     dates = {"GIT_COMMITTER_DATE": f"{DATE}T12:00:00", "GIT_AUTHOR_DATE": f"{DATE}T12:00:00"}
     for words in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "one"]):
         subprocess.run([*git, *words], check=True, env={**os.environ, **dates})
-    found = {one["name"]: one["changed"] for one in stale(out)[0]}
-    assert found == {"flat-plan": ["wrf_mi/scene/plan"], "rooms": UNKNOWN}
+    changed = {result["name"]: result["changed"] for result in stale(out)[0]}
+    assert changed == {"flat-plan": ["wrf_mi/scene/plan"], "rooms": UNKNOWN}

@@ -210,15 +210,15 @@ def test_operations_follow_from_the_shapes(one_gateway):
     [("wrf-gs+", 4 * ONCE), ("factorised", ONCE + 3 * (training.SHARED_FORWARD + training.SHARED_BACKWARD))],
 )
 def test_static_geometry_is_walked_once_per_batch(model, walks, one_gateway):
-    one, four = (
+    single, batched = (
         training.work_of(
             Trainer(one_gateway, official(one_gateway), settings("steps=9", f"batch={batch}", model=model))
         )
         for batch in (1, 4)
     )
-    assert four.splat_gflop / one.splat_gflop == pytest.approx(walks / ONCE)
-    assert one.splat_gflop > 0
-    assert one.moved_gb < four.moved_gb < 4 * one.moved_gb
+    assert batched.splat_gflop / single.splat_gflop == pytest.approx(walks / ONCE)
+    assert single.splat_gflop > 0
+    assert single.moved_gb < batched.moved_gb < 4 * single.moved_gb
 
 
 def test_shares_of_a_step_sum_to_one(one_gateway):

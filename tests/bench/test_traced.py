@@ -12,10 +12,10 @@ def test_traced_equals_splatted_for_small_gaussians(seed):
     for blending in bench_traced.BLENDINGS:
         gaussians, receiver = bench_traced.random_field(seed, blending)
         traced, splatted = (f(gaussians, receiver) for f in (bench_traced.traced, bench_traced.splatted))
-        found = bench_traced.difference(traced, splatted)
-        assert found["ssim"] >= bench_traced.LOWEST_SSIM
-        assert found["magnitude_error"] <= bench_traced.LARGEST_ERROR
-        assert found["complex_error"] <= bench_traced.LARGEST_ERROR
+        differences = bench_traced.difference(traced, splatted)
+        assert differences["ssim"] >= bench_traced.LOWEST_SSIM
+        assert differences["magnitude_error"] <= bench_traced.LARGEST_ERROR
+        assert differences["complex_error"] <= bench_traced.LARGEST_ERROR
 
 
 def test_difference_grows_with_the_order_of_the_neglected_terms():
@@ -32,5 +32,5 @@ def test_difference_grows_with_the_order_of_the_neglected_terms():
 def test_integrator_is_as_fast_as_volprim_rf_basic():
     """10,000 Gaussians, 360 x 90 directions, hits found anew: not slower than ``volprim_rf_basic``."""
     for size in (1.0, 2.0):
-        found = bench_traced.pace(size, repeats=9)
-        assert found["stock_over_traced"] >= 1, found
+        pace = bench_traced.pace(size, repeats=9)
+        assert pace["stock_over_traced"] >= 1, pace

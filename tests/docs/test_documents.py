@@ -36,12 +36,11 @@ def undefined(scripts: Mapping[str, str], folder: Path) -> list[str]:
     command = ["ruff", "check", "--isolated", "--no-cache", "--select", "F821,F823", "--output-format", "concise", "."]
     done = subprocess.run([sys.executable, "-m", *command], cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode in (0, 1), done.stderr
-    return [line for line in done.stdout.splitlines() if re.match(r"[\w-]+\.py:", line)]
+    return [line for line in done.stdout.splitlines() if re.match(r"[\w.-]+\.py:", line)]
 
 
 def test_code_of_documents_defines_its_names(tmp_path):
-    scripts = {page.stem: script(page) for page in PAGES if script(page)}
-    assert len(scripts) == sum(1 for page in PAGES if script(page)) > 5
+    scripts = {name.replace("/", "-"): script(page) for name, page in zip(PAGE_NAMES, PAGES, strict=True)}
     assert undefined(scripts, tmp_path) == []
 
 
@@ -123,18 +122,18 @@ def numbers(value: Any) -> Iterator[float]:
         for entry in inner:
             yield from numbers(entry)
     elif isinstance(value, str):
-        yield from (float(one) for one in re.findall(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?", value.replace(",", "")))
+        yield from (float(number) for number in re.findall(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?", value.replace(",", "")))
     elif isinstance(value, int | float) and not isinstance(value, bool):
         yield float(value)
 
 
-def unfounded(text: str, found: list[float]) -> list[str]:
+def unfounded(text: str, figures: list[float]) -> list[str]:
     """Numbers of a text that no number of a result gives, rounded to their digits; a share may stand for per cent."""
     missing = []
     for shown in re.findall(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?:e-?\d+)?", text):
         number, decimals = float(shown.replace(",", "")), len(shown.partition("e")[0].partition(".")[2])
         half = 0.5 * 10.0**-decimals * (10 ** float(shown.partition("e")[2]) if "e" in shown else 1) * (1 + 1e-6)
-        if not any(abs(abs(one) * factor - number) <= half for one in found for factor in (1, 100)):
+        if not any(abs(abs(known) * factor - number) <= half for known in figures for factor in (1, 100)):
             missing.append(shown)
     return missing
 
@@ -149,8 +148,8 @@ def test_figures_have_a_source(page):
         if "result" in entry:
             names = [entry["result"]] if isinstance(entry["result"], str) else entry["result"]
             results = [json.loads((RESULTS / name).read_text(encoding="utf-8")) for name in names]
-            found = [number for result in results for number in numbers(result)]
-            assert unfounded(text, found) == [], f"not in {entry['result']}: {text}"
+            figures = [number for result in results for number in numbers(result)]
+            assert unfounded(text, figures) == [], f"not in {entry['result']}: {text}"
         else:
             assert entry["is"] in KINDS, entry
     left = LEVEL.sub("", left)

@@ -81,13 +81,13 @@ def test_minutes_of_the_papers_figures_are_the_stored_ones():
     for path in (CHECKOUT / "benchmarks" / "results" / "tables").glob("*-100-seed0.json"):
         row = json.loads(path.read_text())
         stored[row["command"]] = (row.get("train_seconds") or 0.0, row.get("wall_seconds") or 0.0)
-    found = MINUTES.findall((DOCS / "paper-figures.md").read_text(encoding="utf-8"))
-    assert len(found) >= 15
-    for command, minutes in found:
+    stated = MINUTES.findall((DOCS / "paper-figures.md").read_text(encoding="utf-8"))
+    assert len(stated) >= 15
+    for command, minutes in stated:
         words = [SCENES.get(word, word) for word in shlex.split(command)]
-        trained, whole = stored[" ".join(words)]
+        trained, of_command = stored[" ".join(words)]
         # Ray tracing is not trained: its minutes are those of the command.
-        assert float(minutes) == round((whole if "ray-tracing" in words else trained) / 60, 1), command
+        assert float(minutes) == round((of_command if "ray-tracing" in words else trained) / 60, 1), command
 
 
 def test_versions_agree():

@@ -40,7 +40,7 @@ def paper_encoding(t: np.ndarray, octaves: int) -> np.ndarray:
     return np.concatenate([np.sin(angle), np.cos(angle)])
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=12)
 @given(
     arrays(np.float64, st.tuples(st.just(3), st.integers(1, 9)), elements=st.floats(-100, 100)),
     st.integers(1, 10),
@@ -54,7 +54,7 @@ def test_encoding_matches_the_formula_of_the_paper(points, octaves, scale_m):
     np.testing.assert_allclose(encoded, expected, atol=FLOAT64_TOLERANCE * max(1.0, 1.0 / scale_m))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=12)
 @given(
     arrays(np.float64, 3, elements=st.floats(0, 60)),
     arrays(np.float64, 3, elements=st.floats(-100, 100)),

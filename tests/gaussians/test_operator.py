@@ -86,13 +86,10 @@ def test_weights_match_the_oracle(product):
 
 
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(seed=st.integers(0, 2**31), product=st.booleans(), height=st.integers(1, 12), width=st.integers(1, 40))
-def test_any_field_and_size(seed, product, height, width):
+@given(st.integers(0, 2**31), st.booleans(), st.sampled_from([(1, 1), (1, 40), (12, 1), (5, 23)]))
+def test_any_field_and_size(seed, product, size):
     gaussians, signal = hard(product, Float64, n=12, seed=seed)
-    weights, direct = (
-        operator_of(gaussians, (height, width), Float64).weights,
-        splatted(gaussians, (height, width), Float64),
-    )
+    weights, direct = operator_of(gaussians, size, Float64).weights, splatted(gaussians, size, Float64)
     np.testing.assert_allclose(weights @ signal, direct, atol=1e-12 * np.abs(signal).sum())
 
 

@@ -256,10 +256,10 @@ def test_documented_tables_match_the_plugins(name):
     lines = documented.splitlines()
     rules = [i for i, line in enumerate(lines) if line.strip().startswith("====")]
     first_column = slice(0, lines[rules[0]].index("= ") + 1)
-    own = [n for line in lines[rules[1] + 1 : rules[2]] for n in re.findall(r"``([^`]+)``", line[first_column])]
+    parameters = [n for line in lines[rules[1] + 1 : rules[2]] for n in re.findall(r"``([^`]+)``", line[first_column])]
     section = re.search(rf"^## {name}\n(.*?)(?=^## |\Z)", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     assert section is not None
     cells = [line.split(" | ")[0] for line in section[1].splitlines() if line.startswith("| `")]
     shown = [n for cell in cells for n in re.findall(r"`([^`]+)`", cell)]
-    assert shown == own
-    assert own
+    assert shown == parameters
+    assert parameters

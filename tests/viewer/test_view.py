@@ -143,7 +143,7 @@ def test_layers_of_two_runs_of_the_same_data_are_combined(traced, joint, field):
     np.testing.assert_array_equal(both.content.rows.score, read_run(traced).score)
     other = wrf_mi.view(traced, field).content
     assert other.gaussians is None
-    assert "field: of other data than the first run; only its scene is shown." in other.notes
+    assert "wrf-gs+: of other data than the first run; only its scene is shown." in other.notes
 
 
 def test_a_field_of_spectra_shows_them(field):
@@ -176,7 +176,7 @@ def test_representative_rows_span_the_scores():
     np.testing.assert_array_equal(representative(np.full((1, 4), np.nan), 2), [0])
 
 
-def test_maps_are_shown_with_their_heights(traced, tmp_path):
+def test_maps_are_shown_with_their_heights_and_thinned_where_they_are_large(traced, tmp_path):
     files = [write_map(tmp_path / f"at{height}.nc", height) for height in (0.5, 1.5)]
     content = wrf_mi.view(traced, *files).content
     assert content.counts["maps"] == 2
@@ -187,6 +187,11 @@ def test_maps_are_shown_with_their_heights(traced, tmp_path):
     assert shapes == {"power_dbm": (2, 3, 5), "best_receiver": (1, 3, 5)}
     assert first.receivers == ("anchor1", "anchor2") == tuple(wrf_mi.view(files[0]).content.receivers)
     assert any("spectrum not shown" in note for note in content.notes)
+    (thin,), notes = thinned([first], most=20)
+    assert len(notes) == 1
+    np.testing.assert_array_equal(thin.values["power_dbm"], first.values["power_dbm"][:, ::2, ::2])
+    np.testing.assert_array_equal(thin.x_m, first.x_m[::2])
+    assert thinned([first])[0] == [first]
 
 
 def test_maps_of_surfaces_and_datasets_are_points(tmp_path):
@@ -216,15 +221,6 @@ def test_a_chunk_that_ends_its_decompressor_is_refused_in_one_line(tmp_path):
     chunk.write_bytes(head.ljust(500, b"\1"))
     with pytest.raises(InputError, match=r"^\S+map\.zarr: its content is damaged; make the map anew$"):
         read_map(folder)
-
-
-def test_large_maps_are_thinned(tmp_path):
-    layer, _ = read_map(write_map(tmp_path / "map.nc"))
-    (thin,), notes = thinned([layer], most=20)
-    assert len(notes) == 1
-    np.testing.assert_array_equal(thin.values["power_dbm"], layer.values["power_dbm"][:, ::2, ::2])
-    np.testing.assert_array_equal(thin.x_m, layer.x_m[::2])
-    assert thinned([layer])[0] == [layer]
 
 
 def test_command_writes_one_file(traced, room, tmp_path, capsys):
