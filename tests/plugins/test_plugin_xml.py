@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import wrf_mi_plugins
-from documents import blocks
+from documents import DOCS, blocks
 from plugin_fields import plain, write_run
 from wrf_mi_plugins.shape import shape_parameters
 
@@ -178,7 +178,7 @@ print(abs(float(scene.shapes()[0].interior_medium().optical_depth(ray)[0]) - np.
     assert child(code).split() == ["True", "True"]
 
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
+PAGE = DOCS / "plugins.md"
 CLASSES = {
     "wrf_perception_plane": "sensor.PerceptionPlane",
     "wrf_traced": "integrator.TracedField",
@@ -196,13 +196,13 @@ def names(one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> dict
     write_run(folder / "runs" / "first", one_gateway, "wrf-gs+")
     (xml,) = blocks(PAGE, "xml")
     (folder / "scene.xml").write_text(xml)
-    found: dict[str, Any] = {"scenes": []}
+    left: dict[str, Any] = {"scenes": []}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for number, script in enumerate(blocks(PAGE, "python")):
-            exec(compile(script, f"{PAGE.name}, script {number}", "exec"), found)
-            found["scenes"].append(found.get("scene"))
-    return found
+            exec(compile(script, f"{PAGE.name}, script {number}", "exec"), left)
+            left["scenes"].append(left.get("scene"))
+    return left
 
 
 def test_traced_scene(names):
@@ -237,12 +237,10 @@ def test_powers_and_transmittance(names):
     powers = plain(names["powers"])
     assert powers.max() > 0.01
     assert powers.min() >= 0
-    scene, air = names["scenes"][4], names["air"]
-    picture = plain(names["transmittance"]).reshape(18, 72)
-    sensor = scene.sensors()[0]
-    where = (np.stack(np.meshgrid(np.arange(72), np.arange(18)), axis=-1).reshape(-1, 2) + 0.5) / [72, 18]
-    rays, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(where.T), mi.Point2f(0.5))
-    exact = np.exp(-plain(air.optical_depth(rays))).reshape(18, 72)
+    picture, sensor = plain(names["transmittance"]).reshape(18, 72), names["scenes"][4].sensors()[0]
+    pixels = (np.stack(np.meshgrid(np.arange(72), np.arange(18)), axis=-1).reshape(-1, 2) + 0.5) / [72, 18]
+    rays, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(pixels.T), mi.Point2f(0.5))
+    exact = np.exp(-plain(names["air"].optical_depth(rays))).reshape(18, 72)
     assert np.ptp(exact) > 0.1
     error = np.sqrt((exact * (1 - exact) / 64).sum()) / exact.size
     assert abs(picture.mean() - exact.mean()) < STANDARD_ERRORS * error
