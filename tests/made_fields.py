@@ -1,43 +1,78 @@
-"""Fields of Gaussians all around a receiver in float64, and their images, for tests of what may be left out."""
+"""Fields of Gaussians from arrays and all around a receiver, and their images by the oracle in float64."""
 
-from __future__ import annotations
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from wrf_mi_bench import field_oracle as oracle
 
-from wrf_mi.core import Receiver
-from wrf_mi.gaussians.blend import splat
+from wrf_mi.backend.device import on_device
+from wrf_mi.core import Receiver, pixel_directions
 from wrf_mi.gaussians.parameters import Gaussians
-from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 
 Float64 = dr.float64_array_t(mi.Float)
 RECEIVER = Receiver("r", np.array([0.3, -0.2, 0.1]), np.array([0.1, -0.3, 0.2, 0.9]))
 POSE = device_pose(RECEIVER, Float64)
 SIZE = (23, 61)
+"""No whole number of tiles either way."""
 COUNT, BATCH = 40, 2
 
 
-def fields(seed: int, product: bool, low: float = 0.05, high: float = 0.999, count: int = COUNT) -> Gaussians:
+def device_gaussians(float_type: Any, batch: int = 1, **arrays: Any) -> Gaussians:
+    """Gaussians from arrays [coordinates, count]; signals and attenuations are complex, what is left out is None."""
+    arrays = {"opacity": None, "attenuation": None} | arrays
+    for name, values in arrays.items():
+        rows = [values.real, values.imag] if np.iscomplexobj(values) else values
+        if name == "opacity":
+            arrays[name] = None if values is None else on_device(values, float_type)
+        elif values is not None:
+            arrays[name] = [on_device(np.ascontiguousarray(row), float_type) for row in rows]
+    return Gaussians(**arrays, batch=batch)
+
+
+def fields(seed: int) -> Gaussians:
     """Gaussians all around the receiver, below its horizon too, signals of two decades, some nearly opaque."""
-    rng = np.random.default_rng(seed)
-    where = rng.normal(0, 1.5, (3, count)) + RECEIVER.position_m[:, None]
-    where[:, 0] = RECEIVER.position_m + 0.01  # contains the receiver
-    strength = 10 ** rng.uniform(-2, 0, BATCH * count) * np.exp(2j * np.pi * rng.random(BATCH * count))
-    alpha = rng.uniform(low, high, BATCH * count)
-    delta = (1 - alpha) * np.exp(2j * np.pi * rng.random(BATCH * count))
-    return Gaussians(
-        position=[Float64(x) for x in where],
-        scale=[Float64(np.exp(rng.normal(-1, 0.7, BATCH * count))) for _ in range(3)],
-        rotation=[Float64(x) for x in rng.standard_normal((4, BATCH * count))],
-        signal=[Float64(strength.real.copy()), Float64(strength.imag.copy())],
-        opacity=None if product else Float64(alpha),
-        attenuation=[Float64(delta.real.copy()), Float64(delta.imag.copy())] if product else None,
-        batch=BATCH,
+    rng, total = np.random.default_rng(seed), BATCH * COUNT
+    position = rng.normal(0, 1.5, (3, COUNT)) + RECEIVER.position_m[:, None]
+    position[:, 0] = RECEIVER.position_m + 0.01  # contains the receiver
+    return device_gaussians(
+        Float64,
+        BATCH,
+        position=position,
+        scale=np.exp(rng.normal(-1, 0.7, (3, total))),
+        rotation=rng.standard_normal((4, total)),
+        signal=10 ** rng.uniform(-2, 0, total) * np.exp(2j * np.pi * rng.random(total)),
+        opacity=rng.uniform(0.05, 0.999, total),
     )
 
 
-def image(gaussians: Gaussians) -> np.ndarray:
-    re, im = splat(gaussians, POSE, perception_plane(*SIZE, Float64))
-    return re.numpy() + 1j * im.numpy()
+def oracle_image(
+    gaussians: Gaussians,
+    receiver: Receiver,
+    size: tuple[int, int],
+    chosen: Any = None,
+    transmitter: int = 0,
+    **more: Any,
+) -> np.ndarray:
+    """The image of a transmitter's Gaussians, of all or the chosen ones; ``more`` replaces their opacities."""
+    chosen = np.arange(gaussians.count) if chosen is None else chosen
+    start = transmitter * gaussians.count
+
+    def columns(parts: list[Any], start: int = start) -> np.ndarray:
+        return np.stack([part.numpy()[start + chosen].astype(float) for part in parts], axis=1)
+
+    signal = columns(gaussians.signal) @ [1, 1j]
+    geometry = columns(gaussians.position, 0), columns(gaussians.scale), columns(gaussians.rotation)
+    if gaussians.attenuation is not None:
+        more = {"attenuation": columns(gaussians.attenuation) @ [1, 1j]}
+    elif not more:
+        more = {"opacity": columns([gaussians.opacity])[:, 0]}
+    return oracle.render(*geometry, signal, receiver, pixel_directions(*size), **more)
+
+
+def off_edges(image: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+    """The share of pixels on a cut-off, which may fall to either side in float32, and the others' relative L2 error."""
+    off = np.abs(image - expected) > 1e-3 * np.abs(expected).max()
+    return off.mean(), np.linalg.norm((image - expected)[~off]) / np.linalg.norm(expected)

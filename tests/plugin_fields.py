@@ -1,10 +1,10 @@
 """Small fields for the plugins: untrained, as arrays and as run folders."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from small_fits import official, settings
 
@@ -39,3 +39,19 @@ def write_run(folder: Path, record: Record, model: str, *own: str) -> Path:
 def plain(array: Any) -> np.ndarray:
     """A Dr.Jit array as float64."""
     return np.asarray(array.numpy(), float)
+
+
+def slopes(loss: Callable[[], Any], params: Any, key: str, change: Any, step: float) -> tuple[float, float]:
+    """Derivatives of a loss by a scene's parameter along a change of it: backward, and by central differences."""
+    kind, start = type(params[key]), plain(params[key])
+
+    def moved(distance: float, grad: bool = False) -> Any:
+        leaf = kind((start + distance * change).astype(np.float32))
+        if grad:
+            dr.enable_grad(leaf)
+        params.update({key: leaf})
+        return loss()
+
+    numeric = float(moved(step)[0] - moved(-step)[0]) / (2 * step)
+    dr.backward(moved(0.0, grad=True))
+    return float(np.sum(plain(dr.grad(params[key])) * change)), numeric

@@ -1,18 +1,26 @@
-"""Gaussians of all kinds for the traced evaluation, and what a ray meets of them in float64 NumPy."""
-
-from __future__ import annotations
+"""Gaussians of all kinds for the traced evaluation, scenes of them, and what a ray meets of them in float64 NumPy."""
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
+from made_fields import Float64, device_gaussians
 from wrf_mi_bench import field_oracle as oracle
+from wrf_mi_plugins.blend_rays import Walls, blend_rays
+from wrf_mi_plugins.bundles import all_lists, ray_bundles
+from wrf_mi_plugins.ray_response import ray_footprints
+from wrf_mi_plugins.sensor import receiver_to_world
+from wrf_mi_plugins.shape import gaussian_shape
 
+from wrf_mi.backend.device import on_device
+from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import Receiver, rotation_matrix, unit_vectors
-from wrf_mi.gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
+from wrf_mi.gaussians import Gaussians
+from wrf_mi.gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M, depth_order
 
-RECEIVER = Receiver(
-    "receiver", np.array([0.3, -1.2, 2.0]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])
-)
+QUATERNION = np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])
+RECEIVER = Receiver("receiver", np.array([0.3, -1.2, 2.0]), QUATERNION)
 
 
 def any_field(count: int, seed: int = 0, size: float = 0.25) -> dict[str, np.ndarray]:
@@ -65,3 +73,49 @@ def blended(field: dict[str, np.ndarray], blending: str, directions: np.ndarray)
     if blending == "alpha":
         return oracle.blend_alpha(responses, signal, field["opacity"][order, 0])
     return oracle.blend_product(responses, signal, delta)
+
+
+def gaussians_of(field: dict[str, np.ndarray], blending: str, float_type: Any = Float64) -> Gaussians:
+    geometry = {name: field[name].T for name in ("position", "scale", "rotation")}
+    product = {"attenuation": field["attenuation"] @ [1, 1j]} if blending == "product" else {}
+    return device_gaussians(
+        float_type, **geometry, signal=field["signal"] @ [1, 1j], **product or {"opacity": field["opacity"][:, 0]}
+    )
+
+
+def pose_of(float_type: Any = Float64) -> Pose:
+    position, *axes = (
+        [dr.opaque(float_type, float(x)) for x in row] for row in (RECEIVER.position_m, *RECEIVER.to_world)
+    )
+    return Pose(position, axes)
+
+
+def bundles_of(directions: np.ndarray, float_type: Any = Float64) -> Any:
+    return ray_bundles([on_device(c, float_type) for c in directions.reshape(-1, 3).T], *directions.shape[:2])
+
+
+def brute(gaussians: Gaussians, pose: Pose, bundles: Any, walls: Walls | None = None, footprints: Any = None) -> Any:
+    """Real and imaginary part along the rays, with lists that hold every Gaussian."""
+    footprints = footprints or ray_footprints(gaussians, pose)
+    lists = all_lists(depth_order(footprints.depth, gaussians.position), bundles)
+    return blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.blending, walls)
+
+
+def film(height: int, width: int, **more: Any) -> dict[str, Any]:
+    box = {"type": "box"}
+    return {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "luminance", "rfilter": box, **more}
+
+
+def plane(height: int = 12, width: int = 40, crop: dict[str, int] | None = None, **more: Any) -> dict[str, Any]:
+    """The sensor of `RECEIVER`."""
+    to_world = receiver_to_world(RECEIVER.position_m, RECEIVER.orientation_xyzw)
+    return {"type": "wrf_perception_plane", "to_world": to_world, "film": film(height, width, **crop or {}), **more}
+
+
+def scene_of(field: Gaussians, **more: Any) -> Any:
+    shape = {"gaussians": gaussian_shape(field)}
+    return mi.load_dict({"type": "scene", "integrator": {"type": "wrf_traced"}, "sensor": plane()} | shape | more)
+
+
+def complex_image(tensor: Any) -> np.ndarray:
+    return np.asarray(tensor.numpy(), float) @ np.array([1, 1j])

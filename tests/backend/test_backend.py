@@ -1,6 +1,5 @@
-from __future__ import annotations
-
 import os
+import re
 import subprocess
 import sys
 import time
@@ -49,70 +48,60 @@ def good_if(*versions: tuple[int, ...]):
     """Stands in for the trial: only these versions work."""
 
     def verdict(library: libraries.LlvmLibrary, *, fresh: bool = False) -> probe.Verdict:
-        usable = library.version in versions
-        return probe.Verdict(usable, "" if usable else "does not work", ".".join(map(str, library.version)))
+        reason = "" if library.version in versions else "does not work"
+        return probe.Verdict(not reason, reason, ".".join(map(str, library.version)))
 
     return verdict
 
 
+def refusal(name: str = "llvm") -> str:
+    """The one line with which a backend is refused."""
+    with pytest.raises(BackendError) as caught:
+        backend.choose(name)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
 def real_llvm(major: int) -> libraries.LlvmLibrary:
-    found = [library for library in backend.find_llvm(ignore_variable=True) if library.version[:1] == (major,)]
-    if not found:
+    of_major = [library for library in backend.find_llvm(ignore_variable=True) if library.version[:1] == (major,)]
+    if not of_major:
         pytest.skip(f"LLVM {major} is not installed here")
-    return found[0]
+    return of_major[0]
 
 
 def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        timeout=SECONDS_PER_CHILD,
-    )
+    pipes = {"capture_output": True, "text": True, "timeout": SECONDS_PER_CHILD}
+    return subprocess.run([sys.executable, "-c", code], env=os.environ | environment, **pipes)
 
 
-@pytest.mark.parametrize(
-    ("name", "version"),
-    [
-        ("libLLVM-14.so.1", (14,)),
-        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
-        ("libLLVM-17.so", (17,)),
-        ("libLLVM.so.19.1", (19, 1)),
-        ("libLLVM-19.dylib", (19,)),
-        ("libLLVM.19.1.dylib", (19, 1)),
-        ("libLLVM.so", ()),
-        ("libLLVM.so.1", ()),
-        ("libLLVM.dylib", ()),
-        ("libLLVM.so.19.1-rust-1.83.0-stable", None),
-        ("libLLVMCore.a", None),
-        ("libLLVMSPIRVLib.so.15", None),
-        ("libLLVM-C.so", None),
-    ],
-)
-def test_version_from_file_name(name: str, version: tuple[int, ...] | None) -> None:
+VERSIONS = {
+    **{"libLLVM-14.so.1": (14,), "libLLVM-14.0.6.so.1": (14, 0, 6), "libLLVM-17.so": (17,), "libLLVM.so.19.1": (19, 1)},
+    **{"libLLVM-19.dylib": (19,), "libLLVM.19.1.dylib": (19, 1)},
+    **dict.fromkeys(("libLLVM.so", "libLLVM.so.1", "libLLVM.dylib"), ()),
+    **dict.fromkeys(("libLLVM.so.19.1-rust-1.83.0-stable", "libLLVMCore.a", "libLLVMSPIRVLib.so.15", "libLLVM-C.so")),
+}
+
+
+@pytest.mark.parametrize(("name", "version"), VERSIONS.items())
+def test_version_from_file_name(name, version):
     assert libraries.version_from_name(name) == version
 
 
 @given(st.integers(3, 99), st.integers(0, 9), st.integers(0, 99))
-def test_version_round_trips_through_a_file_name(major: int, minor: int, patch: int) -> None:
+def test_version_round_trips_through_a_file_name(major, minor, patch):
     assert libraries.version_from_name(f"libLLVM-{major}.{minor}.{patch}.so") == (major, minor, patch)
     assert libraries.version_from_name(f"libLLVM.so.{major}.{minor}") == (major, minor)
 
 
-def test_newest_first_each_file_once(only) -> None:
+def test_newest_first_each_file_once(only):
     folder = only("libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM.so.9.1", "libLLVM-19.1.7.so", "libLLVMCore.a")
     (folder / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
-    found = [(library.version, library.path.name) for library in backend.find_llvm()]
-    assert found == [
-        ((19, 1, 7), "libLLVM-19.1.7.so"),
-        ((19, 1), "libLLVM.so.19.1"),
-        ((14,), "libLLVM-14.so.1"),
-        ((9, 1), "libLLVM.so.9.1"),
-    ]
+    names = ["libLLVM-19.1.7.so", "libLLVM.so.19.1", "libLLVM-14.so.1", "libLLVM.so.9.1"]
+    assert [library.path.name for library in backend.find_llvm()] == names
+    assert [library.version for library in backend.find_llvm()] == [(19, 1, 7), (19, 1), (14,), (9, 1)]
 
 
-def test_variable_excludes_all_others(only, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variable_excludes_all_others(only, tmp_path, monkeypatch):
     folder = only("libLLVM.so.19.1", "libLLVM-15.so.1")
     monkeypatch.setenv(libraries.LLVM_VARIABLE, str(folder / "libLLVM-15.so.1"))
     assert [library.version for library in backend.find_llvm()] == [(15,)]
@@ -121,52 +110,37 @@ def test_variable_excludes_all_others(only, tmp_path: Path, monkeypatch: pytest.
     assert backend.find_llvm() == []
 
 
-def test_newest_good_library_is_chosen(only, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_newest_good_library_is_chosen(only, monkeypatch):
     only("libLLVM.so.23.1", "libLLVM.so.20.1", "libLLVM.so.19.1", "libLLVM-15.so.1")
     monkeypatch.setattr(backend, "try_llvm", good_if((20, 1), (19, 1), (15,)))
     assert backend.choose("llvm").llvm_version == "20.1"
 
 
-@pytest.mark.parametrize("major", [14, 15, 16])
-def test_old_llvm_is_refused_without_a_trial(only, major: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("major", [14, 16])
+def test_old_llvm_is_refused_without_a_trial(only, major, monkeypatch):
     only(f"libLLVM-{major}.so.1")
     monkeypatch.setattr(probe, "_run_trial", lambda *arguments: pytest.fail("an old LLVM was loaded"))
-    with pytest.raises(BackendError, match=rf"LLVM {major} .* is too old .*: .*install") as caught:
-        backend.choose("llvm")
-    assert "\n" not in str(caught.value)
+    assert re.search(rf"LLVM {major} .* is too old .*: .*install", refusal())
 
 
-def test_no_llvm_at_all(only) -> None:
+def test_missing_and_invalid_libraries_are_refused(only, monkeypatch):
     only()
-    with pytest.raises(BackendError, match=r"no usable LLVM \(none was found\): .*install"):
-        backend.choose("llvm")
-
-
-def test_invalid_library_is_refused(only) -> None:
-    only("libLLVM.so.19.1")
-    with pytest.raises(BackendError, match=r"LLVM 19\.1 .* fails") as caught:
-        backend.choose("llvm")
-    assert "\n" not in str(caught.value)
-
-
-def test_variable_names_a_bad_library_and_a_good_one_exists(only, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = only("libLLVM.so.19.1", "libLLVM-15.so.1")
+    assert re.search(r"no usable LLVM \(none was found\): .*install", refusal())
+    folder = only("libLLVM.so.19.1")
+    assert re.search(r"LLVM 19\.1 .* fails", refusal())
+    only("libLLVM-15.so.1")
     monkeypatch.setenv(libraries.LLVM_VARIABLE, str(folder / "libLLVM-15.so.1"))
     monkeypatch.setattr(backend, "try_llvm", good_if((19, 1)))
-    with pytest.raises(BackendError, match=r"LLVM 15 .* does not work: unset it, LLVM 19\.1 .* works"):
-        backend.choose("llvm")
+    assert re.search(r"LLVM 15 .* does not work: unset it, LLVM 19\.1 .* works", refusal())
 
 
-def test_trial_reports_an_abort() -> None:
+def test_trial_reports_an_abort():
     verdict, final = probe._run_trial(backend.VARIANTS["llvm"], libraries.LLVM_VARIABLE, real_llvm(15).path)
-    assert final
-    assert not verdict.usable
-    assert "SIGABRT" in verdict.reason
-    assert "fminimum" in verdict.reason
-    assert "0x" not in verdict.reason
+    assert (final, verdict.usable) == (True, False)
+    assert re.search("(?=.*SIGABRT)(?=.*fminimum)(?!.*0x)", verdict.reason)
 
 
-def test_verdicts_are_cached_until_the_file_changes(only, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verdicts_are_cached_until_the_file_changes(only, monkeypatch):
     file = only("libLLVM.so.19.1") / "libLLVM.so.19.1"
     trials = []
 
@@ -175,17 +149,16 @@ def test_verdicts_are_cached_until_the_file_changes(only, monkeypatch: pytest.Mo
         return probe.Verdict(True, version="19.1.0"), True
 
     monkeypatch.setattr(probe, "_run_trial", trial)
-    library = backend.find_llvm()[0]
+    (library,) = backend.find_llvm()
     assert probe.try_llvm(library) == probe.try_llvm(library)
     assert len(trials) == 1
     probe.try_llvm(library, fresh=True)
-    assert len(trials) == 2
     os.utime(file, ns=(1, 1))
     probe.try_llvm(library)
     assert len(trials) == 3
 
 
-def test_verdicts_of_hidden_and_visible_devices_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verdicts_of_hidden_and_visible_devices_differ(tmp_path, monkeypatch):
     """An empty list of devices hides them, none shows all."""
     driver, tried = tmp_path / "libcuda.so.1", list[str | None]()
     driver.touch()
@@ -202,29 +175,25 @@ def test_verdicts_of_hidden_and_visible_devices_differ(tmp_path: Path, monkeypat
     assert tried == [None, ""]
 
 
-def test_cached_failures_expire() -> None:
+def test_cached_failures_expire_and_a_damaged_cache_counts_as_empty():
     probe.remember("short", {"usable": False}, seconds=-1)
     probe.remember("long", {"usable": True})
     assert probe.recall("short") is None
     assert probe.recall("long") == {"usable": True}
+    probe.cache_file().write_text('{"long": {"usa')
+    assert probe.recall("long") is None
+    probe.remember("long", {"usable": True})
+    assert probe.recall("long") == {"usable": True}
 
 
-def test_damaged_cache_counts_as_empty() -> None:
-    probe.remember("key", {"usable": True})
-    probe.cache_file().write_text('{"key": {"usa')
-    assert probe.recall("key") is None
-    probe.remember("key", {"usable": True})
-    assert probe.recall("key") == {"usable": True}
-
-
-def test_unwritable_cache_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritable_cache_is_ignored(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setattr(probe, "cache_file", lambda: tmp_path / "file" / "libraries.json")
     probe.remember("key", {"usable": True})
     assert probe.recall("key") is None
 
 
-def test_choice_is_fast_once_cached() -> None:
+def test_choice_is_fast_once_cached():
     backend.choose()
     seconds = []
     for _ in range(5):
@@ -236,7 +205,7 @@ def test_choice_is_fast_once_cached() -> None:
 
 @pytest.mark.parametrize("imported_before", ["", "import drjit; "])
 @pytest.mark.parametrize("major", [14, 15])
-def test_process_with_an_old_llvm_ends_with_one_line(major: int, imported_before: str) -> None:
+def test_process_with_an_old_llvm_ends_with_one_line(major, imported_before):
     path = str(real_llvm(major).path)
     ended = run_python(f"{imported_before}import wrf_mi.backend as b; b.init()", **{libraries.LLVM_VARIABLE: path})
     assert ended.returncode == 1
@@ -245,8 +214,7 @@ def test_process_with_an_old_llvm_ends_with_one_line(major: int, imported_before
     assert libraries.LLVM_VARIABLE in last or "install" in last
 
 
-def test_init_in_a_new_process() -> None:
-    code = """
+IN_A_NEW_PROCESS = """
 import os, sys
 import wrf_mi.backend as b
 assert "drjit" not in sys.modules
@@ -264,12 +232,7 @@ except b.BackendError as error:
 else:
     raise AssertionError
 """
-    ended = run_python(code)
-    assert ended.returncode == 0, ended.stderr
-
-
-def test_init_after_drjit_was_imported() -> None:
-    code = """
+AFTER_DRJIT = """
 import warnings
 import mitsuba
 mitsuba.set_variant("scalar_rgb")
@@ -281,32 +244,34 @@ assert mitsuba.variant() == chosen.variant
 assert any("from scalar_rgb to llvm_ad_mono_polarized" in str(warning.message) for warning in caught)
 assert chosen.llvm_version and "LLVM" in (chosen.llvm_path or "libLLVM")
 """
+
+
+@pytest.mark.parametrize("code", [IN_A_NEW_PROCESS, AFTER_DRJIT], ids=["first", "after Dr.Jit"])
+def test_init_in_a_new_process(code):
     ended = run_python(code)
     assert ended.returncode == 0, ended.stderr
 
 
-def test_cuda_with_a_driver_that_does_not_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cuda_with_a_driver_that_does_not_load(tmp_path, monkeypatch):
     driver = tmp_path / "libcuda.so.1"
     driver.write_text("not a library")
     monkeypatch.setenv(libraries.CUDA_VARIABLE, str(driver))
-    with pytest.raises(BackendError, match=r"CUDA cannot be used, .*libcuda\.so\.1 fails: .* or use the backend llvm"):
-        backend.choose("cuda")
+    assert re.search(r"CUDA cannot be used, .*libcuda\.so\.1 fails: .* or use the backend llvm", refusal("cuda"))
     assert backend.choose("auto").name == "llvm"
 
 
-def test_cuda_without_a_device() -> None:
+def test_cuda_without_a_device():
     if backend.find_cuda():
         pytest.skip("there is a GPU here")
-    with pytest.raises(BackendError, match="CUDA cannot be used, no NVIDIA driver"):
-        backend.choose("cuda")
+    assert "CUDA cannot be used, no NVIDIA driver" in refusal("cuda")
 
 
 @pytest.mark.gpu
-def test_cuda_is_preferred_where_it_works() -> None:
+def test_cuda_is_preferred_where_it_works():
     assert backend.choose("auto").name == "cuda"
 
 
-def test_arguments_are_checked() -> None:
+def test_arguments_are_checked():
     with pytest.raises(InputError, match="backend: 'opencl' is none of"):
         backend.init("opencl")
     with pytest.raises(InputError, match="threads: must be at least 1, got 0"):

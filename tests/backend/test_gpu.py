@@ -1,9 +1,6 @@
 """A GPU computes what the CPU computes: recorded functions, float64, fits and predictions."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -31,58 +28,68 @@ def on_cpu(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         assert run_module("wrf_mi.cli", arguments) == (0, "")
 
 
-def test_sorting_in_a_recording_is_replayed() -> None:
+def test_sorting_in_a_recording_is_replayed():
     """Dr.Jit 1.5 records its own sort on CUDA, and its replay ends the process."""
     double, frozen = dr.float64_array_t(mi.Float), dr.freeze(depth_order)
     rng = np.random.default_rng(0)
     for size in (50, 50, 3000, 3000):
         depth = rng.integers(1, 9, size).astype(float)
         position = rng.integers(-2, 3, (3, size)).astype(np.float32)
-        found = frozen(double(depth), [mi.Float(row) for row in position]).numpy()
-        np.testing.assert_array_equal(found, np.lexsort((*position[::-1], depth)))
+        order = frozen(double(depth), [mi.Float(row) for row in position]).numpy()
+        np.testing.assert_array_equal(order, np.lexsort((*position[::-1], depth)))
 
 
-def test_division_and_roots_are_exact() -> None:
+def test_division_and_roots_are_exact():
     double = dr.float64_array_t(mi.Float)
     values = np.random.default_rng(0).uniform(0.1, 1000, 1000)
     x = double(values)
-    for found, expected in ((1 / x, 1 / values), (dr.sqrt(x), np.sqrt(values)), (dr.rcp(x), 1 / values)):
-        np.testing.assert_allclose(found.numpy(), expected, rtol=1e-15)
+    for result, expected in ((1 / x, 1 / values), (dr.sqrt(x), np.sqrt(values)), (dr.rcp(x), 1 / values)):
+        np.testing.assert_allclose(result.numpy(), expected, rtol=1e-15)
 
 
 @pytest.mark.parametrize("model", [*FIELDS, "kriging"])
-def test_fits_score_alike(model: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = [*QUICK, "steps=60"] if model in FIELDS else []
-    here = train(folder, tmp_path / "gpu", model, settings=given).metrics["ssim"]["mean"]
-    words = [word for setting in given for word in ("--set", setting)]
+def test_fits_score_alike(model, folder, tmp_path, monkeypatch):
+    options = [*QUICK, "steps=60"] if model in FIELDS else []
+    on_gpu = train(folder, tmp_path / "gpu", model, settings=options).metrics["ssim"]["mean"]
+    words = [word for setting in options for word in ("--set", setting)]
     on_cpu(["train", str(folder), "--model", model, *words, "--out", str(tmp_path / "cpu")], monkeypatch)
-    there = json.loads((tmp_path / "cpu" / "metrics.json").read_text())["ssim"]["mean"]
-    assert here == pytest.approx(there, abs=SCORE)
+    cpu_score = json.loads((tmp_path / "cpu" / "metrics.json").read_text())["ssim"]["mean"]
+    assert on_gpu == pytest.approx(cpu_score, abs=SCORE)
 
 
 @pytest.mark.parametrize("model", ["wrf-gs+", "factorised"])
-def test_a_run_predicts_alike(model: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_predicts_alike(model, folder, tmp_path, monkeypatch):
     run = train(folder, tmp_path / "run", model, settings=[*QUICK, "steps=20"])
     tx = np.random.default_rng(0).uniform(-2, 2, (8, 3)).astype(np.float32)
     np.savez(tmp_path / "tx.npz", tx_pos=tx)
-    here = run.predict(tx).mean
-    given, out = tmp_path / "tx.npz", tmp_path / "predictions.npz"
-    on_cpu(["predict", str(run.folder), "--input", str(given), "--out", str(out)], monkeypatch)
+    expected = run.predict(tx).mean
+    positions, out = tmp_path / "tx.npz", tmp_path / "predictions.npz"
+    on_cpu(["predict", str(run.folder), "--input", str(positions), "--out", str(out)], monkeypatch)
     with np.load(out) as arrays:
-        there = arrays["prediction"]
-    assert np.abs(here - there).max() < PIXEL * there.max()
+        predicted = arrays["prediction"]
+    assert np.abs(expected - predicted).max() < PIXEL * predicted.max()
 
 
 @pytest.mark.parametrize(
-    ("model", "given"),
+    ("model", "options"),
     [("ray-tracing", ["--calibrate", "gain,materials"]), ("hybrid", []), ("wrf-gs+", ["--set", "steps=200"])],
 )
-def test_models_of_a_scene_score_alike(
-    model: str, given: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_models_of_a_scene_score_alike(model, options, tmp_path, monkeypatch):
     """Traced, in stages and joint."""
-    words = ["train", "laboratory", "--scene", "laboratory", "--n-train", "24", "--seed", "1", "--model", model, *given]
+    words = [
+        "train",
+        "laboratory",
+        "--scene",
+        "laboratory",
+        "--n-train",
+        "24",
+        "--seed",
+        "1",
+        "--model",
+        model,
+        *options,
+    ]
     assert run_module("wrf_mi.cli", [*words, "--out", str(tmp_path / "gpu")]) == (0, "")
     on_cpu([*words, "--out", str(tmp_path / "cpu")], monkeypatch)
-    here, there = (json.loads((tmp_path / name / "metrics.json").read_text())["ssim"] for name in ("gpu", "cpu"))
-    assert here["mean"] == pytest.approx(there["mean"], abs=SCORE)
+    gpu, cpu = (json.loads((tmp_path / name / "metrics.json").read_text())["ssim"] for name in ("gpu", "cpu"))
+    assert gpu["mean"] == pytest.approx(cpu["mean"], abs=SCORE)

@@ -1,110 +1,70 @@
 """Tables of the benchmarks, and their agreement with the documents."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
+from documents import CHECKOUT, marked
+from wrf_mi_bench import bench as bench_module
 from wrf_mi_bench import scene as bench_scene
-from wrf_mi_bench.bench import (
-    CASES,
-    CHECKS,
-    BenchFailed,
-    bench,
-    case_folder,
-    check_table,
-    own_table,
-    read_results,
-    table,
-)
+from wrf_mi_bench import sources
+from wrf_mi_bench.bench import CASES, CHECKS, BenchFailed, bench, case_folder, check_table, read_results
 from wrf_mi_bench.check import main
 from wrf_mi_bench.stress_rows import FITS, STAGES, stages
 from wrf_mi_bench.table_pages import fronts, read_points
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
-from wrf_mi.parallel import Scheduler
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 RESULTS = CHECKOUT / "benchmarks" / "results"
-NEEDS_NO_DATA = (
-    "damaged-scenes",
-    "traced-and-splatted",
-    "scaling",
-    "operator",
-    "stress",
-    "pareto",
-    "rooms",
-    "phase-error",
-    "elsewhere",
-    "gpu",
-    "robustness",
-    "sentinels",
-    "new-carriers",
-)
+NEEDS_NO_DATA = {
+    *("damaged-scenes", "traced-and-splatted", "scaling", "operator", "stress", "pareto", "rooms", "phase-error"),
+    *("elsewhere", "gpu", "robustness", "sentinels", "new-carriers"),
+}
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
-    "pareto": "speed.md",
-    "scaling": "speed.md",
-    "operator": "speed.md",
-    "training": "speed.md",
-    "stress": "numerics.md",
-    "elsewhere": "numerics.md",
-    "rooms": "correction.md",
-    "stages": "hybrid.md",
-    "intervals": "hybrid.md",
-    "new-carriers": "hybrid.md",
-    "new-receivers": "hybrid.md",
-    "locate": "locate.md",
-    "phase-error": "scenes.md",
-    "sentinels": "results.md",
-    "robustness": "robustness.md",
+    **dict.fromkeys(("pareto", "scaling", "operator", "training"), "speed.md"),
+    **dict.fromkeys(("stages", "intervals", "new-carriers", "new-receivers"), "hybrid.md"),
+    **dict.fromkeys(("stress", "elsewhere"), "numerics.md"),
+    **{"rooms": "correction.md", "locate": "locate.md", "phase-error": "scenes.md"},
+    **{"sentinels": "results.md", "robustness": "robustness.md"},
 }
 """Pages that show a check's table; all others are in `docs/results.md`."""
 OTHER_BLOCKS = ("checks", "figures", "pareto", "ratios")
 """Blocks of pages that are made from several results."""
+FIGURES = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
 
 
 def result(case: str, median: float) -> dict[str, object]:
     metrics = {
         "ssim": {"median": median, "mean": 0.8, "p10": 0.7, "p90": 0.95},
         "reference": {"idw4": {"median": 0.978}},
-        "steps": 1234,
-        "train_seconds": 90.0,
-        "ms_per_sample": 8.5,
-        "peak_memory_mb": 345.6,
     }
+    metrics |= {"steps": 1234, "train_seconds": 90.0, "ms_per_sample": 8.5, "peak_memory_mb": 345.6}
     return {"case": case, "title": CASES[case].title, "metrics": metrics}
 
 
-def test_table_has_a_line_for_each_result() -> None:
-    text = table([result("wrf-gs+-paper", 0.91), result("demo", 0.97)])
-    assert len(text.splitlines()) == 4
-    assert (
-        "| WRF-GS+, L = 9 as the paper | **0.910** | 0.800 | 0.700 | 0.950 | 0.978 | 1,234 | 1.5 min | 8.5 | 346 MB |"
-        in text
-    )
+def test_table_has_a_line_for_each_result_in_the_order_of_the_cases(tmp_path):
+    for case, median in (("demo", 0.97), ("wrf-gs+-paper", 0.91)):
+        (tmp_path / f"{case}.json").write_text(json.dumps(result(case, median)))
+    trained = read_results(tmp_path)[0]
+    assert [r["case"] for r in trained] == ["wrf-gs+-paper", "demo"]
+    lines = bench_module.table(trained).splitlines()
+    assert len(lines) == 4
+    cells = "WRF-GS+, L = 9 as the paper | **0.910** | 0.800 | 0.700 | 0.950 | 0.978 | 1,234 | 1.5 min | 8.5 | 346 MB"
+    assert lines[2] == f"| {cells} |"
 
 
-def test_results_come_in_the_order_of_the_cases(tmp_path: Path) -> None:
-    for case in ("demo", "wrf-gs+-paper"):
-        (tmp_path / f"{case}.json").write_text(json.dumps(result(case, 0.9)))
-    assert [r["case"] for r in read_results(tmp_path)[0]] == ["wrf-gs+-paper", "demo"]
-
-
-def test_unknown_case_is_refused_before_anything_runs(tmp_path: Path) -> None:
+def test_unknown_case_is_refused_before_anything_runs(tmp_path):
     with pytest.raises(InputError, match="unknown; choose from"):
         bench(["no-such-case"], tmp_path / "out", tmp_path / "runs")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_checks_name_missing_data(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_checks_name_missing_data(name, tmp_path, monkeypatch, capsys):
     """The function is there; without data it is one line, exit status 2 and no file."""
     assert callable(resolve(CHECKS[name].function))
     if name in NEEDS_NO_DATA:
@@ -116,27 +76,22 @@ def test_checks_name_missing_data(
     assert not (tmp_path / "out.json").exists()
 
 
-def test_result_of_a_check_is_stored_and_tabulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
-    monkeypatch.setattr(bench_scene, "flat_plan", lambda: figures)
+def test_result_of_a_check_is_stored_and_tabulated(tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_scene, "flat_plan", lambda: FIGURES)
     assert main("wrf_mi_bench.scene:flat_plan", str(tmp_path / "out.json")) == 0
-    assert json.loads((tmp_path / "out.json").read_text()) == figures
-    line = check_table([{"title": "mesh", "figures": figures}]).splitlines()[-1]
-    assert line == "| mesh: walls | **0.9** | 0.8 |"
+    assert json.loads((tmp_path / "out.json").read_text()) == FIGURES
+    assert check_table([{"title": "mesh", "figures": FIGURES}]).splitlines()[-1] == "| mesh: walls | **0.9** | 0.8 |"
 
 
-def test_bench_on_workers_writes_figures_and_reports_failures(
-    two: Scheduler, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bench_on_workers_writes_figures_and_reports_failures(two, tmp_path, capsys):
     """A check that was measured before, and a run that cannot go on."""
     runs, out = tmp_path / "runs", tmp_path / "out"
     folder = case_folder(runs, "flat-plan")
     folder.mkdir(parents=True)
-    figures = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
-    (folder / "check.json").write_text(json.dumps({"figures": figures}))
+    (folder / "check.json").write_text(json.dumps({"figures": FIGURES}))
     rows = bench(["flat-plan"], out, runs, two)
     assert json.loads((out / "flat-plan.json").read_text()) == rows[0]
-    assert rows[0]["figures"] == figures
+    assert rows[0]["figures"] == FIGURES
     assert "| walls | **0.9** | 0.8 |" in (out / "README.md").read_text().replace("mesh of a flat: ", "")
     assert "cases that share a machine" in capsys.readouterr().err
     case_folder(runs, "demo").mkdir()
@@ -145,38 +100,52 @@ def test_bench_on_workers_writes_figures_and_reports_failures(
         bench(["flat-plan", "demo"], out, runs, two)
 
 
-def test_documents_show_the_stored_results() -> None:
-    results = (CHECKOUT / "docs" / "results.md").read_text()
+@pytest.mark.parametrize("name", ["wrf-gs+-paper", "flat-plan"])
+def test_case_folder_depends_on_data_versions_and_arguments(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_module, "dataset_files", lambda dataset: [tmp_path])
+    folders = [case_folder(tmp_path, name)]
+    assert case_folder(tmp_path, name) == folders[0]
+    (tmp_path / "rows.csv").write_text("1")
+    folders.append(case_folder(tmp_path, name))
+    versions = sources.versions() | {"drjit": "0.1"}
+    monkeypatch.setattr(sources, "versions", lambda: versions)
+    folders.append(case_folder(tmp_path, name))
+    if name in CASES:
+        other = replace(CASES[name], arguments=(*CASES[name].arguments, "--seed", "3"))
+        monkeypatch.setattr(bench_module, "CASES", {name: other})
+        folders.append(case_folder(tmp_path, name))
+    assert len(set(folders)) == len(folders)
+    assert all(folder.name.startswith(f"{name}-") for folder in folders)
+
+
+def test_documents_show_the_stored_results():
     trained, checked = read_results(RESULTS)
-    others = [one for one in checked if one["case"] not in ON_PAGE]
-    for one in checked:
-        name = one["case"]
-        if name in ON_PAGE:
-            page = (CHECKOUT / "docs" / ON_PAGE[name]).read_text()
-            assert f"<!-- {name} -->\n{own_table(one)}\n<!-- /{name} -->" in page
-    for name, text in (("figures", table(trained)), ("checks", check_table(others))):
-        assert text in results.split(f"<!-- {name} -->")[1].split(f"<!-- /{name} -->")[0]
-
-
-def test_documents_show_no_check_without_a_stored_result() -> None:
-    measured = {one["case"] for one in read_results(RESULTS)[1]}
-    for page in (CHECKOUT / "docs").glob("*.md"):
-        blocks = set(re.findall(r"^<!-- ([\w-]+) -->$", page.read_text(), re.MULTILINE))
-        assert blocks <= {*measured, *OTHER_BLOCKS}, page.name
-
-
-def test_documents_show_the_fronts_of_the_stored_tables() -> None:
+    for row in checked:
+        if page := ON_PAGE.get(row["case"]):
+            assert (
+                f"<!-- {row['case']} -->\n{bench_module.own_table(row)}\n<!-- /"
+                in (CHECKOUT / "docs" / page).read_text()
+            )
+    others = [row for row in checked if row["case"] not in ON_PAGE]
+    for name, text in (("figures", bench_module.table(trained)), ("checks", check_table(others))):
+        assert text in marked("docs/results.md", name)
     rows = fronts(read_points(RESULTS / "tables"))
     shown = check_table([{"title": CHECKS["pareto"].title, "figures": {"rows": rows}}])
-    assert f"<!-- pareto -->\n{shown}\n<!-- /pareto -->" in (CHECKOUT / "docs" / "speed.md").read_text()
+    assert marked("docs/speed.md", "pareto") == shown
+
+
+def test_documents_show_no_check_without_a_stored_result():
+    measured = {row["case"] for row in read_results(RESULTS)[1]}
+    for page in (CHECKOUT / "docs").glob("*.md"):
+        names = set(re.findall(r"^<!-- ([\w-]+) -->$", page.read_text(), re.MULTILINE))
+        assert names <= {*measured, *OTHER_BLOCKS}, page.name
 
 
 def summary_table(rows: Sequence[Mapping[str, str]]) -> str:
     """Markdown table of the worst error of each stage and its bound, and of the outcome of the fits."""
     lines = ["| what | cases | worst | bound |", "| --- | --- | --- | --- |"]
-    lines += [
-        f"| {title} | {cases or ''} | **{worst:.1e}** | {bound:g} |" for title, cases, worst, bound in stages(rows)
-    ]
+    for title, cases, worst, bound in stages(rows):
+        lines.append(f"| {title} | {cases or ''} | **{worst:.1e}** | {bound:g} |")
     for row in rows:
         if row["what"].startswith(FITS):
             what, _, count = row["what"].rpartition(", ")
@@ -184,17 +153,16 @@ def summary_table(rows: Sequence[Mapping[str, str]]) -> str:
     return "\n".join(lines)
 
 
-def test_documents_show_the_worst_of_each_stage() -> None:
+def test_documents_show_the_worst_of_each_stage():
     rows = json.loads((RESULTS / "stress.json").read_text())["figures"]["rows"]
-    shown = (CHECKOUT / "docs" / "results.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
-    assert shown.strip() == summary_table(rows)
+    assert marked("docs/results.md", "stress").strip() == summary_table(rows)
     shown_stages = [next((words for words, begins in STAGES if re.match(begins, row["what"])), None) for row in rows]
     assert set(shown_stages) >= {words for words, _ in STAGES}
     worse = [{**row, "value": "worst 9.0e-01"} if row["what"].startswith("phase") else row for row in rows]
     assert "| **9.0e-01** | 0.001 |" in summary_table(worse)
 
 
-def test_stored_results_are_complete() -> None:
+def test_stored_results_are_complete():
     trained, checked = read_results(RESULTS)
     assert [r["case"] for r in trained] == list(CASES)
     # What compares this code with stored figures holds for this code alone, so it may not be measured yet, nor may

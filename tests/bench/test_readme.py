@@ -1,17 +1,17 @@
-"""README and documents: scripts run, commands parse, links exist, numbers equal the stored ones."""
-
-from __future__ import annotations
+"""README and documents: scripts run, commands parse, links exist, numbers and measured tables equal the stored ones."""
 
 import argparse
 import importlib
 import json
 import re
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from documents import blocks
+from documents import CHECKOUT, DOCS, PAGE_NAMES, PAGES, README, blocks
 from PIL import Image
 from wrf_mi_bench.bench import CASES, CHECKS
 from wrf_mi_bench.command import TABLES
@@ -24,14 +24,6 @@ from wrf_mi.gaussians import FIELDS
 from wrf_mi.models import MODELS
 from wrf_mi.training.config import TrainConfig
 
-CHECKOUT = Path(__file__).resolve().parents[2]
-README = CHECKOUT / "README.md"
-PAGES = sorted(
-    page
-    for page in (CHECKOUT / "docs").rglob("*.md")
-    if page.relative_to(CHECKOUT / "docs").parts[0] not in {"_build", "api", "notebooks"}
-)
-DOCUMENTS = [README, *PAGES]
 HEIGHT, WIDTH, ROWS = 10, 16, 14
 
 
@@ -52,29 +44,19 @@ def cell_rows(text: str) -> list[list[str]]:
     return [[name, *(cell.strip().strip("`") for cell in rest.split(" | "))] for name, rest in rows]
 
 
-@pytest.fixture
-def tiny_folder(tmp_path: Path) -> Path:
-    """A data set of the same form as rfid-lab, small enough to train on in a moment."""
+def test_scripts_of_the_readme_run(tmp_path, monkeypatch, capsys):
+    """Scripts run unchanged except data set, of rfid-lab's form, and number of steps."""
     rng = np.random.default_rng(3)
     receiver = Receiver("gateway1", np.array([5.0, 0.3, 0.0]), np.array([0.0, 0.6, 0.0, 0.8]))
-    record = Record(
-        name="tiny",
-        task="spectrum",
-        tx_pos_m=rng.uniform(-0.5, 1.0, (ROWS, 3)),
-        receivers=(receiver,),
-        observation=rng.random((1, ROWS, HEIGHT, WIDTH)).astype(np.float32),
-        official=(np.arange(ROWS - 3), np.arange(ROWS - 3, ROWS)),
-    )
-    return write_spectrum_folder(tmp_path / "tiny", record)
-
-
-def test_scripts_of_the_readme_run(tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    """Scripts run unchanged except data set and number of steps."""
+    spectra = rng.random((1, ROWS, HEIGHT, WIDTH)).astype(np.float32)
+    official = np.arange(ROWS - 3), np.arange(ROWS - 3, ROWS)
+    record = Record("tiny", "spectrum", rng.uniform(-0.5, 1.0, (ROWS, 3)), (receiver,), spectra, official)
+    folder = write_spectrum_folder(tmp_path / "tiny", record)
     script = "\n".join(blocks(README, "python"))
-    for shown, tiny in (('"rfid-lab"', repr(str(tiny_folder))), ('"steps=6000"', '"steps=2"')):
+    for shown, tiny in (('"rfid-lab"', repr(str(folder))), ('"steps=6000"', '"steps=2"')):
         assert script.count(shown) == 1
         script = script.replace(shown, tiny)
-    script += "\n".join(blocks(CHECKOUT / "docs" / "model.md", "python"))
+    script += "\n".join(blocks(DOCS / "model.md", "python"))
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     exec(compile(script, str(README), "exec"), names)
@@ -92,8 +74,8 @@ def test_scripts_of_the_readme_run(tiny_folder: Path, tmp_path: Path, monkeypatc
         assert np.ptp(np.asarray(picture.convert("L"))) > 100
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(CHECKOUT)))
-def test_commands_parse(path: Path) -> None:
+@pytest.mark.parametrize("path", PAGES, ids=PAGE_NAMES)
+def test_commands_parse(path):
     targets = set(re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE))
     for line in commands(path):
         program, *arguments = shlex.split(line, comments=True)
@@ -112,27 +94,24 @@ def test_commands_parse(path: Path) -> None:
             assert name in {*CASES, *CHECKS, TABLES}, line
 
 
-def test_readme_shows_all_main_commands() -> None:
+def test_readme_shows_all_main_commands():
     shown = {shlex.split(line, comments=True)[1] for line in commands(README) if line.startswith("wrf-mi")}
     assert shown >= {"doctor", "data", "train", "evaluate", "predict", "compare", "demo", "mesh", "trace", "sweep"}
     assert {"make demo", "make test"} <= {line.partition("#")[0].strip() for line in commands(README)}
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(CHECKOUT)))
-def test_links_and_paths_exist(path: Path) -> None:
+@pytest.mark.parametrize("path", PAGES, ids=PAGE_NAMES)
+def test_links_and_paths_exist(path):
     text = path.read_text(encoding="utf-8")
-    links = [link for link in re.findall(r"\]\(([^)#]+)\)", text) if "://" not in link]
-    for link in links:
-        assert (path.parent / link).exists(), link
-    named = re.findall(r"`((?:wrf_mi|scenes|plugins|tests|docs|notebooks|benchmarks)/[\w./-]*)[`:]", text)
-    for name in named:
+    for link in re.findall(r"\]\(([^)#]+)\)", text):
+        assert "://" in link or (path.parent / link).exists(), link
+    for name in re.findall(r"`((?:wrf_mi|scenes|plugins|tests|docs|notebooks|benchmarks)/[\w./-]*)[`:]", text):
         assert (CHECKOUT / name).exists(), name
 
 
-def test_model_page_states_the_defaults_and_constants() -> None:
-    rows = cell_rows((CHECKOUT / "docs" / "model.md").read_text(encoding="utf-8"))
-    constants = [row for row in rows if row[0].isupper()]
-    settings = [row for row in rows if not row[0].isupper()]
+def test_model_page_states_the_defaults_and_constants():
+    rows = cell_rows((DOCS / "model.md").read_text(encoding="utf-8"))
+    constants, settings = ([row for row in rows if row[0].isupper() == upper] for upper in (True, False))
     assert constants
     assert settings
     for name, value, where, *_ in constants:
@@ -143,15 +122,71 @@ def test_model_page_states_the_defaults_and_constants() -> None:
         assert value == defaults.get(name), name
 
 
-def test_results_page_names_every_case() -> None:
-    rows = cell_rows((CHECKOUT / "docs" / "results.md").read_text(encoding="utf-8"))
+def test_results_page_names_every_case():
+    rows = cell_rows((DOCS / "results.md").read_text(encoding="utf-8"))
     assert [name for name, *_ in rows] == [*CASES, *CHECKS]
 
 
-def test_notebooks_are_stored_without_output() -> None:
-    paths = list((CHECKOUT / "notebooks").glob("*.ipynb"))
-    assert paths
-    for path in paths:
-        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
-            assert not cell.get("outputs"), path.name
-            assert cell.get("execution_count") is None, path.name
+def test_notebooks_are_stored_without_output():
+    cells = [
+        (path.name, cell)
+        for path in (CHECKOUT / "notebooks").glob("*.ipynb")
+        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]
+    ]
+    assert cells
+    assert [name for name, cell in cells if cell.get("outputs") or cell.get("execution_count") is not None] == []
+
+
+EARLIER = sorted((CHECKOUT / "benchmarks" / "results" / "earlier").glob("*.json"))
+"""What was measured at a commit, and is kept as it was found then."""
+DECIMAL = re.compile(r"\d\.\d")
+BLOCK = re.compile(r"<!-- ([\w/-]+) -->\n.*?<!-- /\1 -->", re.DOTALL)
+STATED = {
+    *(("conventions.md", "score"), ("correction.md", "part"), ("data.md", "name"), ("data.md", "task")),
+    *(("export.md", "format"), ("joint.md", "setting"), ("locate.md", "column"), ("maps.md", "variable")),
+    *(("changelog.md", "0.1.0"), ("model.md", "constant"), ("model.md", "setting"), ("numerics.md", "")),
+    *(("plugins.md", "parameter"), ("speed.md", "omitted"), ("tables.md", "question")),
+    *(("mesh.md", "you have"), ("receiver.md", "what"), ("check.md", "kind"), ("own-data.md", "your table")),
+    *(("data.md", "columns of receivers"), ("data.md", "columns of rows")),
+}
+"""Page and first cell of tables of definitions, settings and bounds, which nobody measures."""
+
+
+def unsourced(text: str, page: str) -> list[str]:
+    """First lines of the tables with decimal figures outside blocks that are made from results."""
+    tables = re.findall(r"(?:^ *\|.*\n?)+", BLOCK.sub("", text), re.MULTILINE)
+    first = {table: table.strip().split("\n")[0] for table in tables if DECIMAL.search(table)}
+    return [line for line in first.values() if (page, line.split("|")[1].strip()) not in STATED]
+
+
+def earlier_block(name: str, result: Mapping[str, Any]) -> str:
+    """The block of a document that shows an earlier measurement."""
+    cells = [result["columns"], ["---"] * len(result["columns"]), *result["rows"]]
+    table = "\n".join("|" + "".join(f" {cell} |" if cell else " |" for cell in row) for row in cells)
+    source = f"Measured {result['date']} (commit {result['commit']})"
+    source += f" by `{result['command']}`." if result["command"] else "."
+    return f"<!-- earlier/{name} -->\n{table}\n\n{source}\n<!-- /earlier/{name} -->"
+
+
+@pytest.mark.parametrize("path", PAGES, ids=PAGE_NAMES)
+def test_measured_tables_are_made_from_results(path):
+    text = prose(path)
+    assert unsourced(text, path.name) == []
+    assert BLOCK.findall(text) == re.findall(r"<!-- ([\w-][\w/-]*) -->", text)
+
+
+@pytest.mark.parametrize("path", EARLIER, ids=lambda path: path.stem)
+def test_earlier_measurements_are_stated_and_shown(path):
+    result = json.loads(path.read_text(encoding="utf-8"))
+    for measurement in result.get("measurements", [result]):
+        assert re.fullmatch(r"\d{4}-\d{2}-\d{2} [0-9a-f]{7}", f"{measurement['date']} {measurement['commit']}")
+        assert measurement.get("rows") or (measurement["what"] and measurement["figures"] not in ([], {})), measurement
+    if "measurements" not in result:
+        assert earlier_block(path.stem, result) in (CHECKOUT / result["page"]).read_text(encoding="utf-8")
+
+
+def test_table_without_a_result_is_found():
+    table = "| what | error |\n| --- | --- |\n| a | 0.1 |"
+    assert unsourced(f"By `wrf-mi bench stress`:\n\n{table}\n\nSmall.", "page.md") == ["| what | error |"]
+    for text in (f"<!-- made -->\n{table}\n<!-- /made -->", table.replace("0.1", "one")):
+        assert unsourced(text, "page.md") == []

@@ -1,12 +1,13 @@
-"""Benchmark of random rooms: errors of scans, gain of the correction, table."""
-
-from __future__ import annotations
+"""Random rooms: what a seed fixes, what rooms, scans and channels promise; gain of the correction, table."""
 
 from pathlib import Path
 
+import numpy as np
 import pytest
-from wrf_mi_bench.random_room import OPTIONS, Survey, random_room_record
+from wrf_mi_bench.random_room import OPTIONS, SNR_DB, Survey, random_room_record
 from wrf_mi_bench.rooms import COLUMNS, clipped_cea_db, disagreement, table
+from wrf_mi_scenes.mitsuba_xml import PERFECT
+from wrf_mi_scenes.random_rooms import CLEAR_M, FEWEST, HEIGHTS_M, LEAST_M, MOST, MOST_M, MOUNTED_M, MOUNTS, random_room
 
 from wrf_mi.core import Record
 from wrf_mi.correction import CorrectionOptions, correct_scene, write_page
@@ -15,42 +16,86 @@ from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing.tracer import RayTracer
 
+ROOMS = [random_room(seed) for seed in range(200, 240)]
+SMALL = Survey(train=30, test=4, rays=10_000)
+Surveyed = tuple[Record, Path, Path]
+
+
+def test_rooms_keep_their_bounds():
+    for room in ROOMS:
+        bounds = np.array([mesh.bounds for _, mesh in room.parts.values()])
+        np.testing.assert_allclose(bounds[:, 0].min(axis=0), 0, atol=1e-12)
+        np.testing.assert_allclose(bounds[:, 1].max(axis=0), room.size_m)
+        assert ((np.array(room.size_m[:2]) >= LEAST_M) & (np.array(room.size_m[:2]) <= MOST_M)).all()
+        assert HEIGHTS_M[0] <= room.size_m[2] <= HEIGHTS_M[1]
+        assert FEWEST <= len(room.parts) - 6 <= MOST
+
+
+def test_furniture_and_access_point_stand_apart():
+    for room in ROOMS:
+        boxes = [mesh.bounds for name, (_, mesh) in room.parts.items() if name.startswith("piece")]
+        for index, (low, high) in enumerate(boxes):
+            assert np.maximum(low - room.station_m, room.station_m - high).max() >= CLEAR_M - 1e-4
+            for other_low, other_high in boxes[:index]:
+                assert np.maximum(low - other_high, other_low - high)[:2].max() > 0
+        walls = np.concatenate([room.station_m, np.subtract(room.size_m, room.station_m)])
+        assert walls.min() == pytest.approx(MOUNTED_M, abs=1e-4) if room.mount != "free" else walls.min() > MOUNTED_M
+
+
+def test_rooms_differ_in_mount_and_materials():
+    assert {room.mount for room in ROOMS} == set(MOUNTS)
+    perfect = [{material for material, _ in room.parts.values()} == {PERFECT} for room in ROOMS]
+    assert perfect == [room.perfect for room in ROOMS]
+    assert 0 < sum(perfect) < len(ROOMS) / 2
+
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Path, Path]:
-    return random_room_record(103, tmp_path_factory.mktemp("room"), Survey(train=60, test=24, rays=40_000))
+def surveyed(tmp_path_factory: pytest.TempPathFactory) -> Surveyed:
+    """Channels, the true scene and the scan of a room."""
+    return random_room_record(103, tmp_path_factory.mktemp("room"), SMALL)
 
 
-def test_a_third_of_the_scans_paths_and_a_radian_of_phase_are_wrong(made: tuple[Record, Path, Path]) -> None:
+def test_a_seed_fixes_channels_and_scan(surveyed, tmp_path):
+    again = random_room_record(103, tmp_path, SMALL)
+    for name in ("observation", "tx_pos_m"):
+        np.testing.assert_array_equal(getattr(surveyed[0], name), getattr(again[0], name))
+    first, second = (sorted((scan / "meshes").iterdir()) for _, _, scan in (surveyed, again))
+    assert [file.read_bytes() for file in first] == [file.read_bytes() for file in second]
+
+
+def test_noise_has_the_stated_power(surveyed):
+    record, *_ = surveyed
+    noise, signal = (np.square(np.abs(x)).mean(axis=2) for x in (record.observation - record.truth, record.truth))
+    assert 10 * np.log10((signal / noise).mean()) == pytest.approx(SNR_DB, abs=1.5)
+
+
+def test_a_third_of_the_scans_paths_and_a_radian_of_phase_are_wrong(surveyed):
     """And the scan states no material of the room: those of the rules."""
-    record, true, scan = made
+    record, true, scan = surveyed
     traced = [RayTracer(scene, instrument_of(record), OPTIONS).trace(record.tx_pos_m) for scene in (true, scan)]
-    found = disagreement(*traced)
-    assert found["wrong"] >= 1 / 3
-    assert found["phase_error_rad"] >= 1
+    different = disagreement(*traced)
+    assert different["wrong"] >= 1 / 3
+    assert different["phase_error_rad"] >= 1
     assert not read_scene_folder(scan).materials.constants
-    same = disagreement(traced[0], traced[0])
-    assert same == {"missing": 0, "wrong": 0, "phase_error_rad": 0}
+    assert disagreement(traced[0], traced[0]) == {"missing": 0, "wrong": 0, "phase_error_rad": 0}
 
 
 # Eight seconds. tests/correction/test_correct.py requires 20 dB of a correction by channels, in a smaller room.
 @pytest.mark.slow
-def test_correction_brings_channels_closer_than_the_scan(made: tuple[Record, Path, Path], tmp_path: Path) -> None:
+def test_correction_brings_channels_closer_than_the_scan(tmp_path):
     """By 3 dB at the test rows, 60 training rows; 7 dB with seed 103 and 90 rows."""
-    record, _, scan = made
-    options = CorrectionOptions(rays=1 << 14, steps=3)
-    write_page(correct_scene(scan, record, make_splits(record, "official")[0], options), tmp_path / "corrected")
-    rows = make_splits(record, "official")[0].test
-    accuracy = [
-        clipped_cea_db(
-            RayTracer(scene, instrument_of(record), OPTIONS)(record.tx_pos_m[rows])[0], record.scored[0, rows], record
-        )
+    record, _, scan = random_room_record(103, tmp_path / "room", Survey(train=60, test=24, rays=40_000))
+    (split,) = make_splits(record, "official")
+    write_page(correct_scene(scan, record, split, CorrectionOptions(rays=1 << 14, steps=3)), tmp_path / "corrected")
+    tx_pos_m, scored = record.tx_pos_m[split.test], record.scored[0, split.test]
+    before, after = (
+        clipped_cea_db(RayTracer(scene, instrument_of(record), OPTIONS)(tx_pos_m)[0], scored, record)
         for scene in (scan, tmp_path / "corrected")
-    ]
-    assert accuracy[1] > accuracy[0] + 3
+    )
+    assert after > before + 3
 
 
-def test_table_has_a_line_for_each_room_and_the_median() -> None:
+def test_table_has_a_line_for_each_room_and_the_median():
     row = {
         "what": "0: 3 x 4 x 3 m",
         "value": "1.0 to 9.0 dB",

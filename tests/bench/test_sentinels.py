@@ -1,36 +1,35 @@
-"""Sentinels: which stored figures they are, when a figure counts as kept, and that a stopped call goes on."""
-
-from __future__ import annotations
+"""Sentinels: stored figures, and when they count as kept; results that are older than their source."""
 
 import json
-from collections.abc import Callable, Sequence
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from calling import call
+from documents import CHECKOUT
 from wrf_mi_bench import bench, check
 from wrf_mi_bench import sentinels as bench_sentinels
-from wrf_mi_bench.bench import CHECKS
+from wrf_mi_bench.bench import CHECKS, modules_of, provenance
 from wrf_mi_bench.sentinels import STORED, TABLE_ROWS, Figure, Group, groups, main, median_interval
-from wrf_mi_bench.sources import source_files
+from wrf_mi_bench.sources import PACKAGES, SOURCE, code_digest, modules_of_command, needed_files, source_files
+from wrf_mi_bench.stale import UNKNOWN, stale
 from wrf_mi_bench.tables import FOLDER
 
+from wrf_mi.cli.main import main as cli
 from wrf_mi.core import InputError
 from wrf_mi.tasks import TASKS
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 SSIM = Figure("room: field, median SSIM", 0.90, 0.88, 0.92, True)
 ERROR = Figure("flat: field, median absolute error (dB)", 3.0, 2.8, 3.2, False)
 OTHERS_S = 300
 """Image method, integrator and stress: 30 s, 30 s and 75 s were seen while another process had half of the cores."""
 
 
-def stored_rows() -> list[dict]:
-    return [json.loads((CHECKOUT / STORED / FOLDER / f"{name}-100-seed0.json").read_text()) for name in TABLE_ROWS]
-
-
-def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeypatch):
     monkeypatch.chdir(CHECKOUT)
     known = groups()
     figures = [figure for group in known for figure in group.figures]
@@ -38,13 +37,13 @@ def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeyp
     assert len(known) == len({group.name for group in known})
     assert all(figure.low <= figure.stored <= figure.high for figure in figures)
     assert {name.partition("-")[0] for name in TABLE_ROWS} == set(TASKS)
-    assert OTHERS_S + sum(row["wall_seconds"] for row in stored_rows()) < 40 * 60
+    rows = [json.loads((STORED / FOLDER / f"{name}-100-seed0.json").read_text()) for name in TABLE_ROWS]
+    assert OTHERS_S + sum(row["wall_seconds"] for row in rows) < 40 * 60
 
 
 @pytest.mark.parametrize("count", [40, 400])
-def test_interval_of_a_median_has_its_nominal_coverage(count: int) -> None:
-    rng = np.random.default_rng(1)
-    inside = 0
+def test_interval_of_a_median_has_its_nominal_coverage(count):
+    rng, inside = np.random.default_rng(1), 0
     for _ in range(400):
         low, high = median_interval(list(np.quantile(rng.normal(size=count), np.linspace(0, 1, 101))), count)
         inside += low <= 0 <= high
@@ -53,64 +52,52 @@ def test_interval_of_a_median_has_its_nominal_coverage(count: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("figure", "measured", "verdict"),
+    ("figure", "verdicts"),
     [
-        (SSIM, 0.88, "equal"),
-        (SSIM, 0.93, "better"),
-        (SSIM, 0.87, "worse"),
-        (SSIM, float("nan"), "worse"),
-        (ERROR, 3.2, "equal"),
-        (ERROR, 2.7, "better"),
-        (ERROR, 3.3, "worse"),
-        (ERROR, float("inf"), "worse"),
+        (SSIM, {0.88: "equal", 0.93: "better", 0.87: "worse", float("nan"): "worse"}),
+        (ERROR, {3.2: "equal", 2.7: "better", 3.3: "worse", float("inf"): "worse"}),
     ],
 )
-def test_a_figure_is_worse_outside_its_interval_on_the_bad_side(figure: Figure, measured: float, verdict: str) -> None:
-    assert figure.verdict(measured) == verdict
+def test_a_figure_is_worse_outside_its_interval_on_the_bad_side(figure, verdicts):
+    assert [figure.verdict(measured) for measured in verdicts] == list(verdicts.values())
 
 
-class Made:
+class MadeGroups:
     """Three groups that take no time: a good figure, one as it is asked for, and one without data."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, runs: Path) -> None:
         self.asked: list[str] = []
         self.error: float | Exception | type[BaseException] = 3.0
         known = [
-            Group("good", (SSIM,), self.values("good", lambda: [0.9])),
-            Group("other", (ERROR,), self.values("other", self.other)),
-            Group("far", (ERROR,), self.values("far", lambda: [3.0]), present=False),
+            Group("good", (SSIM,), lambda _: self.measured("good", 0.9)),
+            Group("other", (ERROR,), lambda _: self.measured("other", self.error)),
+            Group("far", (ERROR,), lambda _: self.measured("far", 3.0), present=False),
         ]
         monkeypatch.setattr(bench_sentinels, "groups", lambda: known)
         monkeypatch.setattr(bench_sentinels, "RUNS", runs)
 
-    def values(self, name: str, found: Callable[[], Sequence[float]]) -> Callable[[Path], Sequence[float]]:
-        def measure(_: Path) -> Sequence[float]:
-            self.asked.append(name)
-            return found()
-
-        return measure
-
-    def other(self) -> list[float]:
-        if isinstance(self.error, float):
-            return [self.error]
-        raise self.error
+    def measured(self, name: str, value: float | Exception | type[BaseException]) -> list[float]:
+        self.asked.append(name)
+        if isinstance(value, float):
+            return [value]
+        raise value
 
 
 @pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Made:
-    return Made(monkeypatch, tmp_path / "sentinels")
+def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> MadeGroups:
+    return MadeGroups(monkeypatch, tmp_path / "sentinels")
 
 
-def test_equal_figures_pass_and_missing_data_are_reported(made: Made) -> None:
-    found = main()
-    assert "failed" not in found
-    assert [row["verdict"] for row in found["rows"]] == ["equal", "equal", "not on this machine"]
-    lines = bench_sentinels.table(found["rows"]).splitlines()
+def test_equal_figures_pass_and_missing_data_are_reported(made):
+    result = main()
+    assert "failed" not in result
+    assert [row["verdict"] for row in result["rows"]] == ["equal", "equal", "not on this machine"]
+    lines = bench_sentinels.table(result["rows"]).splitlines()
     assert lines[2] == "| room: field, median SSIM | 0.9 | 0.88 to 0.92 | 0.9 | equal |"
     assert lines[4] == "| flat: field, median absolute error (dB) | 3 | 2.8 to 3.2 |  | not on this machine |"
 
 
-def test_stopped_call_resumes_from_measured_groups(made: Made, tmp_path: Path) -> None:
+def test_stopped_call_resumes_from_measured_groups(made, tmp_path):
     made.error = KeyboardInterrupt
     assert check.main(CHECKS["sentinels"].function, str(tmp_path / "out.json")) == 130
     assert not (tmp_path / "out.json").exists()
@@ -119,7 +106,7 @@ def test_stopped_call_resumes_from_measured_groups(made: Made, tmp_path: Path) -
     assert made.asked == ["good", "other", "other"]
 
 
-def test_changed_code_is_measured_again(made: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_changed_code_is_measured_again(made, monkeypatch, tmp_path):
     first = main()
     assert main() == first  # nothing was measured, dates and seconds are those of the measurement
     changed = tmp_path / "changed.py"
@@ -129,28 +116,23 @@ def test_changed_code_is_measured_again(made: Made, monkeypatch: pytest.MonkeyPa
     assert made.asked == ["good", "other"] * 2
 
 
-def test_source_files_are_the_packages_without_compiled_files() -> None:
-    found = source_files()
-    assert {"wrf_mi/runs/folder.py", "wrf_mi_plugins/shape.py", "wrf_mi_scenes/registry.py"} <= set(found)
-    assert not [name for name in found if name.endswith(".pyc")]
+def test_source_files_are_the_packages_without_compiled_files():
+    names = source_files()
+    assert {"wrf_mi/runs/folder.py", "wrf_mi_plugins/shape.py", "wrf_mi_scenes/registry.py"} <= set(names)
+    assert not [name for name in names if name.endswith(".pyc")]
 
 
 @pytest.mark.parametrize(
     ("error", "value"), [(3.3, "3.3, worse"), (InputError("no\nscene"), "failed: no scene"), (OSError(), "failed")]
 )
-def test_worse_or_failed_figure_is_named_after_all_were_measured(
-    made: Made, error: float | Exception, value: str
-) -> None:
+def test_worse_or_failed_figure_is_named_after_all_were_measured(made, error, value):
     made.error = error
-    found = main()
+    failed = main()["failed"]
     assert made.asked == ["good", "other"]
-    begin = f"1 of 3 figures got worse or were not measured, first {ERROR.name}: {value}"
-    assert found["failed"].startswith(begin)
+    assert failed.startswith(f"1 of 3 figures got worse or were not measured, first {ERROR.name}: {value}")
 
 
-def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_worse(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_worse(monkeypatch, tmp_path, capsys):
     """The check runs in a process of its own, which is left out here."""
     figures = {"rows": [ERROR.row(3.3, "worse"), SSIM.row(0.9, "equal")], "failed": "1 of 2 figures got worse"}
     calls = []
@@ -161,6 +143,7 @@ def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_wo
         return 0, ""
 
     monkeypatch.setattr(bench, "run_module", run_module)
+    monkeypatch.setattr(bench, "source_digests", lambda *modules: {})
     asked = ["bench", "sentinels", "--out", tmp_path / "out", "--runs", tmp_path / "runs"]
     status, out, err = call(asked, capsys)
     assert status == 1
@@ -178,12 +161,72 @@ def test_the_command_prints_and_stores_the_table_and_fails_where_a_figure_got_wo
     assert calls == [CHECKS["sentinels"].function] * 2
 
 
-def test_missing_stored_figures_are_reported_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_stored_figures_are_reported_in_one_line(monkeypatch, tmp_path, capfd):
     """The command, with the process that it starts."""
     monkeypatch.chdir(tmp_path)
     status, out, err = call(["bench", "sentinels", "--out", "out", "--runs", "runs"], capfd)
     assert (status, out, err.count("\n")) == (2, "", 1), err
     assert "stored figures are not on this machine; call it in a checkout" in err
     assert not (tmp_path / "out" / "sentinels.json").exists()
+
+
+DATE = "2020-05-01"
+TEXT = 'def f(x):\n    """Old."""\n    return x + 1\n'
+
+
+def test_digest_ignores_comments_and_docstrings():
+    assert code_digest(
+        '"""New."""\n' + TEXT.replace("Old", "New").replace("return", "# why\n    return")
+    ) == code_digest(TEXT)
+    assert code_digest(TEXT.replace("1", "2")) != code_digest(TEXT)
+
+
+def test_source_of_a_result_has_what_its_module_imports_and_the_models_that_it_names():
+    files = needed_files(*modules_of("stages"))
+    assert {"wrf_mi_bench/stages.py", "wrf_mi/core/files.py", "wrf_mi/models/hybrid/model.py"} <= files.keys()
+    assert "wrf_mi/gaussians/blend.py" in needed_files(*modules_of("elsewhere"))  # of its child process
+    assert "wrf_mi_bench/bench.py" not in files  # a new benchmark makes no other one stale
+    rows = [
+        needed_files(*modules_of_command(f"wrf-mi train rfid-lab --model {name}".split())) for name in ("idw", "fire")
+    ]
+    assert ["wrf_mi/models/uplink/fire.py" in files for files in rows] == [False, True]
+
+
+def test_results_of_changed_source_are_listed(tmp_path, capsys):
+    scan, plan = (provenance(*modules_of(name)) for name in ("large-scan", "flat-plan"))
+    scan[SOURCE] |= {"wrf_mi/scene": "changed"}
+    results = {"flat-plan": plan, "large-scan": scan, "rooms": {"date": DATE}, "stages/part": {"measured": scan}}
+    (tmp_path / "stages").mkdir()
+    for name, content in results.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    assert cli(["bench", "--stale", "--out", str(tmp_path)]) == 0
+    *lines, summary = capsys.readouterr().out.splitlines()
+    part, date = tmp_path / "stages" / "part.json", scan["date"]
+    assert lines[:2] == [
+        f"large-scan: {date}; wrf-mi bench large-scan; changed: wrf_mi/scene",
+        f"rooms: {DATE}; wrf-mi bench rooms; changed: {UNKNOWN}",
+    ]
+    assert lines[2].startswith(f"stages/part: {date}; rm {part}; wrf-mi bench stages; changed: wrf_mi")
+    assert len(lines) == 3
+    assert summary == "2 of 4 results are older than their source, 1 unknown"
+    assert cli(["bench", "demo", "--stale", "--out", str(tmp_path)]) == 2
+
+
+def test_results_without_digest_are_compared_with_the_source_of_their_date(tmp_path):
+    """A repository with this source, but a comment in one folder and a statement in another."""
+    for name, folder in PACKAGES.items():
+        ignored = shutil.ignore_patterns("__pycache__", "results", "[!_]*.[!p]*")
+        shutil.copytree(CHECKOUT / folder / name, tmp_path / folder / name, ignore=ignored)
+    for name, line in (("wrf_mi/core/files.py", "# why"), ("wrf_mi/scene/plan/storey.py", "MADE = 1")):
+        with (tmp_path / name).open("a") as file:
+            file.write(f"{line}\n")
+    out = tmp_path / "benchmarks" / "results"
+    out.mkdir()
+    (out / "flat-plan.json").write_text(json.dumps({"date": DATE}))
+    (out / "rooms.json").write_text(json.dumps({"date": "2019-01-01"}))
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@example.org"]
+    dates = {"GIT_COMMITTER_DATE": f"{DATE}T12:00:00", "GIT_AUTHOR_DATE": f"{DATE}T12:00:00"}
+    for words in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "one"]):
+        subprocess.run([*git, *words], check=True, env={**os.environ, **dates})
+    changed = {result["name"]: result["changed"] for result in stale(out)[0]}
+    assert changed == {"flat-plan": ["wrf_mi/scene/plan"], "rooms": UNKNOWN}

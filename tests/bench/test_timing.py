@@ -1,24 +1,25 @@
-"""How calls are timed, split and compared, on calls whose cost is known."""
-
-from __future__ import annotations
+"""How calls are timed, split and compared, on calls of known cost; growth; work of a training step; times of a GPU."""
 
 import itertools
+import json
+import os
+import sys
 import time
+from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
-from wrf_mi_bench import timing
-from wrf_mi_bench.timing import (
-    Interval,
-    bootstrap,
-    exponent,
-    history_of,
-    interleaved,
-    larger_half,
-    memory_mb,
-    ratio,
-)
+from small_fits import official, settings
+from wrf_mi_bench import gpu, gpu_job, timing, training
+from wrf_mi_bench.bench import all_here
+from wrf_mi_bench.check import main as check_main
+from wrf_mi_bench.scaling import Axis, rows, scale, verdict
+from wrf_mi_bench.timing import Interval, bootstrap, exponent, interleaved, larger_half, memory_mb, ratio
 from wrf_mi_scenes.divided import cluttered_room, divided_room
+
+from wrf_mi.training.trainer import Trainer
 
 BUSY_S = 0.02
 ARRAY_MB = 64
@@ -36,7 +37,7 @@ def array() -> np.ndarray:
     return np.ones(ARRAY_MB * 1_000_000 // 8)
 
 
-def test_bootstrap_interval_holds_the_median_and_narrows() -> None:
+def test_bootstrap_interval_holds_the_median_and_narrows():
     rng = np.random.default_rng(0)
     few, many = (bootstrap(rng.normal(5, 1, n)) for n in (20, 2000))
     assert few.low < few.value < few.high
@@ -47,22 +48,19 @@ def test_bootstrap_interval_holds_the_median_and_narrows() -> None:
         bootstrap([])
 
 
-def test_calls_take_turns_and_warm_up_is_not_timed(clock: list[float]) -> None:
+def test_calls_take_turns_and_warm_up_is_not_timed(clock):
     order: list[str] = []
 
     def call(name: str, cost: float) -> None:
         order.append(name)
-        # The first call of each compiles.
-        clock[0] += cost if order.count(name) > 1 else 100.0
+        clock[0] += cost if order.count(name) > 1 else 100.0  # the first call of each compiles
 
-    calls = {"a": lambda: call("a", 0.002), "b": lambda: call("b", 0.001)}
-    times = interleaved(calls, repeats=4, warm_up=1)
+    times = interleaved({"a": lambda: call("a", 0.002), "b": lambda: call("b", 0.001)}, repeats=4, warm_up=1)
     assert order == [*"ab", *"abba" * 2]
-    np.testing.assert_allclose(times["a"], [2] * 4)
-    np.testing.assert_allclose(times["b"], [1] * 4)
+    np.testing.assert_allclose([times["a"], times["b"]], [[2] * 4, [1] * 4])
 
 
-def test_rounds_end_when_time_is_up_but_three_are_timed(clock: list[float]) -> None:
+def test_rounds_end_when_time_is_up_but_three_are_timed(clock):
     def slow() -> None:
         clock[0] += 10
 
@@ -70,47 +68,39 @@ def test_rounds_end_when_time_is_up_but_three_are_timed(clock: list[float]) -> N
     assert len(interleaved({"slow": slow}, repeats=50, warm_up=1, most_s=75)["slow"]) == 7
 
 
-def test_what_slows_both_calls_leaves_their_ratio(clock: list[float]) -> None:
+def test_what_slows_both_calls_leaves_their_ratio(clock):
     load = itertools.count(1)
-    calls = {"ours": 0.003, "theirs": 0.001}
 
     def cost(seconds: float) -> None:
         clock[0] += seconds * ((next(load) + 1) // 2)  # the same within a round, ever more
 
-    times = interleaved({name: lambda s=s: cost(s) for name, s in calls.items()}, repeats=20, warm_up=1)
+    times = interleaved({"ours": lambda: cost(0.003), "theirs": lambda: cost(0.001)}, repeats=20, warm_up=1)
     assert times["ours"].max() > 5 * times["ours"].min()
-    found = ratio(times["ours"], times["theirs"])
-    np.testing.assert_allclose([found.low, found.value, found.high], 3)
+    interval = ratio(times["ours"], times["theirs"])
+    np.testing.assert_allclose([interval.low, interval.value, interval.high], 3)
     with pytest.raises(ValueError, match="as many of both"):
         ratio([1, 2], [1])
 
 
-def test_history_holds_the_kernels_of_a_call() -> None:
-    import drjit as dr
-    import mitsuba as mi
-
-    total_ms, history = history_of(busy)
+def test_history_holds_the_kernels_of_a_call():
+    total_ms, history = timing.history_of(busy)
     assert total_ms >= 1e3 * BUSY_S
     assert history == []
-    total_ms, (kernel,) = history_of(lambda: dr.sin(dr.arange(mi.Float, 3_000_000) + 1.25))
+    total_ms, (kernel,) = timing.history_of(lambda: dr.sin(dr.arange(mi.Float, 3_000_000) + 1.25))
     assert kernel["cache_hit"]
     assert 0 < kernel["execution_time"] <= total_ms
 
 
-def test_memory_is_what_a_call_needs_beyond_what_was_there() -> None:
-    import drjit as dr
-    import mitsuba as mi
-
-    held = array()
+def test_memory_is_what_a_call_needs_beyond_what_was_there():
+    before = array()
     for _ in range(2):  # the second time, Dr.Jit has freed arrays in store
-        assert ARRAY_MB - PAGES_MB <= memory_mb(array) < ARRAY_MB + SLACK_MB
-        own = memory_mb(lambda: dr.arange(mi.Float, ARRAY_MB * 1_000_000 // 4) + 1)
-        assert ARRAY_MB - PAGES_MB <= own < ARRAY_MB + SLACK_MB
+        for call in (array, lambda: dr.arange(mi.Float, ARRAY_MB * 1_000_000 // 4) + 1):
+            assert ARRAY_MB - PAGES_MB <= memory_mb(call) < ARRAY_MB + SLACK_MB
     assert memory_mb(lambda: None) < SLACK_MB
-    assert held.nbytes == 1e6 * ARRAY_MB
+    assert before.nbytes == 1e6 * ARRAY_MB
 
 
-def test_without_linux_memory_is_watched(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
+def test_without_linux_memory_is_watched(monkeypatch, tmp_path):
     monkeypatch.setattr(timing, "RESET_PEAK", tmp_path / "missing")
 
     def call() -> None:
@@ -121,20 +111,17 @@ def test_without_linux_memory_is_watched(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert ARRAY_MB - PAGES_MB <= memory_mb(call) < ARRAY_MB + SLACK_MB
 
 
-def test_exponent_is_that_of_the_larger_half() -> None:
+def test_exponent_is_that_of_the_larger_half():
     sizes = [10**k for k in range(1, 7)]
     cost = [[1000 + n**1.5] * 3 for n in sizes]  # the overhead hides the growth at first
-    found = exponent(sizes, cost)
-    np.testing.assert_allclose([found.low, found.value, found.high], 1.5, atol=0.01)
-    assert larger_half(6) == slice(3, 6)
-    assert larger_half(4) == slice(1, 4)
-    assert larger_half(3) == slice(1, 3)
-    assert larger_half(2) == slice(0, 2)
+    power = exponent(sizes, cost)
+    np.testing.assert_allclose([power.low, power.value, power.high], 1.5, atol=0.01)
+    assert [larger_half(n) for n in (6, 4, 3, 2)] == [slice(3, 6), slice(1, 4), slice(1, 3), slice(0, 2)]
     with pytest.raises(ValueError, match="two or more"):
         exponent([10], [[1.0]])
 
 
-def test_exponent_is_less_sure_of_noisy_times() -> None:
+def test_exponent_is_less_sure_of_noisy_times():
     rng, sizes = np.random.default_rng(0), [10, 100, 1000, 10000]
     calm, noisy = (exponent(sizes, [n * rng.lognormal(0, s, 9) for n in sizes]) for s in (0.01, 0.5))
     assert noisy.high - noisy.low > 10 * (calm.high - calm.low)
@@ -142,7 +129,7 @@ def test_exponent_is_less_sure_of_noisy_times() -> None:
 
 
 @pytest.mark.parametrize("count", [12, 100, 5000])
-def test_rooms_of_a_number_of_triangles(count: int) -> None:
+def test_rooms_of_a_number_of_triangles(count):
     walls = divided_room(count)
     assert count <= len(walls.faces) <= 1.6 * count
     np.testing.assert_allclose(walls.area, divided_room(12).area)
@@ -155,3 +142,96 @@ def test_rooms_of_a_number_of_triangles(count: int) -> None:
     corners = np.asarray(clutter.vertices)[len(divided_room(12).vertices) :]
     assert np.linalg.norm(corners - clear, axis=1).min() > 1.0
     np.testing.assert_allclose(clutter.area - walls.area, 60, rtol=1e-6)
+
+
+def test_growth_beyond_n_log_n_is_reported(clock):
+    def axis(power: float) -> Axis:
+        def make(n: int):
+            def call() -> None:
+                clock[0] += 1e-7 * n**power
+
+            return call
+
+        return Axis("a", "made up", "things", (10, 100, 1000, 10000), make)
+
+    for power, said in ((1.0, "holds"), (2.0, "does not hold")):
+        growth = scale(axis(power))
+        assert growth["sizes"] == [10, 100, 1000, 10000]
+        assert rows([growth])[0]["asked"].endswith(f": {said}")
+    assert verdict(Interval(1.1, 1.0, 1.3), timing.n_log_n([100, 1000])) == "holds within its interval"
+    # What would take too long is left out, and said.
+    slow = scale(axis(2.0), call_s=1e-3)
+    assert slow["left_out"] == [1000, 10000]
+    assert "1,000 left out" in rows([slow])[0]["what"]
+
+
+SMALL = ("network.width=16", "network.layers=2", "encoding.tx_octaves=3", "encoding.position_octaves=2", "steps=1000")
+ONCE = training.FORWARD + training.BACKWARD
+
+
+def test_operations_follow_from_the_shapes(one_gateway):
+    """WRF-GS+ of 8 Gaussians, two layers of 16 that both see 12 and 18 numbers, nine outputs."""
+    trainer, n, width = Trainer(one_gateway, official(one_gateway), settings(*SMALL)), 8, 16
+    encoded = 2 * (2 * width * 12 * n + 2 * width * 18)  # twice: encodings have no derivative
+    hidden, heads = 3 * 2 * width * width * n, 3 * 2 * 9 * width * n
+    assert training.work_of(trainer).network_gflop * 1e9 == pytest.approx(2 * encoded + hidden + heads, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("model", "walks"),
+    [("wrf-gs+", 4 * ONCE), ("factorised", ONCE + 3 * (training.SHARED_FORWARD + training.SHARED_BACKWARD))],
+)
+def test_static_geometry_is_walked_once_per_batch(model, walks, one_gateway):
+    single, batched = (
+        training.work_of(
+            Trainer(one_gateway, official(one_gateway), settings("steps=9", f"batch={batch}", model=model))
+        )
+        for batch in (1, 4)
+    )
+    assert batched.splat_gflop / single.splat_gflop == pytest.approx(walks / ONCE)
+    assert single.splat_gflop > 0
+    assert single.moved_gb < batched.moved_gb < 4 * single.moved_gb
+
+
+def test_shares_of_a_step_sum_to_one(one_gateway):
+    trainer = Trainer(one_gateway, official(one_gateway), settings(*SMALL))
+    of_step = training.shares(training.some_steps(trainer, 3))
+    assert trainer.state.step == 6
+    assert sum(of_step.values()) >= 1 - 1e-9
+    assert min(of_step.values()) >= 0
+    assert of_step[training.PRODUCTS] > 0
+    assert of_step[training.WALKS] > 0
+
+
+def test_reference_calls_compute_a_product_and_a_copy():
+    rng = np.random.default_rng(0)
+    a, b = (rng.standard_normal((32, 32)) for _ in range(2))
+    np.testing.assert_allclose(training.product_call(32)().numpy(), a @ b, atol=1e-4)
+    assert dr.width(training.stream_call(1000)()) == 1000
+
+
+def test_fit_of_a_subprocess_has_its_time_and_scores(monkeypatch):
+    def run_command(arguments: tuple[str, ...], folder: Path, where: str) -> None:
+        assert arguments == ("train", training.DATA, "--model", "wrf-gs")
+        folder.mkdir()
+        metrics = {"train_seconds": 9.0, "peak_memory_mb": 80.0, "ssim": {"median": 0.9}, "gaussians": 7, "steps": 3}
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+
+    monkeypatch.setattr(training, "run_command", run_command)
+    fit = training.fit("wrf-gs")
+    assert fit["processor_seconds"] >= 0
+    assert (fit["seconds"], fit["peak_memory_mb"], fit["gaussians"]) == (9.0, 80.0, 7)
+
+
+def test_lines_state_the_share_of_the_limit():
+    fit = {"seconds": 90.4, "processor_seconds": 170.0, "peak_memory_mb": 380.2, "ssim": {"median": 0.9731}}
+    work = {"network_gflop": 0.9, "splat_gflop": 0.1, "moved_gb": 0.02}
+    step = {"ms": {"value": 10.0, "low": 9.0, "high": 11.0}, "work": work, "shares": {"products of networks": 0.6}}
+    machine = {"product_gflop_s": 200.0, "stream_gb_s": 20.0}
+    lines = {line["what"]: line for line in training.rows({"wrf-gs+": fit}, {"WRF-GS+, 1": step}, machine)}
+    fitted = lines["WRF-GS+, fit to its final accuracy"]
+    assert fitted["value"] == "90 s, of processors 170 s; 380 MB; median SSIM 0.973"
+    assert fitted["asked"] == "180 s, 2048 MB"
+    # 1 GFLOP at 200 GFLOP/s are 5 ms, 20 MB at 20 GB/s one.
+    assert lines["WRF-GS+, a step of 1 transmitter"]["value"].endswith("at least 5.00 ms, 50 %")
+    assert lines["WRF-GS+, a step of 1 transmitter: where its time goes"]["value"] == "products of networks 60 %"

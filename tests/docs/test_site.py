@@ -1,7 +1,5 @@
 """Documentation site and packaging: pages, drawings, examples of the how-to pages, versions, workflows."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex
@@ -12,14 +10,12 @@ from typing import Any
 
 import pytest
 import yaml
-from documents import blocks
+from documents import CHECKOUT, DOCS, blocks
 
 import wrf_mi
 from wrf_mi import models
 from wrf_mi.graph import receivers
 
-CHECKOUT = Path(__file__).resolve().parents[2]
-DOCS = CHECKOUT / "docs"
 WORKFLOWS = sorted((CHECKOUT / ".github" / "workflows").glob("*.yml"))
 PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+")
 MINUTES = re.compile(r"^(wrf-mi train .+?) --out \S+\s+# ([\d.]+) min$", re.MULTILINE)
@@ -37,7 +33,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_site_is_built_without_warnings_and_lists_every_page(site: Path) -> None:
+def test_site_is_built_without_warnings_and_lists_every_page(site):
     """Sphinx warns of pages without a place in the table of contents, and of links to nothing."""
     front = (site / "index.html").read_text(encoding="utf-8")
     for page in (*DOCS.glob("*.md"), *(DOCS / "howto").glob("*.md")):
@@ -46,7 +42,7 @@ def test_site_is_built_without_warnings_and_lists_every_page(site: Path) -> None
         assert (site / "api" / f"wrf_mi.{name}.html").exists(), name
 
 
-def test_drawings_are_those_of_their_script() -> None:
+def test_drawings_are_those_of_their_script():
     sys.path.insert(0, str(DOCS / "_extensions"))
     import stage_drawings
 
@@ -57,7 +53,7 @@ def test_drawings_are_those_of_their_script() -> None:
         assert stored == stage_drawings.drawing(name), f"{name}: run {stage_drawings.__file__}"
 
 
-def test_examples_of_how_to_pages_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_of_how_to_pages_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before = set(models.MODELS), set(receivers.RECEIVERS)
     names: dict[str, Any] = {"__name__": "how_to_pages"}
@@ -80,28 +76,28 @@ def test_examples_of_how_to_pages_run(tmp_path: Path, monkeypatch: pytest.Monkey
                 del registry._known[name]
 
 
-def test_minutes_of_the_papers_figures_are_the_stored_ones() -> None:
+def test_minutes_of_the_papers_figures_are_the_stored_ones():
     stored = {}
     for path in (CHECKOUT / "benchmarks" / "results" / "tables").glob("*-100-seed0.json"):
         row = json.loads(path.read_text())
         stored[row["command"]] = (row.get("train_seconds") or 0.0, row.get("wall_seconds") or 0.0)
-    found = MINUTES.findall((DOCS / "paper-figures.md").read_text(encoding="utf-8"))
-    assert len(found) >= 15
-    for command, minutes in found:
+    stated = MINUTES.findall((DOCS / "paper-figures.md").read_text(encoding="utf-8"))
+    assert len(stated) >= 15
+    for command, minutes in stated:
         words = [SCENES.get(word, word) for word in shlex.split(command)]
-        trained, whole = stored[" ".join(words)]
+        trained, of_command = stored[" ".join(words)]
         # Ray tracing is not trained: its minutes are those of the command.
-        assert float(minutes) == round((whole if "ray-tracing" in words else trained) / 60, 1), command
+        assert float(minutes) == round((of_command if "ray-tracing" in words else trained) / 60, 1), command
 
 
-def test_versions_agree() -> None:
+def test_versions_agree():
     citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == wrf_mi.__version__
     assert f"## {wrf_mi.__version__}\n" in (DOCS / "changelog.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
-def test_workflows_have_pinned_actions_few_rights_and_existing_targets(path: Path) -> None:
+def test_workflows_have_pinned_actions_few_rights_and_existing_targets(path):
     text = path.read_text(encoding="utf-8")
     content = yaml.safe_load(text)
     assert content["permissions"] == {"contents": "read"}

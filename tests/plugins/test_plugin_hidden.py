@@ -1,7 +1,5 @@
 """Gaussians behind opaque walls are left out, and the field changes by no more than is stated."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr
@@ -9,10 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import wrf_mi_plugins
-from test_plugin_integrator import complex_image, scene_of
-from test_plugin_integrator_rays import gaussians_of
-from test_plugin_integrator_walls import BRICK, FREQUENCY_HZ
-from traced_fields import RECEIVER, any_field
+from test_plugin_integrator_walls import BRICK, CARRIER
+from traced_fields import RECEIVER, any_field, complex_image, gaussians_of, scene_of
 from wrf_mi_plugins import integrator
 
 from wrf_mi.core import InputError
@@ -44,53 +40,43 @@ SHEETS = {
 }
 
 
-def rendered(blending: str, seed: int, power: float, monkeypatch: pytest.MonkeyPatch) -> tuple[np.ndarray, int]:
-    """The field, and how many entries lists had when it was blended."""
-    entries = []
+def rendered(field: Any, power: float, walls: dict[str, Any]) -> tuple[np.ndarray, int]:
+    """The image, and how many entries lists had when it was blended."""
+    entries, blend_rays = [], integrator.blend_rays
 
     def counting(footprints: Any, signal: Any, lists: Any, *more: Any) -> Any:
         entries.append(int(dr.sum(lists.end - lists.begin)[0]))
-        return blend(footprints, signal, lists, *more)
+        return blend_rays(footprints, signal, lists, *more)
 
-    blend = integrator.blend_rays
-    traced = {"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ, "thickness_itu_brick": 0.3, "opaque_power": power}
-    scene = scene_of(gaussians_of(any_field(COUNT, seed, 0.05), blending), integrator=traced, **SHEETS)
-    with monkeypatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(integrator, "blend_rays", counting)
-        image = complex_image(mi.render(scene))
-    return image, entries[0]
+        traced = CARRIER | {"thickness_itu_brick": 0.3, "opaque_power": power}
+        return complex_image(mi.render(scene_of(field, integrator=traced, **walls))), entries[0]
 
 
 @pytest.mark.parametrize("blending", ["alpha", "product"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_error_is_within_the_bound(blending: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_is_within_the_bound(blending, seed):
     """Metal hides at any bound and changes nothing; masonry that passes a sixth of the power does so at 0.2."""
-    strength = np.linalg.norm(any_field(COUNT, seed, 0.05)["signal"], axis=1)
+    arrays = any_field(COUNT, seed, 0.05)
+    field, strength = gaussians_of(arrays, blending), np.linalg.norm(arrays["signal"], axis=1)
     largest = strength.max() if blending == "alpha" else strength.sum()
-    whole, entries = rendered(blending, seed, 0.0, monkeypatch)
-    few, fewer = rendered(blending, seed, 1e-8, monkeypatch)
-    assert fewer < entries
-    assert np.abs(few - whole).max() <= 1e-4 * largest + ROUNDING
-    least, fewest = rendered(blending, seed, 0.2, monkeypatch)
-    assert fewest < fewer
-    error = np.abs(least - whole).max()
-    assert 1e-3 < error <= np.sqrt(0.2) * largest
+    (exact, entries), (few, fewer), (least, fewest) = (rendered(field, power, SHEETS) for power in (0.0, 1e-8, 0.2))
+    assert fewest < fewer < entries
+    assert np.abs(few - exact).max() <= 1e-4 * largest + ROUNDING
+    assert 1e-3 < np.abs(least - exact).max() <= np.sqrt(0.2) * largest
 
 
-def test_gaussians_before_walls_are_kept() -> None:
+def test_gaussians_before_walls_are_kept():
     """A sheet behind all Gaussians hides none, and of a scene without walls nothing is left out."""
     field = gaussians_of(any_field(COUNT, 0, 0.1), "alpha")
-    traced = {"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ}
     for walls in ({}, {"metal": METAL, "far": sheet([60.0, 0, 0], 100.0, METAL["id"])}):
-        images = [
-            complex_image(mi.render(scene_of(field, integrator=traced | {"opaque_power": power}, **walls)))
-            for power in (0.0, 0.5)
-        ]
+        images = [rendered(field, power, walls)[0] for power in (0.0, 0.5)]
         np.testing.assert_array_equal(*images)
         assert np.abs(images[0]).max() > 0.1
 
 
 @pytest.mark.parametrize("power", [-0.1, 1.0])
-def test_invalid_opaque_power_is_refused(power: float) -> None:
+def test_invalid_opaque_power_is_refused(power):
     with pytest.raises((InputError, RuntimeError), match="opaque_power"):
         mi.load_dict({"type": "wrf_traced", "opaque_power": power})

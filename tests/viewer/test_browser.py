@@ -1,7 +1,5 @@
 """Views in a browser: Chromium without a window, where it is installed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -96,9 +94,7 @@ def opened(browser: Browser, folder: Path, content: ViewContent, size: tuple[int
 
 
 @pytest.mark.parametrize(("size", "observed"), [(LAPTOP, "image"), (PHONE, "level")])
-def test_views_need_no_network_and_answer_their_controls(
-    browser: Browser, tmp_path: Path, size: tuple[int, int], observed: str
-) -> None:
+def test_views_need_no_network_and_answer_their_controls(browser, tmp_path, size, observed):
     content = made_view(observed)
     tab, first = opened(browser, tmp_path, content, size)
     assert first == {
@@ -116,18 +112,16 @@ def test_views_need_no_network_and_answer_their_controls(
     # The scene is drawn: neither text nor background has colours.
     part = tab.picture()[60 : size[1] // 2 + 100, : size[0] * 2 // 3].reshape(-1, 3).astype(int)
     assert (np.ptp(part, axis=1) > 40).mean() > 0.02
-    seen = tab.run(CONTROLS)
-    assert seen.pop("chosen").startswith("row 15, SSIM 0.")
-    ceiling = [3, 6, 6]
-    assert seen == {"heights": [1.5], "direct": [3], "fewer": [3, 6, 2 * ELLIPSOID], "ceiling": ceiling}
+    shown = tab.run(CONTROLS)
+    assert shown.pop("chosen").startswith("row 15, SSIM 0.")
+    assert shown == {"heights": [1.5], "direct": [3], "fewer": [3, 6, 2 * ELLIPSOID], "ceiling": [3, 6, 6]}
     assert tab.complaints() == []
-    assert [url for url in tab.requests() if not url.startswith(("data:", "blob:"))] == [
-        (tmp_path / "view.html").as_uri()
-    ]
+    requests = [url for url in tab.requests() if not url.startswith(("data:", "blob:"))]
+    assert requests == [(tmp_path / "view.html").as_uri()]
     tab.close()
 
 
-def test_channels_are_drawn_over_subcarriers(browser: Browser, tmp_path: Path) -> None:
+def test_channels_are_drawn_over_subcarriers(browser, tmp_path):
     content = replace(made_view("curve"), scene=None, gaussians=None, paths=None, maps=[])
     tab, first = opened(browser, tmp_path, content, PHONE)
     assert (first["images"], first["lines"], first["layers"]) == (0, [8, 8], 3)
@@ -135,17 +129,13 @@ def test_channels_are_drawn_over_subcarriers(browser: Browser, tmp_path: Path) -
     tab.close()
 
 
-def test_a_map_alone_is_seen_from_further_back(browser: Browser, tmp_path: Path) -> None:
+def test_a_map_alone_is_seen_from_further_back(browser, tmp_path):
     """Plotly draws flat scenes wider than rooms: their corners would lie outside the picture."""
-    whole = made_view()
-    low = whole.receivers_m * [1, 1, 0] + [0, 0, 0.5]
-    flat = replace(whole, receivers_m=low, scene=None, gaussians=None, paths=None, rows=None, maps=whole.maps[:1])
-    away = []
-    for number, content in enumerate((whole, flat)):
-        (tmp_path / str(number)).mkdir()
-        (tmp_path / str(number) / "view.html").write_text(page(content))
-        tab = browser.open(tmp_path / str(number) / "view.html", *LAPTOP)
-        assert tab.run(READY)
+    view, away = made_view(), []
+    low = view.receivers_m * [1, 1, 0] + [0, 0, 0.5]
+    flat = replace(view, receivers_m=low, scene=None, gaussians=None, paths=None, rows=None, maps=view.maps[:1])
+    for content in (view, flat):
+        tab, _ = opened(browser, tmp_path, content, LAPTOP)
         away.append(tab.run(EYE))
         assert tab.complaints() == []
         tab.close()

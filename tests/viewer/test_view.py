@@ -1,11 +1,10 @@
 """Views of scenes, runs and maps: what they show is what these hold."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,24 +27,26 @@ FLOAT32 = 1e-5
 """Relative rounding of float32."""
 
 
+def trained(data: Path, make: pytest.TempPathFactory, model: str, **options: Any) -> Path:
+    return wrf_mi.train(data, make.mktemp("runs") / model, model, **options).folder
+
+
 @pytest.fixture(scope="module")
 def traced(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, settings = tmp_path_factory.mktemp("runs") / "traced", TracingSettings(depth=2, rays=4096)
-    return wrf_mi.train(flat_folder, folder, "ray-tracing", scene=room, settings=settings).folder
+    settings = TracingSettings(depth=2, rays=4096)
+    return trained(flat_folder, tmp_path_factory, "ray-tracing", scene=room, settings=settings)
 
 
 @pytest.fixture(scope="module")
 def joint(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, depth = tmp_path_factory.mktemp("runs") / "joint", ["traced.depth=1", "traced.rays=4096"]
-    return wrf_mi.train(
-        flat_folder, folder, "wrf-gs+", scene=room, settings=[*SMALL, *depth, "density.max_gaussians=8", "patience=0"]
-    ).folder
+    settings = [*SMALL, "traced.depth=1", "traced.rays=4096", "density.max_gaussians=8", "patience=0"]
+    return trained(flat_folder, tmp_path_factory, "wrf-gs+", scene=room, settings=settings)
 
 
 @pytest.fixture(scope="module")
 def field(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A field of spectra without a scene."""
-    return wrf_mi.train(folder, tmp_path_factory.mktemp("runs") / "field", "wrf-gs+", settings=SMALL).folder
+    return trained(folder, tmp_path_factory, "wrf-gs+", settings=SMALL)
 
 
 def write_map(path: Path, height_m: float = 1.0) -> Path:
@@ -63,29 +64,26 @@ def write_map(path: Path, height_m: float = 1.0) -> Path:
     return path
 
 
-def test_scenes_by_name_folder_file_and_object_show_every_triangle(room: Path, tmp_path: Path) -> None:
+def test_scenes_by_name_folder_file_and_object_show_every_triangle(room, tmp_path):
     scene = open_scene(room, 2.4e9)
     triangles = scene_surfaces(scene).triangles
     for source in (room, room / "scene.xml", scene):
         content = wrf_mi.view(source).content
         assert content.counts == {"triangles": len(triangles)}
-        assert content.scene is not None
         shown = np.concatenate([mesh.corners_m for mesh in content.scene.meshes])
         assert np.sort(shown.ravel()) == pytest.approx(np.sort(triangles.ravel()), rel=FLOAT32)
         ceilings = [mesh for mesh in content.scene.meshes if mesh.ceiling]
-        assert all(mesh.corners_m[..., 2] == pytest.approx(2.7) for mesh in ceilings)
         assert ceilings
-    box = trimesh.creation.box((2, 3, 4))
-    box.export(tmp_path / "box.stl")
-    plain, given = wrf_mi.view(tmp_path / "box.stl"), wrf_mi.view(tmp_path / "box.stl", material="concrete")
-    assert plain.counts == given.counts == {"triangles": 12}
-    for found, name in ((plain, "no material"), (given, "concrete")):
-        assert found.content.scene is not None
-        assert {mesh.material for mesh in found.content.scene.meshes} == {name}
-        assert len(found.content.scene.edges_m) == 12  # those of a box, without diagonals
+        assert all(mesh.corners_m[..., 2] == pytest.approx(2.7) for mesh in ceilings)
+    trimesh.creation.box((2, 3, 4)).export(tmp_path / "box.stl")
+    for options, name in (({}, "no material"), ({"material": "concrete"}, "concrete")):
+        view = wrf_mi.view(tmp_path / "box.stl", **options)
+        assert view.counts == {"triangles": 12}
+        assert {mesh.material for mesh in view.content.scene.meshes} == {name}
+        assert len(view.content.scene.edges_m) == 12  # those of a box, without diagonals
 
 
-def test_the_largest_triangles_are_kept(room: Path) -> None:
+def test_the_largest_triangles_are_kept(room):
     surfaces, materials = surfaces_in(open_scene(room, 2.4e9))
     content, note = scene_content(surfaces, materials, most=4)
     every = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
@@ -95,11 +93,9 @@ def test_the_largest_triangles_are_kept(room: Path) -> None:
     assert note == f"Mesh: the largest 4 of {len(every)} triangles."
 
 
-def test_a_traced_run_shows_its_held_out_rows_and_stored_paths(traced: Path) -> None:
+def test_a_traced_run_shows_its_held_out_rows_and_stored_paths(traced):
     results, content = read_run(traced), wrf_mi.view(traced).content
     rows, paths = content.rows, content.paths
-    assert rows is not None
-    assert paths is not None
     np.testing.assert_array_equal(rows.row, results.row)
     np.testing.assert_array_equal(rows.score, results.score)
     assert (rows.label, rows.higher_is_better) == ("absolute error (dB)", False)
@@ -115,7 +111,7 @@ def test_a_traced_run_shows_its_held_out_rows_and_stored_paths(traced: Path) -> 
     assert set(paths.kinds) == {"line of sight", "reflection", "reflection, reflection"}
 
 
-def test_the_strongest_paths_of_each_pair_are_kept(traced: Path) -> None:
+def test_the_strongest_paths_of_each_pair_are_kept(traced):
     stored = load_trace(traced / "paths.npz")
     kept, every = path_layer(stored, 2), path_layer(stored, 10**6)
     for tx in range(stored.paths.n_tx):
@@ -124,12 +120,10 @@ def test_the_strongest_paths_of_each_pair_are_kept(traced: Path) -> None:
             assert np.sort(kept.gain_db[(kept.tx == tx) & (kept.rx == rx)]) == pytest.approx(best)
 
 
-def test_a_joint_run_shows_gaussians_and_paths_of_its_settings(joint: Path) -> None:
+def test_a_joint_run_shows_gaussians_and_paths_of_its_settings(joint):
     view = wrf_mi.view(joint, transmitters=3, gaussians=5)
     content, run = view.content, open_run(joint)
-    gaussians, rows = content.gaussians, content.rows
-    assert gaussians is not None
-    assert rows is not None
+    gaussians = content.gaussians
     assert view.counts["transmitters"] == 3
     assert (view.counts["gaussians"], gaussians.total) == (5, run.metrics["gaussians"])
     positions_m = np.array(run.field.params["position"], float).T
@@ -137,97 +131,91 @@ def test_a_joint_run_shows_gaussians_and_paths_of_its_settings(joint: Path) -> N
         assert np.abs(positions_m - at_m).max(axis=1).min() < FLOAT32
     strength = (10 ** (gaussians.strength_db / 10)).mean(axis=0)
     assert (np.diff(strength) <= 0).all()
-    assert content.paths is not None
     assert content.paths.order.max() <= 1
     text = " ".join(content.notes)
     for words in ("3 of 6 held-out rows", f"the 5 of {gaussians.total} of", "at most 1 interactions"):
         assert words in text
 
 
-def test_layers_of_two_runs_of_the_same_data_are_combined(traced: Path, joint: Path, field: Path) -> None:
+def test_layers_of_two_runs_of_the_same_data_are_combined(traced, joint, field):
     both = wrf_mi.view(traced, joint)
     assert {"triangles", "gaussians", "paths", "held_out_rows"} <= both.counts.keys()
-    assert both.content.rows is not None
     np.testing.assert_array_equal(both.content.rows.score, read_run(traced).score)
     other = wrf_mi.view(traced, field).content
     assert other.gaussians is None
-    assert "field: of other data than the first run; only its scene is shown." in other.notes
+    assert "wrf-gs+: of other data than the first run; only its scene is shown." in other.notes
 
 
-def test_a_field_of_spectra_shows_them(field: Path) -> None:
+def test_a_field_of_spectra_shows_them(field):
     content, results = wrf_mi.view(open_run(field)).content, read_run(field)
-    assert content.rows is not None
     observed = content.rows.observed
     assert (observed["kind"], observed["size"]) == ("image", list(results.truth.shape[-2:]))
     for key in ("measured", "predicted"):
         assert [len(part) for part in observed[key]] == [len(content.rows.stored)]
     assert content.scene is None
-    assert content.gaussians is not None
     assert content.gaussians.strength_db.shape == (len(content.rows.stored), 8)
 
 
-@pytest.mark.parametrize("placed", [True, False])
-def test_channels_are_curves_where_positions_are_known(placed: bool, tmp_path: Path) -> None:
-    record = channels(placed)
-    model = "idw" if placed else "linear"
-    folder = wrf_mi.train(record, tmp_path / "run", model).folder
-    if not placed:
-        with pytest.raises(InputError, match="neither scene nor positions are known"):
-            wrf_mi.view(open_run(folder, record))
-        return
-    rows = wrf_mi.view(open_run(folder, record)).content.rows
-    assert rows is not None
+def test_channels_are_curves_where_positions_are_known(tmp_path):
+    record, unplaced = channels(True), channels(False)
+    run = open_run(wrf_mi.train(record, tmp_path / "placed", "idw").folder, record)
+    rows = wrf_mi.view(run).content.rows
     assert rows.observed["kind"] == "curve"
     assert rows.observed["measured"]["shape"] == [1, 10, 4]
-    power = np.square(np.abs(read_run(folder).truth)).mean(axis=2)
-    assert power_db(read_run(folder).truth) == pytest.approx(10 * np.log10(power))
+    truth = read_run(tmp_path / "placed").truth
+    assert power_db(truth) == pytest.approx(10 * np.log10(np.square(np.abs(truth)).mean(axis=2)))
+    folder = wrf_mi.train(unplaced, tmp_path / "unplaced", "linear").folder
+    with pytest.raises(InputError, match="neither scene nor positions are known"):
+        wrf_mi.view(open_run(folder, unplaced))
 
 
-def test_representative_rows_span_the_scores() -> None:
+def test_representative_rows_span_the_scores():
     score = np.array([[5.0, 1.0, 3.0, np.nan, 2.0, 4.0], [5.0, 1.0, 3.0, np.nan, 2.0, np.nan]])
     np.testing.assert_array_equal(representative(score, 3), [0, 1, 2])  # best, worst and median
     np.testing.assert_array_equal(representative(score, 9), np.arange(6))
     np.testing.assert_array_equal(representative(np.full((1, 4), np.nan), 2), [0])
 
 
-def test_maps_are_shown_with_their_heights(traced: Path, tmp_path: Path) -> None:
+def test_maps_are_shown_with_their_heights_and_thinned_where_they_are_large(traced, tmp_path):
     files = [write_map(tmp_path / f"at{height}.nc", height) for height in (0.5, 1.5)]
     content = wrf_mi.view(traced, *files).content
     assert content.counts["maps"] == 2
-    assert [one.height_m for one in content.maps] == [0.5, 1.5]
+    assert [layer.height_m for layer in content.maps] == [0.5, 1.5]
     first = content.maps[0]
     assert first.labels == {"power_dbm": "received power (dBm)", "best_receiver": "best receiver"}
-    assert first.values["power_dbm"].shape == (2, 3, 5)
-    assert first.values["best_receiver"].shape == (1, 3, 5)
-    assert first.receivers == ("anchor1", "anchor2")
+    shapes = {name: values.shape for name, values in first.values.items()}
+    assert shapes == {"power_dbm": (2, 3, 5), "best_receiver": (1, 3, 5)}
+    assert first.receivers == ("anchor1", "anchor2") == tuple(wrf_mi.view(files[0]).content.receivers)
     assert any("spectrum not shown" in note for note in content.notes)
-    alone = wrf_mi.view(files[0]).content
-    assert tuple(alone.receivers) == first.receivers
+    (thin,), notes = thinned([first], most=20)
+    assert len(notes) == 1
+    np.testing.assert_array_equal(thin.values["power_dbm"], first.values["power_dbm"][:, ::2, ::2])
+    np.testing.assert_array_equal(thin.x_m, first.x_m[::2])
+    assert thinned([first])[0] == [first]
 
 
-def test_maps_of_surfaces_and_datasets_are_points(tmp_path: Path) -> None:
+def test_maps_of_surfaces_and_datasets_are_points(tmp_path):
     xarray = pytest.importorskip("xarray")
-    places = np.random.default_rng(2).uniform(size=(3, 20))
-    points = {axis: ("point", values) for axis, values in zip("xyz", places, strict=True)}
+    positions = np.random.default_rng(2).uniform(size=(3, 20))
+    points = {axis: ("point", values) for axis, values in zip("xyz", positions, strict=True)}
     values = {"power_dbm": (("receiver", "point"), np.arange(20.0)[None])}
-    found, notes = read_map(xarray.Dataset(values, {**points, "receiver": ["a"]}))
-    assert (found.height_m, notes) == (None, [])
-    assert found.z_m == pytest.approx(places[2])
-    (thin,), (note,) = thinned([found], most=6)
+    layer, notes = read_map(xarray.Dataset(values, {**points, "receiver": ["a"]}))
+    assert (layer.height_m, notes) == (None, [])
+    assert layer.z_m == pytest.approx(positions[2])
+    (thin,), (note,) = thinned([layer], most=6)
     np.testing.assert_array_equal(thin.values["power_dbm"], [[0, 4, 8, 12, 16]])
     assert note == "Maps: every 2th position along each axis (every 4th point of a surface)."
 
 
-def test_a_chunk_that_ends_its_decompressor_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_chunk_that_ends_its_decompressor_is_refused_in_one_line(tmp_path):
     xarray, folder = pytest.importorskip("xarray"), tmp_path / "map.zarr"
     pytest.importorskip("zarr")
     power = np.random.default_rng(0).uniform(-90, -40, (2, 7, 8)).astype(np.float32)
     axes = {"x": np.arange(8.0), "y": np.arange(7.0), "height": 1.0, "receiver": ["a", "b"]}
-    made = xarray.Dataset({"power_dbm": (("receiver", "y", "x"), power)}, axes)
-    made.to_zarr(folder, zarr_format=2)
-    found, _ = read_map(folder)
-    np.testing.assert_array_equal(found.values["power_dbm"], power)
-    assert (found.name, found.receivers, found.height_m) == ("map.zarr", ("a", "b"), 1.0)
+    xarray.Dataset({"power_dbm": (("receiver", "y", "x"), power)}, axes).to_zarr(folder, zarr_format=2)
+    layer, _ = read_map(folder)
+    np.testing.assert_array_equal(layer.values["power_dbm"], power)
+    assert (layer.name, layer.receivers, layer.height_m) == ("map.zarr", ("a", "b"), 1.0)
     chunk = folder / "power_dbm" / "0.0.0"
     head = chunk.read_bytes()[:14]  # of Blosc, but for the higher bytes of the compressed size
     chunk.write_bytes(head.ljust(500, b"\1"))
@@ -235,40 +223,31 @@ def test_a_chunk_that_ends_its_decompressor_is_refused_in_one_line(tmp_path: Pat
         read_map(folder)
 
 
-def test_large_maps_are_thinned(tmp_path: Path) -> None:
-    found, _ = read_map(write_map(tmp_path / "map.nc"))
-    (thin,), notes = thinned([found], most=20)
-    assert thin.values["power_dbm"].shape == (2, 2, 3)
-    np.testing.assert_array_equal(thin.values["power_dbm"], found.values["power_dbm"][:, ::2, ::2])
-    np.testing.assert_array_equal(thin.x_m, found.x_m[::2])
-    assert len(notes) == 1
-    assert thinned([found])[0] == [found]
-
-
-def test_command_writes_one_file(traced: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_one_file(traced, room, tmp_path, capsys):
     out = tmp_path / "new" / "view.html"
     status, printed, err = call(["view", traced, "--out", out, "--transmitters", 2, "--paths", 1], capsys)
     assert status == 0
     assert printed.splitlines()[-1] == f"view: {out} ({out.stat().st_size / 1e6:.1f} MB)"
     assert err.startswith("opening the scene\n")
     status, printed, _ = call(["view", room, "--out", out, "--json"], capsys)
-    found = json.loads(printed)
-    assert (status, found["bytes"], found["notes"]) == (0, out.stat().st_size, [])
-    assert found["triangles"] > 0
-    assert found["bytes"] < 15e6
+    counts = json.loads(printed)
+    assert (status, counts["bytes"], counts["notes"]) == (0, out.stat().st_size, [])
+    assert counts["triangles"] > 0
+    assert counts["bytes"] < 15e6
 
 
-def test_command_refuses_in_one_line(
-    traced: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_command_refuses_in_one_line(traced, tmp_path, capsys, monkeypatch):
     out = tmp_path / "view.html"
-    refused(["view", tmp_path / "no", "--out", out], "no: no such file; give a run folder, a map or a scene", capsys)
-    refused(["view", tmp_path / "no.nc", "--out", out], "no.nc: no such file", capsys)
-    refused(["view", tmp_path / "no.stl", "--out", out], "no.stl: no such file", capsys)
+    (tmp_path / "bad.nc").write_bytes(b"no map")
+    for source, message in (
+        ("no", "no: no such file; give a run folder, a map or a scene"),
+        ("no.nc", "no.nc: no such file"),
+        ("no.stl", "no.stl: no such file"),
+        ("bad.nc", "bad.nc: not readable"),
+    ):
+        refused(["view", tmp_path / source, "--out", out], message, capsys)
     refused(["view", traced, "--out", tmp_path], "a folder; give the name of a file", capsys)
     refused(["view", traced, "--out", out, "--gaussians", 0], "setting gaussians: 0 is out of range", capsys)
-    (tmp_path / "bad.nc").write_bytes(b"no map")
-    refused(["view", tmp_path / "bad.nc", "--out", out], "bad.nc: not readable", capsys)
     assert not out.exists()
     with pytest.raises(InputError, match="nothing to show"):
         wrf_mi.view()
@@ -278,5 +257,5 @@ def test_command_refuses_in_one_line(
         refused(["view", tmp_path / file, "--out", out], rf"need {package}: pip install 'wrf-mi\[view\]'", capsys)
 
 
-def test_options_have_the_documented_defaults() -> None:
+def test_options_have_the_documented_defaults():
     assert ViewOptions() == ViewOptions(transmitters=40, gaussians=1000, paths=200)

@@ -1,4 +1,4 @@
-"""Point clouds and bare meshes from files, units in LAS, damage; `test_density_and_initial.py` has other formats."""
+"""Point clouds and bare meshes from files, units in LAS, damage; `test_initial.py` has other formats."""
 
 import importlib
 import logging

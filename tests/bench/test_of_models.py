@@ -1,0 +1,180 @@
+"""Benchmarks of models: stages and intervals of the hybrid, rows saved, positions, new receivers, stored parts."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from wrf_mi_bench import bench, comparison, stages
+from wrf_mi_bench.comparison import MEASURED, STORED, measured_on, stored_part
+from wrf_mi_bench.locate import CELLS as LOCATE_CELLS
+from wrf_mi_bench.locate import STRETCH, stretches, summary
+from wrf_mi_bench.rows_saved import CURVES, IDW, ROWS, measure, picture, rows_needed, saved
+from wrf_mi_bench.rows_saved import JOINT as JOINT_START
+from wrf_mi_bench.stages import CALIBRATED, CELLS, JOINT, LAB, Cell, parts_of, rows_of, table
+from wrf_mi_bench.unmeasured import HYBRID, LAW, gains, only
+
+from wrf_mi.core import Receiver, Record
+from wrf_mi.datasets import make_splits
+
+
+def test_part_is_measured_once_and_stored_with_machine_and_date(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(bench, "source_digests", lambda *modules: {})
+    calls: list[int] = []
+
+    def score() -> dict[str, Any]:
+        calls.append(1)
+        return {"score": len(calls)}
+
+    first = stored_part("rooms", "part", score)
+    assert stored_part("rooms", "part", score) == first
+    assert first["score"] == 1
+    assert {"date", "machine", "versions", "source"} <= set(first[MEASURED])
+    (STORED / "rooms" / "part.json").unlink()
+    assert stored_part("rooms", "part", score)["score"] == 2
+
+
+@pytest.mark.parametrize(
+    ("days", "stated"), [(["2026-01-02"], "2026-01-02"), (["2026-01-02", "2025-12-31"], "2025-12-31 to 2026-01-02")]
+)
+def test_dates_of_parts(days, stated):
+    assert measured_on([{MEASURED: {"date": day}} for day in days]) == stated
+
+
+def test_intervals_of_runs_are_stored_and_those_outside_are_counted(tmp_path, monkeypatch):
+    asked = list[tuple[str, str]]()
+
+    def measured(cell: Cell, name: str, _: Any) -> dict[str, Any]:
+        asked.append((cell.name, name))
+        return {"block": "ssim", "score": {}, "inside_90": 0.97 if name == JOINT else 0.9, "crps": 0.02}
+
+    monkeypatch.setattr(comparison, "STORED", tmp_path)
+    cells = Cell("open", "official", None), Cell("meshed", "blocked", 400)
+    replaced = {"RUNS": tmp_path / "runs", "INTERVAL_CELLS": cells, "measured_intervals": measured}
+    for name, value in (replaced | {"data_folder": lambda name: tmp_path}).items():
+        monkeypatch.setattr(stages, name, value)
+    result = stages.intervals()
+    assert asked == [
+        (cell, name) for cell in ("open-official-all", "meshed-blocked-400") for name in stages.INTERVAL_MODELS
+    ]
+    assert (result["inside"], result["runs"]) == (4, 6)
+    assert result["failed"] == "intervals cover 85 to 95 % in 4 of 6 runs"
+    assert stages.intervals()["rows"] == result["rows"]
+    assert len(asked) == 6  # the second time from the files
+    assert stages.interval_table(result["rows"]).splitlines()[2:] == [
+        "| open, official, all rows | 90%, 0.02 | 97%, 0.02 | 90%, 0.02 |",
+        "| meshed, blocked, 400 rows | 90%, 0.02 | 97%, 0.02 | 90%, 0.02 |",
+    ]
+
+
+def test_table_names_stages_the_best_part_and_those_that_are_clearly_better():
+    def measured(model: str, median: float, gains: tuple[float, ...] = (), **more: Any) -> dict[str, Any]:
+        score = {"median": median, "mean": median - 0.01}
+        gain = dict(zip(("gain", "gain_low", "gain_high"), gains, strict=False))
+        return {"model": model, "score": score, "block": "ssim", "inside_90": None, "crps": None} | gain | more
+
+    kept = [("mean", True, 0.7, None), ("correction", False, 0.695, 3.0), ("field", True, None, 1.0)]
+    in_turn = [dict(zip(("stage", "kept", "held_out", "seconds"), values, strict=True)) for values in kept]
+    results = [
+        measured("hybrid", 0.9, inside_90=0.88, crps=0.02, stages=in_turn),
+        measured("kriging", 0.92, (-0.02, -0.03, -0.01)),
+        measured("idw", 0.7, (0.2, 0.1, 0.3)),
+        measured(JOINT, 0.91, (-0.01, -0.03, 0.01)),
+    ]
+    assert table(rows_of(CELLS[0], results)).splitlines()[2] == (
+        "| rfid-lab, official, 5 rows | **0.9** (0.89) | 88% | 0.02 | mean 0.7, ~~correction 0.695~~, field "
+        "| kriging 0.92 (0.91) | -0.02 (-0.03 to -0.01) | 0.92 | 0.7 | kriging |"
+    )
+
+
+@pytest.mark.parametrize(
+    ("task", "scene", "parts"),
+    [
+        ("spectrum", None, ["kriging", "idw"]),
+        ("spectrum", "room", ["kriging", "idw", "ray-tracing", JOINT]),
+        ("rssi", "flat", ["kriging", "idw", "ray-tracing", CALIBRATED]),
+    ],
+)
+def test_parts_are_those_of_the_task_and_the_scene(task, scene, parts):
+    assert parts_of(task, scene) == parts
+
+
+@pytest.mark.parametrize(("goal", "rows"), [(2.5, 20 * 2**0.5), (0.5, 10), (4, None)])
+def test_rows_needed_are_where_the_curve_reaches_the_score(goal, rows):
+    """And the same of a score that is the better the lower."""
+    expected = None if rows is None else pytest.approx(rows)
+    assert rows_needed((10, 20, 40), (1, 2, 3), goal, True) == expected
+    assert rows_needed((10, 20, 40), (-1, -2, -3), -goal, False) == expected
+
+
+@pytest.mark.slow
+def test_a_cell_is_measured_with_all_starts_and_the_paths_alone(tmp_path):
+    scores = measure(Cell(LAB, "official", 5), 0, tmp_path / "cell", steps=2)
+    assert {*CURVES, IDW, "task"} == set(scores)
+    assert len({scores[name] for name in CURVES}) == len(CURVES)
+    assert not (tmp_path / "cell").exists()
+
+
+def test_table_states_the_share_of_the_rows_and_the_picture_has_a_panel_a_data_set():
+    shared = {"seed": 0, "task": "spectrum", IDW: 0.1}
+    scores = [
+        {"dataset": name, "rows": n, **shared, **dict.fromkeys(CURVES, k), JOINT_START: k + 1}
+        for name, rows in ROWS.items()
+        for k, n in enumerate(rows)
+    ]
+    lines = saved(scores)
+    assert "joint needs 80 (50%)" in next(line for line in lines if line["what"] == f"{LAB}, 160 rows")["value"]
+    assert len(picture(scores).axes) == len(ROWS)
+    assert len(lines) == sum(map(len, ROWS.values()))
+
+
+def positions(error_m: float, inside: float, count: int = 10 * STRETCH) -> dict[str, Any]:
+    """A cell whose errors are those of nearest neighbours less half a metre, in the share ``inside`` of its regions."""
+    hits = np.random.default_rng(0).permutation(np.arange(count) < inside * count)
+    values = {"error_m": error_m, "neighbours_error_m": error_m + 0.5, "best_neighbours_error_m": error_m}
+    values |= {"area_m2": 1.0, "radius_m": 1.0}
+    return {name: [value] * count for name, value in values.items()} | {"inside": hits.tolist()}
+
+
+def test_draws_are_pooled_and_judged_together():
+    shares = {0: 0.8, 1: 1.0, 2: 0.9}
+    result = summary({cell: positions(1.0 + cell.seed, shares[cell.seed]) for cell in LOCATE_CELLS})
+    rows = {row["what"]: row for row in result["rows"]}
+    pooled = rows["64 rows, hybrid, knows walls, 3 draws"]
+    assert pooled["mean_m"] == pytest.approx(2.0)
+    assert pooled["gain_m"] == pytest.approx([0.5] * 3)
+    assert pooled["inside"][0] == pytest.approx(0.9)
+    assert "all rows, hybrid, knows walls, seed 0" in rows
+    assert result["coverage_outside"] == ["all rows, hybrid, knows walls, seed 0"]  # 80 %; of 64 rows 90 % in the mean
+    assert result["not_clearly_better"] == []
+    assert "failed" in result
+
+
+def test_stretches_are_means_of_consecutive_rows_over_draws():
+    values = np.stack([np.arange(50.0), np.arange(50.0) + 2])
+    np.testing.assert_allclose(stretches(values), [np.arange(20).mean() + 1, np.arange(20, 50).mean() + 1])
+
+
+def test_new_receivers_alone_see_the_rows_left_to_them():
+    receivers = tuple(Receiver(f"rx{k}", np.array([k, 0.0, 1.0]), np.array([0.0, 0, 0, 1])) for k in range(3))
+    observed = -np.arange(180, dtype=np.float32).reshape(3, 60)
+    official, tx_pos_m = (np.arange(40), np.arange(40, 60)), np.random.default_rng(0).uniform(1, 5, (60, 3))
+    record = Record("made-up", "rssi", tx_pos_m, receivers, observed, official)
+    (split,) = make_splits(record, "receiver+5:1")
+    alone, rows = only(record, split)
+    assert [receiver.name for receiver in alone.receivers] == ["rx1"]
+    np.testing.assert_array_equal(rows.train, split.left[:, 1])
+    np.testing.assert_array_equal(rows.test, split.test)
+    known = np.flatnonzero(np.isfinite(alone.observation[0]))
+    np.testing.assert_array_equal(known, np.union1d(split.left[:, 1], split.test))
+    np.testing.assert_array_equal(alone.observation[0, known], observed[1, known])
+
+
+def test_seeds_that_score_the_same_rows_do_not_narrow_an_interval():
+    errors = np.random.default_rng(1).uniform(1, 3, (2, 50))
+    scores = {HYBRID: errors[0].tolist(), LAW: errors[1].tolist(), "inside_90": 0.9, "crps": 1.0, "task": "rssi"}
+    scores["pairs"] = [["rx", row] for row in range(50)]
+    once, thrice = (gains([scores] * count)[LAW] for count in (1, 3))
+    assert once[2].value == pytest.approx((errors[1] - errors[0]).mean())
+    assert (thrice[2].low, thrice[2].high) == pytest.approx((once[2].low, once[2].high))
+    assert thrice[:2] == pytest.approx(once[:2])
