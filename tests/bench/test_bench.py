@@ -51,7 +51,6 @@ ON_PAGE = {
     "scaling": "speed.md",
     "operator": "speed.md",
     "training": "speed.md",
-    "stress": "numerics.md",
     "elsewhere": "numerics.md",
     "rooms": "correction.md",
     "stages": "hybrid.md",
@@ -60,10 +59,10 @@ ON_PAGE = {
     "new-receivers": "hybrid.md",
     "locate": "locate.md",
     "phase-error": "scenes.md",
-    "sentinels": "results.md",
-    "robustness": "robustness.md",
 }
-"""Pages that show a check's table; all others are in `docs/results.md`."""
+"""Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
+NOT_LISTED = ("stress", "robustness", "sentinels")
+"""Checks of many rows; `docs/numerics.md` summarises the first two."""
 OTHER_BLOCKS = ("checks", "figures", "pareto", "ratios")
 """Blocks of pages that are made from several results."""
 
@@ -148,7 +147,7 @@ def test_bench_on_workers_writes_figures_and_reports_failures(
 def test_documents_show_the_stored_results() -> None:
     results = (CHECKOUT / "docs" / "results.md").read_text()
     trained, checked = read_results(RESULTS)
-    others = [one for one in checked if one["case"] not in ON_PAGE]
+    others = [one for one in checked if one["case"] not in {*ON_PAGE, *NOT_LISTED}]
     for one in checked:
         name = one["case"]
         if name in ON_PAGE:
@@ -186,12 +185,19 @@ def summary_table(rows: Sequence[Mapping[str, str]]) -> str:
 
 def test_documents_show_the_worst_of_each_stage() -> None:
     rows = json.loads((RESULTS / "stress.json").read_text())["figures"]["rows"]
-    shown = (CHECKOUT / "docs" / "results.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
+    shown = (CHECKOUT / "docs" / "numerics.md").read_text().split("<!-- stress -->")[1].split("<!-- /stress -->")[0]
     assert shown.strip() == summary_table(rows)
     shown_stages = [next((words for words, begins in STAGES if re.match(begins, row["what"])), None) for row in rows]
     assert set(shown_stages) >= {words for words, _ in STAGES}
     worse = [{**row, "value": "worst 9.0e-01"} if row["what"].startswith("phase") else row for row in rows]
     assert "| **9.0e-01** | 0.001 |" in summary_table(worse)
+
+
+def test_documents_show_the_robustness_without_single_files() -> None:
+    result = json.loads((RESULTS / "robustness.json").read_text())
+    rows = [row for row in result["figures"]["rows"] if " inputs, " not in row["value"]]
+    shown = check_table([{"title": CHECKS["robustness"].title, "figures": {"rows": rows}}])
+    assert f"<!-- robustness -->\n{shown}\n<!-- /robustness -->" in (CHECKOUT / "docs" / "numerics.md").read_text()
 
 
 def test_stored_results_are_complete() -> None:

@@ -18,8 +18,8 @@ BLOCK = re.compile(r"<!-- ([\w/-]+) -->\n.*?<!-- /\1 -->", re.DOTALL)
 STATED = {
     *(("conventions.md", "score"), ("correction.md", "part"), ("data.md", "name"), ("data.md", "task")),
     *(("export.md", "format"), ("joint.md", "setting"), ("locate.md", "column"), ("maps.md", "variable")),
-    *(("changelog.md", "0.1.0"), ("model.md", "constant"), ("model.md", "setting"), ("numerics.md", "")),
-    *(("plugins.md", "parameter"), ("speed.md", "omitted"), ("tables.md", "question")),
+    *(("changelog.md", "0.1.0"), ("gaussians.md", "constant"), ("gaussians.md", "setting"), ("numerics.md", "")),
+    *(("plugins.md", "parameter"), ("speed.md", "omitted")),
     *(("mesh.md", "you have"), ("receiver.md", "what"), ("check.md", "kind"), ("own-data.md", "your table")),
     *(("data.md", "columns of receivers"), ("data.md", "columns of rows")),
 }

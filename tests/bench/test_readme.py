@@ -74,7 +74,7 @@ def test_scripts_of_the_readme_run(tiny_folder: Path, tmp_path: Path, monkeypatc
     for shown, tiny in (('"rfid-lab"', repr(str(tiny_folder))), ('"steps=6000"', '"steps=2"')):
         assert script.count(shown) == 1
         script = script.replace(shown, tiny)
-    script += "\n".join(blocks(CHECKOUT / "docs" / "model.md", "python"))
+    script += "\n".join(blocks(CHECKOUT / "docs" / "gaussians.md", "python"))
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     exec(compile(script, str(README), "exec"), names)
@@ -129,8 +129,8 @@ def test_links_and_paths_exist(path: Path) -> None:
         assert (CHECKOUT / name).exists(), name
 
 
-def test_model_page_states_the_defaults_and_constants() -> None:
-    rows = cell_rows((CHECKOUT / "docs" / "model.md").read_text(encoding="utf-8"))
+def test_gaussians_page_states_the_defaults_and_constants() -> None:
+    rows = cell_rows((CHECKOUT / "docs" / "gaussians.md").read_text(encoding="utf-8"))
     constants = [row for row in rows if row[0].isupper()]
     settings = [row for row in rows if not row[0].isupper()]
     assert constants

@@ -20,7 +20,7 @@ SITE = {"_build", "api", "notebooks"}
 PAGES = [README, *(page for page in sorted((CHECKOUT / "docs").rglob("*.md")) if not SITE & set(page.parts))]
 PARALLEL = 0.02
 """Relative difference of figures after a fit whose parallel sums differ in the last digits: 1.4 % was seen."""
-CONTINUED = {"model.md": README}
+CONTINUED = {"gaussians.md": README}
 """Pages whose code goes on from that of another one."""
 WRITES = {"train": 1, "plan_sweep": 0, "make_scene": 1, "edit_scene": 1, "compare": 1}
 """Functions that write a folder, and the place of its name among their arguments."""
