@@ -55,14 +55,12 @@ ON_PAGE = {
     "rooms": "correction.md",
     "stages": "hybrid.md",
     "intervals": "hybrid.md",
-    "new-carriers": "hybrid.md",
-    "new-receivers": "hybrid.md",
     "locate": "locate.md",
     "phase-error": "scenes.md",
 }
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
-NOT_LISTED = ("stress", "robustness", "sentinels")
-"""Checks of many rows; `docs/numerics.md` summarises the first two."""
+NOT_LISTED = ("stress", "robustness", "sentinels", "new-carriers", "new-receivers")
+"""Checks of many rows or of a former hybrid; `docs/numerics.md` summarises the first two."""
 OTHER_BLOCKS = ("checks", "figures", "pareto", "ratios")
 """Blocks of pages that are made from several results."""
 
