@@ -46,8 +46,8 @@ def on_site(text: str, docs: Path, folder: Path) -> str:
             # From the top, as those of an included file are relative to the page that includes it.
             return f"[{shown}](/{path.relative_to(docs)}{anchor})"
         checkout = docs.parent
-        pages = {checkout / "README.md": "/index.md", checkout / "benchmarks/results/tables/README.md": "/tables.md"}
-        pages[checkout / "benchmarks/results/tables"] = "/tables.md"
+        tables = checkout / "benchmarks/results/tables"
+        pages = {checkout / "README.md": "/index.md", tables: "/all-tables.md", tables / "README.md": "/all-tables.md"}
         if path in pages:
             return f"[{label}]({pages[path]})"
         if path.parent == checkout / "notebooks":

@@ -56,7 +56,7 @@ def test_scripts_of_the_readme_run(tmp_path, monkeypatch, capsys):
     for shown, tiny in (('"rfid-lab"', repr(str(folder))), ('"steps=6000"', '"steps=2"')):
         assert script.count(shown) == 1
         script = script.replace(shown, tiny)
-    script += "\n".join(blocks(DOCS / "model.md", "python"))
+    script += "\n".join(blocks(DOCS / "gaussians.md", "python"))
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     exec(compile(script, str(README), "exec"), names)
@@ -109,8 +109,8 @@ def test_links_and_paths_exist(path):
         assert (CHECKOUT / name).exists(), name
 
 
-def test_model_page_states_the_defaults_and_constants():
-    rows = cell_rows((DOCS / "model.md").read_text(encoding="utf-8"))
+def test_gaussians_page_states_the_defaults_and_constants():
+    rows = cell_rows((DOCS / "gaussians.md").read_text(encoding="utf-8"))
     constants, settings = ([row for row in rows if row[0].isupper() == upper] for upper in (True, False))
     assert constants
     assert settings
@@ -144,8 +144,8 @@ BLOCK = re.compile(r"<!-- ([\w/-]+) -->\n.*?<!-- /\1 -->", re.DOTALL)
 STATED = {
     *(("conventions.md", "score"), ("correction.md", "part"), ("data.md", "name"), ("data.md", "task")),
     *(("export.md", "format"), ("joint.md", "setting"), ("locate.md", "column"), ("maps.md", "variable")),
-    *(("changelog.md", "0.1.0"), ("model.md", "constant"), ("model.md", "setting"), ("numerics.md", "")),
-    *(("plugins.md", "parameter"), ("speed.md", "omitted"), ("tables.md", "question")),
+    *(("changelog.md", "0.1.0"), ("gaussians.md", "constant"), ("gaussians.md", "setting"), ("numerics.md", "")),
+    *(("plugins.md", "parameter"), ("speed.md", "omitted")),
     *(("mesh.md", "you have"), ("receiver.md", "what"), ("check.md", "kind"), ("own-data.md", "your table")),
     *(("data.md", "columns of receivers"), ("data.md", "columns of rows")),
 }

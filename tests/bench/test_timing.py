@@ -2,8 +2,6 @@
 
 import itertools
 import json
-import os
-import sys
 import time
 from pathlib import Path
 
@@ -12,9 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from small_fits import official, settings
-from wrf_mi_bench import gpu, gpu_job, timing, training
-from wrf_mi_bench.bench import all_here
-from wrf_mi_bench.check import main as check_main
+from wrf_mi_bench import timing, training
 from wrf_mi_bench.scaling import Axis, rows, scale, verdict
 from wrf_mi_bench.timing import Interval, bootstrap, exponent, interleaved, larger_half, memory_mb, ratio
 from wrf_mi_scenes.divided import cluttered_room, divided_room

@@ -17,7 +17,7 @@ from documents import CHECKOUT, DOCS, PAGE_NAMES, PAGES, README, blocks
 
 PARALLEL = 0.02
 """Relative difference of figures after a fit whose parallel sums differ in the last digits: 1.4 % was seen."""
-CONTINUED = {"model.md": README}
+CONTINUED = {"gaussians.md": README}
 """Pages whose code goes on from that of another one."""
 WRITES = {"train": 1, "plan_sweep": 0, "make_scene": 1, "edit_scene": 1, "compare": 1}
 """Functions that write a folder, and the place of its name among their arguments."""

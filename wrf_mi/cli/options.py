@@ -44,7 +44,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     """Add data set, model, split and settings."""
     add = parser.add_argument
     add("dataset", nargs="?", metavar="DATASET", help=DATASET)
-    add("--model", choices=list(MODELS), help="model to fit (default: hybrid); baselines: docs/baselines.md")
+    add("--model", choices=list(MODELS), help="model to fit (default: hybrid); baselines: docs/models.md")
     text = "stages of the hybrid that may be used, from mean,calibration,correction,surfaces,field,residual"
     add("--stages", metavar="LIST", help=f"{text} (default: all that the data allow)")
     add("--fast", action="store_true", help="the hybrid without its field, whose training takes most of the time")

@@ -8,7 +8,7 @@ encoding is that of the WRF-GS+ paper, section V-A, after NeRF:
 The paper sets L = 9, ten octaves, and does not say on what scale of coordinates. Here ``t`` is the coordinate in metres
 divided by ``scale_m``, so the shortest period is ``2 * scale_m / 2^L``: 4 mm for L = 9 and one metre. A field changes
 over about half a wavelength, which for 915 MHz is 0.16 m: shorter periods let a network memorise its training
-positions, which is why fewer octaves predict better (see `docs/model.md`). The longest period is ``2 * scale_m``:
+positions, which is why fewer octaves predict better (see `docs/gaussians.md`). The longest period is ``2 * scale_m``:
 transmitters at that distance along an axis have equal features.
 """
 
