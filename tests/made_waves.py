@@ -18,10 +18,7 @@ ELEMENTS_M = planar_array(3, 3, 0.45 * WAVELENGTH_M)
 SIZE = (16, 32)
 CONE_DEG = 70.0
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
-RECEIVERS = (
-    Receiver("one", np.array([3.0, 1.0, -0.5]), UPRIGHT),
-    Receiver("two", np.array([-1.0, 4.0, 1.0]), UPRIGHT),
-)
+RECEIVERS = (Receiver("one", np.array([3.0, 1.0, -0.5]), UPRIGHT), Receiver("two", np.array([-1.0, 4.0, 1.0]), UPRIGHT))
 """Some 3 m from the transmitters."""
 
 

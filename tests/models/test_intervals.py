@@ -31,7 +31,6 @@ COVERED = 0.02
 def fold_of(record: Record, n_train: int | None = None) -> tuple[Split, Split]:
     split = make_splits(record, "official", n_train=n_train)[0]
     fold = hold_out(record, split)
-    assert fold is not None
     return split, fold
 
 
@@ -166,9 +165,7 @@ def test_training_with_intervals_predicts_as_without_and_is_restored(flat_folder
     assert not (run.folder / "held_out").exists()
 
 
-def test_intervals_without_rows_to_hold_out_are_refused(
-    flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_intervals_without_rows_to_hold_out_are_refused(flat_folder, tmp_path, capsys) -> None:
     arguments = ["train", flat_folder, "--model", "kriging", "--n-train", "2", "--intervals", "--out", tmp_path / "run"]
     refused(arguments, "2 training rows; intervals need three at least", capsys)
     assert not (tmp_path / "run").exists()

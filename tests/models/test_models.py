@@ -8,7 +8,6 @@ import os
 import sys
 import types
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -86,9 +85,7 @@ def registered() -> Iterator[None]:
     del models.MODELS._known["nearest"], sys.modules[module.__name__]
 
 
-def test_registered_model_is_trained_resumed_evaluated_and_compared(
-    registered: None, flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_registered_model_is_trained_resumed_evaluated_and_compared(registered, flat_folder, tmp_path, capsys) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted, match=rf"stopped in nearest rows; go on with: wrf-mi train --resume {out}"):
         train(flat_folder, out, "nearest", settings=("neighbours=2",), stop=lambda: True)
@@ -125,9 +122,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
-def test_commands_find_the_model_of_an_installed_package(
-    installed: dict[str, str], flat_folder: Path, tmp_path: Path
-) -> None:
+def test_commands_find_the_model_of_an_installed_package(installed, flat_folder, tmp_path) -> None:
     out = tmp_path / "run"
     settings = ("--set", "neighbours=1", "--out", out, "--json")
     (trained,) = in_subprocess(installed, ("train", flat_folder, "--model", "nearest", *settings))
@@ -157,9 +152,7 @@ OLD = {
 
 
 @pytest.mark.parametrize("kind", OLD)
-def test_runs_of_version_0_1_are_refused_by_every_command(
-    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_runs_of_version_0_1_are_refused_by_every_command(kind, tmp_path, capsys) -> None:
     run, out = tmp_path / "old", tmp_path / "out"
     run.mkdir()
     (run / "config.yaml").write_text(OLD[kind])

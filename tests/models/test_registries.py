@@ -77,9 +77,7 @@ def registered() -> Iterator[Any]:
     del receivers._RECEIVERS._known["attenuated"], sys.modules["attenuators"]
 
 
-def test_registered_receiver_is_trained_resumed_evaluated_and_compared(
-    registered: Any, flat_folder: Path, tmp_path: Path
-) -> None:
+def test_registered_receiver_is_trained_resumed_evaluated_and_compared(registered, flat_folder, tmp_path) -> None:
     out, steps = tmp_path / "run", 0
 
     def stop() -> bool:
@@ -108,9 +106,7 @@ def test_receiver_of_another_task_or_unknown_is_refused(registered: Any, flat_fo
     assert not (tmp_path / "run").exists()
 
 
-def test_receivers_and_benchmarks_of_installed_packages_are_found(
-    flat_folder: Path, tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
-) -> None:
+def test_receivers_and_benchmarks_of_installed_packages_are_found(flat_folder, tmp_path_factory, tmp_path) -> None:
     site = tmp_path_factory.mktemp("site")
     (site / "attenuators.py").write_text(PACKAGE)
     info = site / "attenuators-1.0.dist-info"

@@ -103,9 +103,7 @@ def commands(environment: dict[str, str], *calls: list[str | Path]) -> list[tupl
 SERVED = {"trees": "rssi", "wrf-gs": "spectrum, rssi and csi", "factorised": "spectrum, rssi and csi"}
 
 
-def test_task_and_layout_of_another_package_are_trained_evaluated_predicted_and_compared(
-    installed: tuple[dict[str, str], Path], tmp_path: Path
-) -> None:
+def test_task_and_layout_of_another_package_are_trained_evaluated_predicted_and_compared(installed, tmp_path) -> None:
     environment, data = installed
     runs = [tmp_path / name for name in ("idw", "kriging", "hybrid")]
     models = [*(run.name for run in runs), *SERVED]

@@ -36,8 +36,6 @@ def test_a_carrier_is_held_out_as_the_split_does(bands: Record, known: bool) -> 
     """A trained one; its held-out rows' positions remain in training only where the test rows' do."""
     split = make_splits(bands, "frequency-known:2" if known else "frequency:2")[0]
     fold = hold_out(bands, split)
-    assert bands.carriers_hz is not None
-    assert fold is not None
     trained, held = fold.all_train, fold.test
     assert set(trained) | set(held) <= set(split.all_train)
     assert len(set(bands.carriers_hz[held])) == 1

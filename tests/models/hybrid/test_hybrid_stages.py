@@ -78,9 +78,7 @@ def test_stages_are_reported_in_their_order_and_kept_where_they_gain(spectra: tu
     assert all(one["ms"] > 0 for one in kept)
 
 
-def test_hybrid_of_a_wrong_scene_is_above_its_trace_and_interpolation(
-    spectra: tuple[wrf_mi.Run, Record], scenes: dict[str, Path], tmp_path: Path
-) -> None:
+def test_hybrid_of_a_wrong_scene_is_above_its_trace_and_interpolation(spectra, scenes, tmp_path) -> None:
     run, record = spectra
     split = measured(scenes, "spectrum")[1]
     for model, scene in (("ray-tracing", scenes["thought"]), ("kriging", None)):
@@ -96,7 +94,6 @@ def test_fit_in_a_scene_is_restored_with_its_sides(spectra: tuple[wrf_mi.Run, Re
     np.testing.assert_allclose(whole.mean, run.predict(position).mean, atol=FLOAT32_GREY)
     single = [again.predict(one[None]).mean[0] for one in position]
     np.testing.assert_allclose(whole.mean, np.stack(single), atol=FLOAT32_GREY)
-    assert whole.std is not None
     scene = run.folder / "parts" / "paths" / "scene"
     assert (scene / "correction.md").exists()
     # Training alone could find the materials in the stated scene, too.
@@ -155,9 +152,7 @@ def test_few_rows_train_paths_and_hold_two_out(scenes: dict[str, Path], tmp_path
     assert run.metrics["inside_90"] > 0.5
 
 
-def test_scene_as_stated_is_kept_where_few_rows_prefer_it(
-    scenes: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scene_as_stated_is_kept_where_few_rows_prefer_it(scenes, tmp_path, monkeypatch) -> None:
     stated = str(scenes["thought"])
     monkeypatch.setattr(scene_side, "_held_out_score", lambda one: float(one.problem.scene == stated))
     record, split = measured(scenes, "spectrum", 16)
@@ -182,9 +177,7 @@ def test_stages_that_are_not_wanted_are_not_fitted(scenes: dict[str, Path], tmp_
         assert list(run.metrics["held_out"]) == ["paths", "hybrid"]
 
 
-def test_unknown_stages_and_stages_of_other_models_are_refused(
-    flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_stages_and_stages_of_other_models_are_refused(flat_folder, tmp_path, capsys) -> None:
     out = ["--out", str(tmp_path / "run")]
     refused(["train", flat_folder, "--stages", "mean,sixth", *out], "'sixth' is unknown", capsys)
     refused(["train", flat_folder, "--fast", "--stages", "mean", *out], "one of --stages and --fast", capsys)

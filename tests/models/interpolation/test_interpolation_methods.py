@@ -125,10 +125,7 @@ def test_runs_with_headings_equal_the_library(flat_folder: Path, tmp_path: Path)
     record = load(flat_folder)
     (split,) = make_splits(record, "official")
     place, turned = record.tx_pos_m, record.tx_heading_rad
-    given = {
-        "kriging": ("length_m=0.5", "noise=0.1", "heading_length=1.5"),
-        "trees": ("trees=20", "leaf_rows=2"),
-    }
+    given = {"kriging": ("length_m=0.5", "noise=0.1", "heading_length=1.5"), "trees": ("trees=20", "leaf_rows=2")}
     for name, settings in given.items():
         found = stored(train(flat_folder, tmp_path / name, name, settings=settings).folder)["prediction"]
         for r, receiver in enumerate(record.receivers):

@@ -227,9 +227,7 @@ SHAPES = {"symmetric": ELEMENTS_M, "without opposites": np.delete(planar_array(3
 
 @pytest.mark.parametrize("elements_m", SHAPES.values(), ids=SHAPES)
 @pytest.mark.parametrize("most", [70, 45])
-def test_fit_resolves_phases_and_mirror_images(
-    elements_m: np.ndarray, most: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fit_resolves_phases_and_mirror_images(elements_m, most, monkeypatch) -> None:
     """Whatever phase and mirror image each row comes with; where rows are many, shares are fitted to some of them."""
     monkeypatch.setattr(module, "MOST_ROWS", most)
     monkeypatch.setattr(module, "STEPS", 10)
@@ -262,7 +260,6 @@ def test_realignment_corrects_single_rows(monkeypatch: pytest.MonkeyPatch) -> No
     """What the alignment of neighbours got wrong: a mirror image, and a phase."""
     monkeypatch.setattr(module, "STEPS", 10)
     where, opposite = positions(60, seed=2), mirror_order(ELEMENTS_M)
-    assert opposite is not None
     truth = signals(where, TOWARDS)
     truth /= np.linalg.norm(truth, axis=1, keepdims=True)
     right = fit_signals(truth, where, ELEMENTS_M, DICTIONARY)

@@ -18,13 +18,7 @@ from wrf_mi.models.interpolation import spectra
 from wrf_mi.models.interpolation.by_receiver import ByReceiver
 from wrf_mi.models.interpolation.kriging import Kriged, Kriging, UncertainKriged
 from wrf_mi.models.interpolation.kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight, sight_axes
-from wrf_mi.models.interpolation.spectra import (
-    GAPS,
-    LEAST_ROWS,
-    KrigedSpectra,
-    SpectrumKrigingSettings,
-    signal_weight,
-)
+from wrf_mi.models.interpolation.spectra import GAPS, LEAST_ROWS, KrigedSpectra, SpectrumKrigingSettings, signal_weight
 from wrf_mi.models.model import Inputs, field_arrays, from_field_arrays
 from wrf_mi.receivers.array import Lags
 from wrf_mi.tasks.scores import inside_interval, ssim
@@ -194,14 +188,12 @@ def progress() -> list[tuple[str, float]]:
 
 @pytest.fixture(scope="module")
 def model(record: Record, progress: list[tuple[str, float]]) -> ByReceiver:
-    assert record.official is not None
     settings = SpectrumKrigingSettings(directions=60)
     return fit(record, record.official[0], settings, lambda *stage: progress.append(stage[:2]))
 
 
 @pytest.mark.parametrize("receiver", [0, 1])
 def test_mixture_beats_kriging_and_states_its_error(record: Record, model: ByReceiver, receiver: int) -> None:
-    assert record.official is not None
     rows, truth = record.official[1], record.observation[receiver, record.official[1]]
     where = record.tx_pos_m[rows]
     estimate = model.predict(Inputs(where, np.zeros(len(rows))), receiver)
@@ -220,7 +212,6 @@ def test_mixture_beats_kriging_and_states_its_error(record: Record, model: ByRec
 
 
 def test_deviation_is_that_of_the_grey_values_far_away(record: Record, model: ByReceiver) -> None:
-    assert record.official is not None
     known = record.observation[0, record.official[0]]
     away = model.predict(Inputs(np.array([[100.0, 100.0, 0.0]])), 0)
     near = model.predict(Inputs(record.tx_pos_m[record.official[0]]), 0)
@@ -262,7 +253,6 @@ def test_weight_of_signals_falls_with_their_ignorance() -> None:
 
 
 def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, model: ByReceiver) -> None:
-    assert record.official is not None
     observed = record.observation[0, record.official[0]]
     fitted = signals_and_nearby(model)
     rows = np.arange(len(observed))  # fewer than would be drawn from
@@ -293,7 +283,6 @@ def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, mode
 
 def test_receivers_with_few_rows_are_kriged_generically_beside_others(record: Record, tmp_path: Path) -> None:
     """Rows that one receiver missed are left out there; below `LEAST_ROWS` its spectra themselves are kriged."""
-    assert record.official is not None
     rows = record.official[0][:24]
     observed = record.observation.copy()
     observed[1, rows[:4]] = np.nan
@@ -309,7 +298,6 @@ def test_receivers_with_few_rows_are_kriged_generically_beside_others(record: Re
     asked = Inputs(record.tx_pos_m[record.official[1]])
     for receiver in (0, 1):
         before, after = (each.predict(asked, receiver) for each in (mixed, again))
-        assert before.std is not None
         np.testing.assert_array_equal(after.mean, before.mean)
         np.testing.assert_array_equal(after.std, before.std)
         assert np.isfinite(before.mean).all()
@@ -351,7 +339,6 @@ def test_weights_keep_their_defaults_without_gaps(record: Record) -> None:
 
 def test_spectra_are_read_in_chunks(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many at once as memory bears: the parts are joined in order."""
-    assert record.official is not None
     sizes = []
     unscale = spectra.unscale
 
@@ -368,9 +355,7 @@ def test_spectra_are_read_in_chunks(record: Record, monkeypatch: pytest.MonkeyPa
     assert np.median(ssim(near, record.observation[0, record.official[0][:20]])) > 0.9
 
 
-def test_more_rows_than_the_memory_bears_are_kriged_generically_with_a_warning(
-    record: Record, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_more_rows_than_the_memory_bears_are_kriged_generically_with_a_warning(record, monkeypatch, caplog) -> None:
     monkeypatch.setattr(spectra, "MOST_COVARIANCES", 9 * 11**2)
     model = fit(record, np.arange(12))
     assert all(isinstance(one, UncertainKriged) for one in model.models)
@@ -379,9 +364,7 @@ def test_more_rows_than_the_memory_bears_are_kriged_generically_with_a_warning(
 
 @pytest.mark.parametrize("settings", [QUICK, replace(QUICK, generic=True), replace(QUICK, length_m=0.2)])
 @pytest.mark.parametrize("change", ["array", "frequencies_hz", None])
-def test_unknown_instruments_and_stated_covariances_are_kriged_generically(
-    settings: SpectrumKrigingSettings, change: str | None, record: Record, two_gateways: Record
-) -> None:
+def test_unknown_instruments_and_stated_covariances_are_kriged_generically(settings, change, record, two_gateways):
     if change is None and settings is QUICK:
         record = two_gateways  # an instrument of which nothing is known
     unknown = {"array": without_array, "frequencies_hz": lambda one: replace(one, frequencies_hz=None)}
@@ -390,17 +373,14 @@ def test_unknown_instruments_and_stated_covariances_are_kriged_generically(
     assert model.predict(Inputs(record.tx_pos_m[:2]), 0).std is None
 
 
-def test_an_array_on_a_line_is_kriged_generically_with_a_warning(
-    record: Record, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_array_on_a_line_is_kriged_generically_with_a_warning(record, caplog) -> None:
     model = fit(record.with_array(np.outer(np.arange(9), [0.1, 0, 0])), np.arange(12))
     assert all(isinstance(one, UncertainKriged) for one in model.models)
     assert "the spectra themselves are kriged: retrieval: 9 elements on a line" in caplog.text
 
 
 @pytest.mark.parametrize(
-    ("setting", "value"),
-    [("cone_deg", 0.0), ("cone_deg", 181.0), ("directions", 0), ("lengths", 0)],
+    ("setting", "value"), [("cone_deg", 0.0), ("cone_deg", 181.0), ("directions", 0), ("lengths", 0)]
 )
 def test_settings_that_cannot_be_fitted_are_refused(setting: str, value: float) -> None:
     with pytest.raises(InputError, match=f"setting {setting}: {value} is out of range, choose"):

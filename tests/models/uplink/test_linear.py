@@ -77,7 +77,6 @@ def test_penalty_is_chosen_on_validation_rows_and_fitted_to_all_training_rows() 
     assert shares == sorted(shares)
 
     def solved(rows: np.ndarray, penalty: float) -> np.ndarray:
-        assert record.uplink is not None
         u, d = record.uplink[rows].astype(complex), record.observation[0, rows].astype(complex)
         divisor = normalised_uplink(u)[1][..., None]
         weight = np.abs(divisor) / np.sqrt(np.square(np.abs(d)).sum(axis=(1, 2), keepdims=True))
@@ -87,7 +86,6 @@ def test_penalty_is_chosen_on_validation_rows_and_fitted_to_all_training_rows() 
         return np.asarray(np.linalg.lstsq(x, y, rcond=None)[0])
 
     def error(penalty: float) -> float:
-        assert record.uplink is not None
         truth = record.observation[0, split.validation]
         found = record.uplink[split.validation] @ solved(split.train, penalty)
         return float(np.median(relative_error(found.reshape(len(truth), -1), truth.reshape(len(truth), -1))))
@@ -101,7 +99,6 @@ def test_penalty_is_chosen_on_validation_rows_and_fitted_to_all_training_rows() 
 def test_errors_are_relative_to_the_energy_of_rows() -> None:
     """Scaled rows do not change the map, and a row without downlink energy is ignored."""
     record, _ = linear_record(noise=0.3)
-    assert record.uplink is not None
     split, size = split_of(), np.float32(10) ** np.arange(ROWS)[:, None, None].clip(0, 5)
     larger = replace(record, observation=record.observation * size, uplink=record.uplink * size)
     expected = fit(record, split).matrix

@@ -50,7 +50,6 @@ class Turned(Fitted):
         self.angle = angle
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        assert inputs.uplink is not None
         return Prediction((inputs.uplink * np.exp(1j * self.angle)).astype(np.complex64))
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -62,7 +61,6 @@ class TurnedModel(UplinkModel):
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> Turned:
         record = problem.record
-        assert record.uplink is not None
         rows = split.all_train
         return Turned(float(np.angle((record.observation[0, rows] * record.uplink[rows].conj()).sum())))
 
@@ -121,9 +119,7 @@ def test_receivers_and_antennas_are_distinguished(tmp_path: Path) -> None:
         assert read_run(out).score.shape == shape[:2]
 
 
-def test_uplink_predicts_without_positions(
-    turned: None, unplaced_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_uplink_predicts_without_positions(turned, unplaced_folder, tmp_path, capsys) -> None:
     out = train(unplaced_folder, tmp_path / "run", "turned").folder
     metrics, arrays = json.loads((out / "metrics.json").read_text()), stored(out)
     assert metrics["cea_db"]["median"] > 100  # exact but for single precision
@@ -146,9 +142,7 @@ def test_uplink_predicts_without_positions(
     refused(["predict", tmp_path, "--input", tmp_path / "none.npz", *call_out], "no such file", capsys)
 
 
-def test_invalid_uplinks_of_predictions_are_refused(
-    run: Path, csi_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_uplinks_of_predictions_are_refused(run, csi_folder, tmp_path, capsys) -> None:
     good = np.ones((2, ANTENNAS, SUBCARRIERS), np.complex64)
     broken = good.copy()
     broken[1, 0, 0] = np.nan + 1j
@@ -225,9 +219,7 @@ PLACED = {
 
 
 @pytest.mark.parametrize("what", PLACED)
-def test_errors_name_the_file_of_the_data(
-    what: str, turned: None, flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_errors_name_the_file_of_the_data(what, turned, flat_folder, tmp_path, monkeypatch) -> None:
     change, method, message = PLACED[what]
     monkeypatch.setattr("wrf_mi.datasets.observations.ROWS_PER_CHUNK", 7)  # the rows come in parts
     record = load(flat_folder)
