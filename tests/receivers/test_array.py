@@ -39,16 +39,11 @@ ARRAYS = {
     "coinciding": np.array([[0.2, 0, 0], [0.2, 0, 0], [-0.2, 0, 0], [-0.2, 0, 0.0]]),
 }
 
-needs_data = needs("rfid-lab")
-
 
 def test_planar_array_is_a_centred_grid():
     array = planar_array(2, 3, 0.1)
-    np.testing.assert_allclose(
-        array,
-        [[-0.1, -0.05, 0], [0, -0.05, 0], [0.1, -0.05, 0], [-0.1, 0.05, 0], [0, 0.05, 0], [0.1, 0.05, 0]],
-        atol=EXACT,
-    )
+    expected = [[x, y, 0] for y in (-0.05, 0.05) for x in (-0.1, 0, 0.1)]
+    np.testing.assert_allclose(array, expected, atol=EXACT)
     for wrong in ((0, 4, 0.1), (4, 0, 0.1), (4, 4, 0), (4, 4, float("nan"))):
         with pytest.raises(ValueError, match="positive"):
             planar_array(*wrong)
@@ -90,7 +85,7 @@ def test_minmax_scale_maps_constant_images_to_zero():
     np.testing.assert_allclose(minmax_scale(images), [[[0, 0.5], [0.25, 1]], [[0, 0], [0, 0]]])
 
 
-@needs_data
+@needs("rfid-lab")
 @pytest.mark.parametrize(("first_row", "obeys"), [(0, True), (1, False)])
 def test_measured_spectra_are_bartlett_spectra_of_their_array(first_row: int, obeys: bool):
     """Squared, they lie in the span of the array's 49 lag harmonics; with elevations 1 to 90 they would not."""
@@ -109,27 +104,23 @@ def test_measured_spectra_are_bartlett_spectra_of_their_array(first_row: int, ob
 def test_spectrum_is_the_plain_sum(name: str, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch):
     elements = ARRAYS[name]
     h = RNG.normal(size=(3, 2, len(elements))) + 1j * RNG.normal(size=(3, 2, len(elements)))
-    expected = np.abs(
-        h @ array_response(elements, pixel_directions(*size), FREQUENCY_HZ).conj().reshape(-1, len(elements)).T
-    )
+    response = array_response(elements, pixel_directions(*size), FREQUENCY_HZ).reshape(-1, len(elements))
+    expected = np.abs(h @ response.conj().T)
     largest = np.abs(h).sum(axis=-1).max()
-    found = bartlett_spectrum(h, elements, FREQUENCY_HZ, *size)
-    np.testing.assert_allclose(found, expected.reshape(3, 2, *size), rtol=0, atol=ROUNDING * largest)
+    spectrum = bartlett_spectrum(h, elements, FREQUENCY_HZ, *size)
+    np.testing.assert_allclose(spectrum, expected.reshape(3, 2, *size), rtol=0, atol=ROUNDING * largest)
     monkeypatch.setattr(module, "TABLE_BYTES", 16 * 50 * len(elements))
     monkeypatch.setattr(module, "CHUNK_SIZE", 4)
     blocks = bartlett_spectrum(h, elements, FREQUENCY_HZ, *size)
-    np.testing.assert_allclose(blocks, found, rtol=0, atol=ROUNDING * largest)
+    np.testing.assert_allclose(blocks, spectrum, rtol=0, atol=ROUNDING * largest)
 
 
-@pytest.mark.parametrize("factor", [0.0, 1e-200, 1e200])
-def test_spectrum_scales_with_signals_of_any_size(factor: float):
-    elements = ARRAYS["regular"]
+def test_spectrum_scales_with_signals_of_any_size_and_number():
     h = RNG.normal(size=16) + 1j * RNG.normal(size=16)
-    expected = factor * bartlett_spectrum(h, elements, FREQUENCY_HZ, *SIZE)
-    np.testing.assert_allclose(bartlett_spectrum(factor * h, elements, FREQUENCY_HZ, *SIZE), expected, rtol=ROUNDING)
-
-
-def test_no_signals_have_no_spectra():
+    spectrum = bartlett_spectrum(h, ARRAYS["regular"], FREQUENCY_HZ, *SIZE)
+    for factor in (0.0, 1e-200, 1e200):
+        scaled = bartlett_spectrum(factor * h, ARRAYS["regular"], FREQUENCY_HZ, *SIZE)
+        np.testing.assert_allclose(scaled, factor * spectrum, rtol=ROUNDING)
     assert bartlett_spectrum(np.zeros((0, 16)), ARRAYS["regular"], FREQUENCY_HZ, *SIZE).shape == (0, *SIZE)
 
 

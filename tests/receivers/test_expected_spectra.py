@@ -28,13 +28,13 @@ def test_spectra_are_the_mean_over_random_phases(phase_error: float) -> None:
     paths = made_paths(seed=1)
     reflections = (paths.interactions == 1).sum(axis=1)
     rng, plain = np.random.default_rng(3), instrument(0.0)
-    wanted = np.zeros((1, paths.n_tx, *SIZE))
+    mean = np.zeros((1, paths.n_tx, *SIZE))
     for _ in range(4096):
         phase = phase_error * np.sqrt(reflections) * rng.normal(size=len(paths))
-        wanted += plain.observe(replace(paths, gain=paths.gain * np.exp(1j * phase))) / 4096
-    found = instrument(phase_error).observe(paths)
-    assert np.abs(found - wanted).mean() < EXPECTATION
-    assert np.abs(plain.observe(paths) - wanted).mean() > 2 * np.abs(found - wanted).mean()
+        mean += plain.observe(replace(paths, gain=paths.gain * np.exp(1j * phase))) / 4096
+    spectra = instrument(phase_error).observe(paths)
+    assert np.abs(spectra - mean).mean() < EXPECTATION
+    assert np.abs(plain.observe(paths) - mean).mean() > 2 * np.abs(spectra - mean).mean()
 
 
 def test_certain_phases_change_nothing() -> None:

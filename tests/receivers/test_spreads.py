@@ -30,9 +30,11 @@ def test_two_equal_paths() -> None:
     assert found.azimuth_spread_deg[0] == pytest.approx(np.degrees(np.sqrt(np.log(2))), rel=ROUNDING)
 
 
-def test_a_path_alone_has_no_spread_and_an_infinite_k_factor() -> None:
-    found = statistics([1e-9], [7.0], [33.0])
-    assert (found.delay_spread_s[0], found.azimuth_spread_deg[0], found.k_factor_db[0]) == (0, 0, np.inf)
+def test_k_factor_is_that_of_strongest_over_rest_and_a_path_alone_has_no_spread() -> None:
+    three = statistics([8e-9, 1e-9, 1e-9], [5.0, 6.0, 7.0], [0.0, 1.0, 2.0])
+    assert three.k_factor_db[0] == pytest.approx(10 * np.log10(4), abs=ROUNDING)
+    alone = statistics([1e-9], [7.0], [33.0])
+    assert (alone.delay_spread_s[0], alone.azimuth_spread_deg[0], alone.k_factor_db[0]) == (0, 0, np.inf)
 
 
 def test_azimuth_spread_ignores_turns_elevation_and_vertical_paths() -> None:
@@ -42,12 +44,6 @@ def test_azimuth_spread_ignores_turns_elevation_and_vertical_paths() -> None:
     arrival = np.array([[1.0, 0, 0], [0, 0, 1.0]])
     vertical = PathStatistics.of_paths(np.zeros(2, np.int64), 1, np.ones(2), np.array([4.0, 5.0]), arrival)
     assert vertical.azimuth_spread_deg[0] == 0
-
-
-def test_k_factor_is_that_of_strongest_over_rest() -> None:
-    assert statistics([8e-9, 1e-9, 1e-9], [5.0, 6.0, 7.0], [0.0, 1.0, 2.0]).k_factor_db[0] == pytest.approx(
-        10 * np.log10(4), abs=ROUNDING
-    )
 
 
 def test_transmitters_without_paths_are_not_a_number_and_rows_are_placed() -> None:

@@ -159,13 +159,13 @@ def test_scene_as_stated_is_kept_where_few_rows_prefer_it(scenes, tmp_path, monk
     stated = str(scenes["thought"])
     monkeypatch.setattr(scene_side, "_held_out_score", lambda side: float(side.problem.scene == stated))
     record, split = measured(scenes, "spectrum", 16)
-    settings = ("stages=mean,correction", "steps=20")
+    settings = ("stages=mean,correction,surfaces", "steps=20")
     run = wrf_mi.train(record, tmp_path / "run", scene=stated, split=split, settings=settings)
     again = assert_restored(run, record)
     assert all(opened.fitted.parts["paths"].problem.scene == stated for opened in (run, again))
     assert not (run.folder / "parts" / "paths" / "scene").exists()
     reports = {report["stage"]: report for report in run.metrics["stages"]}
-    assert list(reports) == ["mean", "calibration", "correction"]
+    assert list(reports) == ["mean", "calibration", "correction", "surfaces"]
     assert reports["calibration"]["kept"]
     assert not reports["correction"]["kept"]
     assert list(run.metrics["held_out"]) == ["paths", "hybrid"]
