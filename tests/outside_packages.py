@@ -1,7 +1,5 @@
 """Packages of others with a model, a receiver model, a benchmark, a task and a layout, and commands that find them."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

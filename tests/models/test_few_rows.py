@@ -1,7 +1,5 @@
 """Receivers with few training rows, or none, are predicted by what the others teach, without harm to these."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -22,8 +20,7 @@ NAMES = list(PLACES_M)
 SCARCE: dict[str, tuple[int, ...]] = {"attic": (3, 5, 41, 44, 47, 50), "cellar": tuple(range(TRAINED, TRAINED + 8))}
 """Rows of receivers with two training rows and with none."""
 NOISE_DB = 1.0  # standard deviation of the noise of `made_building.building`
-WORSE_DB = 0.05
-"""Allowed difference of a mean absolute error: kriging learns its common terms from the few rows, too."""
+WORSE_DB = 0.05  # allowed difference of a mean absolute error: kriging learns its common terms from the few rows, too
 
 
 def errors_db(folder: Path) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Intervals from held-out errors, and held-out rows themselves."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -23,10 +21,8 @@ from wrf_mi.tasks.scores import crps, inside_interval
 from wrf_mi.training.by_distance import fit_intervals
 from wrf_mi.training.selection import HeldOut, hold_out
 
-ROUNDING_DB = 2e-5
-"""Of powers near -60 dBm in single precision, a few units in the last place."""
-COVERED = 0.02
-"""Allowed difference of a coverage of 0.9 over 4,000 draws: four standard errors."""
+ROUNDING_DB = 2e-5  # of powers near -60 dBm in single precision, a few units in the last place
+COVERED = 0.02  # allowed difference of a coverage of 0.9 over 4,000 draws: four standard errors
 
 
 def fold_of(record: Record, n_train: int | None = None) -> tuple[Split, Split]:

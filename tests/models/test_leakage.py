@@ -1,7 +1,5 @@
 """Arrays of every model: bit for bit the same if test rows hold NaN and infinity, and finite but for stated gaps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

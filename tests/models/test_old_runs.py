@@ -1,7 +1,5 @@
 """Runs of version 0.1."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Receivers at unknown places are located by their training rows, and every model of strengths without a scene runs."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Models, receiver models, benchmarks, tasks and layouts from outside the package, registered or installed."""
 
-from __future__ import annotations
-
 import csv
 import json
 import sys

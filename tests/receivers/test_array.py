@@ -16,13 +16,11 @@ from wrf_mi.receivers.reports import minmax_scale
 
 FREQUENCY_HZ = 920e6
 SPACING_M = 0.16
-EXACT = 1e-9
-"""Sums of 16 terms of size one in float64."""
+EXACT = 1e-9  # sums of 16 terms of size one in float64
 ROUNDING_RMS = 0.0013
 """8-bit greys are off by up to 1/510; squared, the real spectra's residual was measured as 0.0012 rms."""
 
-ROUNDING = 1e-12
-"""Sums of some hundred products in double precision, of signals of size 1."""
+ROUNDING = 1e-12  # sums of some hundred products in double precision, of signals of size 1
 SIZE = 14, 31
 
 RNG = np.random.default_rng(0)

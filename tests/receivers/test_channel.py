@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from random_paths import paths_of
 from scipy.constants import speed_of_light
 
 from wrf_mi.core import Paths, Receiver
@@ -21,20 +22,8 @@ def random_paths(count: int = 40, n_tx: int = 4, n_rx: int = 3, seed: int = 0) -
     order = np.lexsort((length, tx, rx))
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return Paths(
-        tx=tx[order],
-        rx=rx[order],
-        gain=rng.normal(size=count) + 1j * rng.normal(size=count),
-        length_m=length[order],
-        departure=direction,
-        arrival=direction[::-1].copy(),
-        interactions=np.zeros((count, 1), np.uint8),
-        vertices_m=np.full((count, 1, 3), np.nan),
-        objects=np.full((count, 1), -1, np.int32),
-        object_names=(),
-        n_tx=n_tx,
-        n_rx=n_rx,
-    )
+    gain = rng.normal(size=count) + 1j * rng.normal(size=count)
+    return paths_of(tx[order], rx[order], gain, length[order], direction, n_tx, n_rx)
 
 
 def receivers(count: int = 3) -> list[Receiver]:

@@ -1,25 +1,37 @@
 """Spectra of paths with uncertain phases: against plain Monte Carlo, in its limits, and row by row."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from spectrum_paths import made_paths
+from random_paths import paths_of
 
-from wrf_mi.core import Receiver
+from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receivers.instruments import SpectrumInstrument
 
 CARRIER_HZ, SIZE = 2.4e9, (12, 36)
 RX = Receiver("rx", np.zeros(3), np.array([0.0, 0, 0, 1]), array_m=planar_array(4, 4, 0.06))
-EXPECTATION = 0.03
-"""Mean difference of 16 draws from 4,096; greys of 0..1."""
+EXPECTATION = 0.03  # mean difference of 16 draws from 4,096; greys of 0..1
 
 
 def instrument(phase_error: float) -> SpectrumInstrument:
     return SpectrumInstrument((RX,), np.array([CARRIER_HZ]), size=SIZE, phase_error=phase_error)
+
+
+def made_paths(seed: int, n_tx: int = 5, each: int = 6) -> Paths:
+    """The direct path and some with up to three interactions for each transmitter but the last, which has none."""
+    rng = np.random.default_rng(seed)
+    count = each * (n_tx - 1)
+    up = rng.normal(size=(count, 3))
+    up[:, 2] = np.abs(up[:, 2])
+    direction = up / np.linalg.norm(up, axis=1, keepdims=True)
+    kinds = rng.choice([0, 1, 1, 4], size=(count, 3))
+    kinds[::each] = 0
+    tx, rx = np.repeat(np.arange(n_tx - 1), each), np.zeros(count, np.int64)
+    gain = rng.normal(size=count) + 1j * rng.normal(size=count)
+    length_m = np.sort(rng.uniform(2, 9, (n_tx - 1, each)), axis=1).ravel()
+    return paths_of(tx, rx, gain, length_m, direction, n_tx, 1, np.sort(kinds, axis=1)[:, ::-1])
 
 
 @pytest.mark.parametrize("phase_error", [0.3, 1.0, 2.5])

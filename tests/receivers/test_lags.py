@@ -1,7 +1,5 @@
 """Lags against squared spectra computed from signals, for regular and irregular arrays."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -10,8 +8,7 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.receivers import Lags, array_response, bartlett_spectrum
 
 FREQUENCY_HZ = 920e6
-EXACT = 1e-9
-"""Sums of 256 products of size one in float64."""
+EXACT = 1e-9  # sums of 256 products of size one in float64
 
 IRREGULAR = np.array([[0, 0, 0], [0.13, 0.02, 0], [-0.03, 0.11, 0], [0.09, 0.15, 0.05]])
 

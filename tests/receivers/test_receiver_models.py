@@ -1,12 +1,11 @@
 """How traced and learned fields combine, against closed forms and the NumPy receivers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
 from box_room import FREQUENCY_HZ
+from random_paths import paths_of
 from scipy.constants import speed_of_light
 
 from wrf_mi.backend.device import on_device
@@ -19,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from wrf_mi.backend.vectors import Pose
-from wrf_mi.core import Paths, Receiver, pixel_directions, unit_vectors
+from wrf_mi.core import Receiver, pixel_directions, unit_vectors
 from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Gaussians
@@ -31,12 +30,9 @@ from wrf_mi.receivers.reports import minmax_scale
 
 Float64 = dr.float64_array_t(mi.Float)
 
-DOUBLE = 1e-11
-"""Float64, sums of a thousand terms, phases of a hundred radians."""
-SINGLE = 2e-5
-"""The same in float32."""
-ROOT = 2e-4
-"""`DARK` under the root raises a dark pixel to 1e-4."""
+DOUBLE = 1e-11  # float64, sums of a thousand terms, phases of a hundred radians
+SINGLE = 2e-5  # the same in float32
+ROOT = 2e-4  # `DARK` under the root raises a dark pixel to 1e-4
 
 ORIGIN = np.zeros((1, 3))
 HEIGHT, WIDTH = 18, 40
@@ -103,21 +99,9 @@ def summed(name: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
 def test_an_instrument_reports_alike_of_paths_in_numpy_in_drjit_and_of_sums(name: str) -> None:
     model, (traced, arrays) = INSTRUMENTS[name], paths()
     count = arrays["gain"].size
-    none = np.zeros((count, 0))
-    stored = Paths(
-        tx=np.repeat([0, 1], count // 2),
-        rx=np.zeros(count, np.int64),
-        gain=arrays["gain"].ravel(),
-        length_m=arrays["length"].ravel(),
-        departure=-arrays["arrival"].reshape(-1, 3),
-        arrival=arrays["arrival"].reshape(-1, 3),
-        interactions=none.astype(np.uint8),
-        vertices_m=np.zeros((count, 0, 3)),
-        objects=none.astype(np.int32),
-        object_names=(),
-        n_tx=2,
-        n_rx=1,
-    )
+    tx, rx = np.repeat([0, 1], count // 2), np.zeros(count, np.int64)
+    arrival = arrays["arrival"].reshape(-1, 3)
+    stored = paths_of(tx, rx, arrays["gain"].ravel(), arrays["length"].ravel(), arrival, 2, 1)
     observed = model.observed(stored, Receiver("rx", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))
     expected = np.ascontiguousarray(observed).view(float) if np.iscomplexobj(observed) else observed
     for report in (model(traced, None).numpy(), model.signal_report(summed(name, arrays))):
@@ -262,15 +246,9 @@ def test_full_sphere_includes_directions_below_the_horizon() -> None:
     assert directions[target, 2] < 0
     at = directions[target] * 4
     zero, one = Float64(0.0), Float64(1.0)
-    gaussian = Gaussians(
-        position=[Float64(x) for x in at],
-        scale=[Float64(0.2)] * 3,
-        rotation=[zero, zero, zero, one],
-        signal=[Float64(0.8), Float64(-0.3)],
-        opacity=Float64(0.9),
-        attenuation=None,
-        batch=1,
-    )
+    shape = {"scale": [Float64(0.2)] * 3, "rotation": [zero, zero, zero, one], "opacity": Float64(0.9)}
+    signal = [Float64(0.8), Float64(-0.3)]
+    gaussian = Gaussians(position=[Float64(x) for x in at], signal=signal, attenuation=None, batch=1, **shape)
     pose = Pose([zero] * 3, [[one if i == j else zero for j in range(3)] for i in range(3)])
     plane = perception_plane(HEIGHT, WIDTH, Float64)
     signal = np.array([1, 1j]) @ [part.numpy() for part in learned_field(gaussian, pose, plane, sphere=True)]

@@ -6,8 +6,7 @@ import pytest
 
 from wrf_mi.receivers.reports import LEAST_POWER, SILENCE, arrives, minmax_scale, scaled, strength_db
 
-EXACT = 1e-12
-"""A few operations in float64."""
+EXACT = 1e-12  # A few operations in float64
 POWER = np.array([0.0, SILENCE, 1.01 * SILENCE, 1e-15, 1e-3])
 FLOOR = 1e-12
 

@@ -1,7 +1,5 @@
 """Retrieval of element signals from stored spectra, for spectra made from known signals and for measured ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from changed_folders import needs

@@ -1,7 +1,5 @@
 """Delay spread, angular spread and K-factor of paths in closed form."""
 
-from __future__ import annotations
-
 from dataclasses import astuple
 
 import numpy as np
@@ -10,8 +8,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.receivers.spreads import PathStatistics, joined
 
-ROUNDING = 1e-6
-"""Of float64 sums; angles near zero lose half the digits."""
+ROUNDING = 1e-6  # of float64 sums; angles near zero lose half the digits
 
 
 def statistics(power: list[float], length_m: list[float], azimuth_deg: list[float], elevation_deg: float = 0.0):

@@ -1,7 +1,5 @@
 """The nearest-neighbour blend, scores and levels, against closed forms and the published figures of the data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from changed_folders import DATA, needs
@@ -17,15 +15,11 @@ from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim, ssim_mixtures, summary
 
 EXACT = 1e-12
-SUMS = 1e-9
-"""Differences of float64 sums of 49 values below one, and logarithms."""
-PUBLISHED = 0.0005
-"""The data's description gives three digits."""
+SUMS = 1e-9  # differences of float64 sums of 49 values below one, and logarithms
+PUBLISHED = 0.0005  # the data's description gives three digits
 
-RAYLEIGH_DB = 10 / np.log(10) * np.pi / np.sqrt(6)
-"""Standard deviation of 10 log10 of an exponential variable: 5.57 dB."""
-EULER_DB = 10 / np.log(10) * 0.5772156649
-"""How far its mean lies below 10 log10 of the mean: 2.51 dB."""
+RAYLEIGH_DB = 10 / np.log(10) * np.pi / np.sqrt(6)  # standard deviation of 10 log10 of an exponential variable: 5.57 dB
+EULER_DB = 10 / np.log(10) * 0.5772156649  # how far its mean lies below 10 log10 of the mean: 2.51 dB
 DRAWS = 200_000
 SAMPLED_DB = 0.6
 """Of Rice's distribution, which Nakagami's only resembles, most at equal mean and deviation; sampling adds 0.02 dB."""

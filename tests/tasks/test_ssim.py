@@ -1,7 +1,5 @@
 """Structural similarity and the spectrum loss against scikit-image and finite differences."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,10 +16,8 @@ from wrf_mi.tasks.losses import spectrum_loss, ssim
 
 Float64 = dr.float64_array_t(mi.Float)
 
-SINGLE = 1e-5
-"""Required of the float32 form on every image."""
-DOUBLE = 1e-12
-"""float64 sums of 49 pixels and at most 32,400 windows."""
+SINGLE = 1e-5  # required of the float32 form on every image
+DOUBLE = 1e-12  # float64 sums of 49 pixels and at most 32,400 windows
 DIFFERENCES = 1e-6
 """Relative; central differences of step 1e-5 in float64 leave about (1e-5)^2 times the third derivative / C2."""
 

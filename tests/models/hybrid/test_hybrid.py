@@ -1,7 +1,5 @@
 """The hybrid as a run without a scene: parts, restored predictions, refusals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,10 +15,8 @@ from wrf_mi.models.hybrid.model import HybridSettings, parts_of
 from wrf_mi.tasks.scores import cea_db
 from wrf_mi.training.selection import HeldOut, hold_out
 
-UNCLEAR_DB = 0.1
-"""Difference on 24 held-out rows that is no clear gain over the most trusted ingredient, kriging."""
-EXACT_DB = 30.0
-"""CEA of a downlink that is its uplink turned, from twenty rows: single precision and a little penalty."""
+UNCLEAR_DB = 0.1  # difference on 24 held-out rows that is no clear gain over the most trusted ingredient, kriging
+EXACT_DB = 30.0  # CEA of a downlink that is its uplink turned, from twenty rows: single precision and a little penalty
 
 
 def test_strengths_without_a_scene_are_those_of_kriging_and_restored(flat_folder: Path, tmp_path: Path):

@@ -1,7 +1,5 @@
 """The stages of a fit in a scene: what is kept, restored, resumed and refused, for every task."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import partial
@@ -27,12 +25,9 @@ HZ = 920e6
 SHAPES = {"spectrum": (24, 48), "rssi": (), "csi": (6,)}
 TRACE = TraceOptions(depth=2, rays=1 << 12)
 QUICK = ("steps=30",)
-FLOAT32_GREY = 1e-4
-"""Of greys that a batch of transmitters and a single one give: sums in single precision."""
-CLEAR_DB = 0.3
-"""Of strengths without noise in the true scene; the constant level and slope are fitted to 30 rows."""
-CLEAR_GREY = 0.05
-"""Gain of the mean SSIM by the true materials of three of six walls: 0.1 with 30 rows."""
+FLOAT32_GREY = 1e-4  # of greys that a batch of transmitters and a single one give: sums in single precision
+CLEAR_DB = 0.3  # of strengths without noise in the true scene; the constant level and slope are fitted to 30 rows
+CLEAR_GREY = 0.05  # gain of the mean SSIM by the true materials of three of six walls: 0.1 with 30 rows
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """Kriging of channels: line of sight and diffuse field, or generic."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

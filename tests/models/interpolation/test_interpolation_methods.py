@@ -1,7 +1,5 @@
 """Registry of models, settings, and predictions of interpolation methods."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,8 +28,7 @@ SETTINGS = {
     for name, model in MODELS.items()
     for what, kind in (model.settings.items() if isinstance(model.settings, dict) else [("", model.settings)])
 }
-ROUNDING = 1e-4
-"""Powers of tens of dBm are stored in single precision."""
+ROUNDING = 1e-4  # powers of tens of dBm are stored in single precision
 
 
 def test_entries_of_the_registry_are_consistent() -> None:

@@ -1,7 +1,5 @@
 """Kriging and trees against dense linear algebra, random fields and published figures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from changed_folders import DATA, needs
@@ -15,8 +13,7 @@ from wrf_mi.models.interpolation.trees import Trees
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import summary
 
-EXACT = 1e-9
-"""Systems of a few dozen rows, condition 1e4, in float64."""
+EXACT = 1e-9  # systems of a few dozen rows, condition 1e4, in float64
 
 
 def chosen(model: Kriged) -> dict[str, float]:
@@ -114,7 +111,6 @@ def test_complex_observations_are_two_real_components_and_rows_with_nan_are_igno
 
 def test_likelihood_recovers_the_covariance_of_random_fields():
     """300 rows, 400 draws, each with a mean of its own: all three to 6 %, twice what 400 draws scatter by.
-
     The plain likelihood, which takes no account of the 400 means, is off by 7 to 14 %.
     """
     positions, heading, rng = sampled(300, 0)
@@ -184,7 +180,6 @@ def test_published_figures_of_kriging_by_pixel(split: str, published: float):
 @needs("flat-ble")
 def test_published_figures_of_signal_strengths():
     """Kriging about a log-distance law from 256 rows, 3.34 dB, and trees with heading on all rows, 3.14 dB.
-
     The published subset is not known; ours differ by 0.1 dB from each other. 40 trees are 0.02 dB worse than 300.
     """
     record, score = load(DATA / "flat-ble"), TASKS["rssi"].score

@@ -1,7 +1,5 @@
 """Lengths of strengths over areas larger than a floor are told by the rows, and intervals cover there."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +17,7 @@ from wrf_mi.models.model import default_settings, inputs_of
 from wrf_mi.runs.api import train
 from wrf_mi.tasks.scores import REAL_90
 
-FACTOR = 2.5
-"""Of a length by the likelihood of some hundred rows about the true one, either way."""
+FACTOR = 2.5  # of a length by the likelihood of some hundred rows about the true one, either way
 COVERED = (0.84, 0.96)
 """Share inside 90 % of some hundred errors, which shadowing correlates: 0.9 within three standard errors of 2 %."""
 

@@ -1,7 +1,5 @@
 """Element signals as a Gaussian process: its covariances, its fit, and the spectra that it is expected to give."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,8 +28,7 @@ from wrf_mi.receivers.retrieve import mirror_order
 
 TOWARDS = np.array([3.0, 1.0, -0.5]) / np.linalg.norm([3.0, 1.0, -0.5])
 DICTIONARY = Covariances(np.array([4.0, 1.0, 0.3]) * WAVELENGTH_M, departures(TOWARDS, WAVENUMBER, CONE_DEG, count=60))
-ROUNDING = 1e-9
-"""Of sums of some hundred numbers of size one, through the inverse of a matrix of condition 1e4."""
+ROUNDING = 1e-9  # of sums of some hundred numbers of size one, through the inverse of a matrix of condition 1e4
 
 
 def drawn(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -238,7 +235,7 @@ def test_fit_resolves_phases_and_mirror_images(elements_m, most, monkeypatch) ->
 def test_realignment_corrects_single_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the alignment of neighbours got wrong: a mirror image, and a phase."""
     monkeypatch.setattr(module, "STEPS", 10)
-    where, opposite = positions(60, seed=2), mirror_order(ELEMENTS_M)
+    where, opposite = positions(40, seed=2), mirror_order(ELEMENTS_M)
     truth = unit_signals(where)
     right = fit_signals(truth, where, ELEMENTS_M, DICTIONARY)
     rows = right.signals.copy()
@@ -284,7 +281,6 @@ def certain(mean: np.ndarray, variance: float) -> Posterior:
 @pytest.mark.parametrize("size", [(12, 24), (90, 360)])
 def test_known_signals_give_their_spectrum(size: tuple[int, int]) -> None:
     """On any grid: extremes are sought as far apart as lobes of the array allow, not so many pixels.
-
     A null is a cone; where its tip lies between the directions that are looked at, all is some per cent too low.
     """
     h = signals(positions(4), TOWARDS)
@@ -299,7 +295,7 @@ def test_expected_spectrum_is_the_mean_of_many() -> None:
     h = signals(positions(2), TOWARDS)
     posterior = certain(h, 0.5 * float(np.square(np.abs(h)).mean()))
     rng = np.random.default_rng(0)
-    pair = rng.normal(size=(2, 3000, 1, 9)) / np.sqrt(2)
+    pair = rng.normal(size=(2, 1500, 1, 9)) / np.sqrt(2)
     noise = (pair[0] + 1j * pair[1]) * np.sqrt(posterior.variance)
     h = posterior.mean + noise @ posterior.basis.T
     drawn = minmax_scale(bartlett_spectrum(h, ELEMENTS_M, FREQUENCY_HZ, 16, 32))

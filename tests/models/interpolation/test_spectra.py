@@ -1,7 +1,5 @@
 """Kriging of spectra: of grey values along and across the line of sight, and joined with element signals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,8 +27,7 @@ LENGTH_M = np.array([0.4, 0.15, 0.25])
 NOISE = 0.02
 QUICK = SpectrumKrigingSettings(directions=20, lengths=2)
 KRIGING = MODELS["kriging"].serving("spectrum", False)
-SINGLE = 2e-5
-"""Observations are float32 and of size one; weights of some tens of rows go with them."""
+SINGLE = 2e-5  # observations are float32 and of size one; weights of some tens of rows go with them
 
 
 def fit(
@@ -158,9 +155,6 @@ def test_equal_spectra_and_coincident_rows_can_be_fitted() -> None:
     np.testing.assert_allclose(found.predict(where[:1])[0], observed.mean(axis=0), atol=SINGLE)
 
 
-# Both estimates together
-
-
 @pytest.fixture(scope="module")
 def record() -> Record:
     return wave_record(rows=80, held_out=20)
@@ -230,28 +224,24 @@ def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, mode
     assert weight[1] == pytest.approx(0.5 * 0.9)
     observed, fitted = record.observation[0, record.official[0]], coherent(model)
     rows = np.arange(len(observed))  # fewer than would be drawn from
-
     by_gap = []
     for gap in GAPS:
         posterior = fitted.signals.held_out(gap * WAVELENGTH_M, rows)
         kriged, deviation = fitted.nearby.held_out(gap * WAVELENGTH_M, rows)
-        by_gap.append((posterior, kriged, deviation))
+        by_gap.append((fitted.report(posterior), posterior.ignorance, kriged, deviation))
 
     def left(half: float) -> float:
         errors = []
-        for posterior, kriged, _ in by_gap:
-            weight = posterior.ignorance**2 / (posterior.ignorance**2 + half**2)
-            mixed = kriged + weight[:, None, None] * (fitted.report(posterior)[0] - kriged)
-            errors.append(np.square(mixed - observed).mean())
+        for report, ignorance, kriged, _ in by_gap:
+            weight = ignorance**2 / (ignorance**2 + half**2)
+            errors.append(np.square(kriged + weight[:, None, None] * (report[0] - kriged) - observed).mean())
         return float(np.mean(errors))
 
     # Chosen between 0.01 and 3 in steps of a tenth.
     others = [half for half in fitted.half * np.array([0.1, 0.8, 1.25, 10.0]) if 0.01 < half < 3]
     assert left(fitted.half) <= min(left(half) for half in others)
-    inside = []
-    for posterior, kriged, deviation in by_gap:
-        mean, std = fitted.mixed(fitted.report(posterior), posterior.ignorance, kriged, deviation)
-        inside.append((np.abs(mean - observed) <= 1.6449 * fitted.spread * std).mean())
+    mixed = [fitted.mixed(*parts) for parts in by_gap]
+    inside = [np.abs(mean - observed) <= 1.6449 * fitted.spread * std for mean, std in mixed]
     assert np.mean(inside) == pytest.approx(0.9, abs=0.01)
 
 

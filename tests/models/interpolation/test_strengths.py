@@ -1,7 +1,5 @@
 """Kriging of signal strengths: its posterior, its terms, and that it learns what was put into made-up strengths."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +18,7 @@ from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.power_map import trace_map
 
 FREQUENCY_HZ = 2.44e9
-AT_1M_DBM = -40.2
-"""Free space at 2.44 GHz."""
+AT_1M_DBM = -40.2  # free space at 2.44 GHz
 UP = np.array([0.0, 0.0, 0.0, 1.0])
 DEFAULTS = StrengthSettings()
 

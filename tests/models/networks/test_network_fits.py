@@ -4,8 +4,6 @@ Sanity figures of the real data, which correct versions reach: 8 spectra are fit
 and held-out spectra are predicted better than by the mean training spectrum (0.673 on the authors' rows of rfid-lab).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,14 +30,10 @@ from wrf_mi.receivers.reports import minmax_scale
 from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim
 from wrf_mi.training.session import FitSession
 
-FITTED = 0.9
-"""Structural similarity to which 8 spectra must be fitted."""
-MEAN_SPECTRUM = 0.673
-"""Median of the mean training spectrum on the authors' held-out rows of rfid-lab."""
-MRI_DB = 4.17
-"""Median absolute error of a log-distance fit on flat-ble."""
-SAME = 1e-5
-"""Sums in float32 whose order may differ."""
+FITTED = 0.9  # structural similarity to which 8 spectra must be fitted
+MEAN_SPECTRUM = 0.673  # median of the mean training spectrum on the authors' held-out rows of rfid-lab
+MRI_DB = 4.17  # median absolute error of a log-distance fit on flat-ble
+SAME = 1e-5  # sums in float32 whose order may differ
 
 
 NERF2 = {"networks": Networks(3, 48, 0, 2, 2), "rays": 128, "sphere_rays": 24, "samples": 2, "tx_octaves": 2}

@@ -1,7 +1,5 @@
 """Convolutions, the march along rays and the training of networks, against NumPy and finite differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -36,8 +34,7 @@ from wrf_mi.training.adam import NumericsError
 
 pytestmark = pytest.mark.all_threads
 
-EXACT = 1e-12
-"""Some hundred float64 products of numbers around one."""
+EXACT = 1e-12  # some hundred float64 products of numbers around one
 
 DIFFERENCE, GRADIENT_TOLERANCE = 1e-6, 1e-7
 """Step of central differences in float64, whose error is about its square plus 1e-16 / 1e-6, and ten times that error,
@@ -239,8 +236,7 @@ def test_normalisation_of_uplinks_is_undone_for_channels():
         normalised_uplink(np.where(np.arange(3)[:, None, None] == 1, 0, uplink))
 
 
-VAE = VaeSettings(latent=2, width=5, last=5, octaves=0)
-"""Of four cells, three coordinates and six pixels."""
+VAE = VaeSettings(latent=2, width=5, last=5, octaves=0)  # of four cells, three coordinates and six pixels
 
 
 @pytest.mark.gradcheck

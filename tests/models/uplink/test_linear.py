@@ -1,7 +1,5 @@
 """The linear map from uplink to downlink: exactness, weights of rows and choice of the penalty."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +14,8 @@ from wrf_mi.tasks.conditions import normalised_uplink
 from wrf_mi.training.session import FitSession
 
 ROWS, ANTENNAS, UP, DOWN = 40, 3, 6, 5
-EXACT = 1e-5
-"""Coefficients are stored in single precision; the least penalty is 1e-10 of the uplink's energy."""
-ROUNDING = 1e-9
-"""Of float64, squared by the normal equations."""
+EXACT = 1e-5  # coefficients are stored in single precision; the least penalty is 1e-10 of the uplink's energy
+ROUNDING = 1e-9  # of float64, squared by the normal equations
 
 
 def complex_normal(rng: np.random.Generator, *shape: int) -> np.ndarray:

@@ -1,7 +1,5 @@
 """R2F2 with the paths of a scene: uplink and downlink of transmitters in the laboratory, traced and noisy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,10 +22,8 @@ from wrf_mi.tracing.options import TraceOptions
 HZ = 2.437e9 + 312.5e3 * np.arange(-16, 16)
 HALF = 16
 SNR_DB = 25.0
-GAIN_DB = 8.0
-"""Least gain by lengths that are known to centimetres: half of the one in these draws."""
-SCENE_GAIN_DB = 4.0
-"""Least gain by the exact scene: 6.8 dB with this noise."""
+GAIN_DB = 8.0  # least gain by lengths that are known to centimetres: half of the one in these draws
+SCENE_GAIN_DB = 4.0  # least gain by the exact scene: 6.8 dB with this noise
 SETTINGS = ["depth=2", "reflections=2", "max_paths=20", "wavefront=spherical"]
 
 

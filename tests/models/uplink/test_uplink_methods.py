@@ -1,7 +1,5 @@
 """Methods from the uplink: exactness on sparse paths, gain over a copy of the uplink, stored models, refused data."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -118,11 +116,11 @@ def walk(elements):
 @pytest.mark.parametrize("wavefront", ["plane", "spherical"])
 def test_r2f2_is_exact_on_noise_free_sparse_paths(elements, wavefront):
     rng = np.random.default_rng(1)
-    h = channels(*sparse(10, 4, rng, 1.5 if wavefront == "spherical" else 10), elements, wavefront == "spherical")
+    h = channels(*sparse(5, 4, rng, 1.5 if wavefront == "spherical" else 10), elements, wavefront == "spherical")
     record = record_of(h, elements)
-    fitted = r2f2.MODEL.fit(Problem(record, PathSettings(max_paths=5, choice_rows=2), 0), split_of(10), FitSession())
+    fitted = r2f2.MODEL.fit(Problem(record, PathSettings(max_paths=5, choice_rows=2), 0), split_of(5), FitSession())
     assert fitted.kind == wavefront, "the kind of wave is found on validation rows"
-    assert accuracy_db(fitted, record, np.arange(10), h).min() > EXACT_DB
+    assert accuracy_db(fitted, record, np.arange(5), h).min() > EXACT_DB
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -209,7 +207,6 @@ def test_fire_ignores_rows_without_downlink(walk):
 )
 def test_captures_without_a_pose_are_fitted_and_predicted(name, known, walk):
     """As in Argos' captures, the base station's position, elements and frequencies are unknown.
-
     Networks of ten steps predict no better than zeros; the other methods reach a median CEA of 15 dB.
     """
     truth, _ = walk

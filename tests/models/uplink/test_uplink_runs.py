@@ -1,7 +1,5 @@
 """Runs on uplink and downlink channels: antennas, the uplink as input and as reference, data without positions."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -25,10 +23,8 @@ from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
 from wrf_mi.training.session import FitSession
 
-ROUNDING = 1e-4
-"""Powers of tens of dBm are stored in single precision."""
-TURNED_DB = -20 * np.log10(2 * np.sin(0.05))
-"""A turn by 0.1 rad leaves 2 sin(0.05) of each coefficient."""
+ROUNDING = 1e-4  # powers of tens of dBm are stored in single precision
+TURNED_DB = -20 * np.log10(2 * np.sin(0.05))  # A turn by 0.1 rad leaves 2 sin(0.05) of each coefficient
 
 
 @pytest.fixture(scope="module")
