@@ -37,13 +37,16 @@ def made_paths(seed: int, n_tx: int = 5, each: int = 6) -> Paths:
 @pytest.mark.parametrize("phase_error", [0.3, 1.0, 2.5])
 def test_spectra_are_the_mean_over_random_phases(phase_error: float) -> None:
     """Phases are independent and normal, of variance phase_error^2 for each reflection; transmissions add none."""
-    paths = made_paths(seed=1)
-    reflections = (paths.interactions == 1).sum(axis=1)
-    rng, plain = np.random.default_rng(3), instrument(0.0)
-    mean = np.zeros((1, paths.n_tx, *SIZE))
-    for _ in range(4096):
-        phase = phase_error * np.sqrt(reflections) * rng.normal(size=len(paths))
-        mean += plain.observe(replace(paths, gain=paths.gain * np.exp(1j * phase))) / 4096
+    paths, copies, rounds = made_paths(seed=1), 512, 8
+    names = ("tx", "rx", "gain", "length_m", "departure", "arrival", "interactions", "vertices_m", "objects")
+    many = replace(paths, **{name: np.concatenate([getattr(paths, name)] * copies) for name in names})
+    first_tx = np.repeat(paths.n_tx * np.arange(copies), len(paths))
+    many = replace(many, tx=many.tx + first_tx, n_tx=copies * paths.n_tx)
+    deviation = phase_error * np.sqrt((many.interactions == 1).sum(axis=1))
+    rng, plain, mean = np.random.default_rng(3), instrument(0.0), 0
+    for _ in range(rounds):
+        drawn = plain.observe(replace(many, gain=many.gain * np.exp(1j * deviation * rng.normal(size=len(many)))))
+        mean += drawn.reshape(1, copies, paths.n_tx, *SIZE).mean(axis=1) / rounds
     spectra = instrument(phase_error).observe(paths)
     assert np.abs(spectra - mean).mean() < EXPECTATION
     assert np.abs(plain.observe(paths) - mean).mean() > 2 * np.abs(spectra - mean).mean()

@@ -65,7 +65,9 @@ def test_equals_scikit_image(name, shape):
 
 
 @settings(max_examples=20, deadline=None)
-@given(st.integers(7, 12), st.integers(7, 12), st.floats(0, 1), st.floats(1e-4, 1), st.integers(0, 2**32 - 1))
+@given(
+    st.sampled_from([7, 11]), st.sampled_from([7, 12]), st.floats(0, 1), st.floats(1e-4, 1), st.integers(0, 2**32 - 1)
+)
 def test_equals_scikit_image_at_any_level_and_contrast(height, width, level, contrast, seed):
     rng = np.random.default_rng(seed)
     prediction = level + contrast * rng.random((2, height, width))
