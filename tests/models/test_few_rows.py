@@ -76,16 +76,13 @@ def test_shift_follows_the_rows_where_receivers_differ_more_than_rows(number: in
     assert np.abs(error_db).mean() < 1.5
 
 
-def test_standard_deviation_has_both_variances_and_rows_reduce_it() -> None:
+def test_deviation_has_both_variances_and_a_receiver_at_an_unknown_place_the_mean_level() -> None:
     record = building(**SCARCE)
     record.observation[:3] += np.array([[-4.0], [0.0], [4.0]], np.float32)
     two_rows, none = SharedLaw.fit(record, np.arange(TRAINED), np.array([3, 4])).std_db
     # The variance between is that of three numbers, 16 dB^2, and within receivers noise of 1 dB and the law's misfit.
     assert none == pytest.approx(np.sqrt(16 + NOISE_DB**2), rel=0.25)
     assert two_rows == pytest.approx(np.sqrt(1.5) * NOISE_DB, rel=0.5)
-
-
-def test_a_receiver_at_an_unknown_place_has_the_mean_level() -> None:
     record = building(**SCARCE)
     lost = replace(record.receivers[4], position_m=np.full(3, np.nan))
     record = replace(record, receivers=(*record.receivers[:4], lost))

@@ -37,13 +37,20 @@ def shadowed(seed: int, rows: int = 80, noise_db: float = 0.0) -> tuple[np.ndarr
     return tx_pos_m, -42 - 28 * np.log10(distance_m) + noise_db * shadow, place_m
 
 
-def test_strengths_without_noise_locate_the_receiver() -> None:
+def test_strengths_locate_the_receiver_stated_coordinates_remain_and_a_single_row_says_little() -> None:
     """The law's least distance of 0.3 m moves them by centimetres, and so do errors of the height."""
     for seed in range(5):
         tx_pos_m, power_dbm, place_m = shadowed(seed)
         found_m, std_m = place_of_receiver(tx_pos_m, power_dbm, 36.0, UNKNOWN_M)
         np.testing.assert_allclose(found_m[:2], place_m[:2], atol=0.1)
         assert (std_m > 0).all()
+    tx_pos_m, power_dbm, place_m = shadowed(0)
+    found_m, std_m = place_of_receiver(tx_pos_m, power_dbm, 36.0, np.array([np.nan, np.nan, 2.6]))
+    assert (found_m[2], std_m[2]) == (2.6, 0)
+    np.testing.assert_allclose(found_m[:2], place_m[:2], atol=0.1)
+    found_m, std_m = place_of_receiver(np.array([[3.0, 4.0, 1.0]]), np.array([-60.0]), 20.0, UNKNOWN_M)
+    assert np.isfinite(found_m).all()
+    assert (std_m[:2] > 5).all()
 
 
 def test_standard_deviations_cover_the_errors_under_correlated_shadowing() -> None:
@@ -54,16 +61,6 @@ def test_standard_deviations_cover_the_errors_under_correlated_shadowing() -> No
         found_m, std_m = place_of_receiver(tx_pos_m, power_dbm, 36.0, UNKNOWN_M)
         inside += list(np.abs(found_m - place_m)[:2] < std_m[:2])
     assert 0.55 < np.mean(inside) < 0.85
-
-
-def test_stated_coordinates_remain_and_a_single_row_says_little_of_the_others() -> None:
-    tx_pos_m, power_dbm, place_m = shadowed(0)
-    found_m, std_m = place_of_receiver(tx_pos_m, power_dbm, 36.0, np.array([np.nan, np.nan, 2.6]))
-    assert (found_m[2], std_m[2]) == (2.6, 0)
-    np.testing.assert_allclose(found_m[:2], place_m[:2], atol=0.1)
-    found_m, std_m = place_of_receiver(np.array([[3.0, 4.0, 1.0]]), np.array([-60.0]), 20.0, UNKNOWN_M)
-    assert np.isfinite(found_m).all()
-    assert (std_m[:2] > 5).all()
 
 
 def test_places_come_from_the_rows_that_are_named_and_others_stay() -> None:

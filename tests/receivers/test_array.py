@@ -12,7 +12,6 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import load
 from wrf_mi.receivers import array as module
 from wrf_mi.receivers.array import array_response, bartlett_spectrum, mirror_order
-from wrf_mi.receivers.reports import minmax_scale
 
 FREQUENCY_HZ = 920e6
 SPACING_M = 0.16
@@ -38,17 +37,14 @@ ARRAYS = {
 }
 
 
-def test_planar_array_is_a_centred_grid():
+def test_planar_array_is_a_centred_grid_whose_nearer_elements_lead_in_phase():
     array = planar_array(2, 3, 0.1)
     expected = [[x, y, 0] for y in (-0.05, 0.05) for x in (-0.1, 0, 0.1)]
     np.testing.assert_allclose(array, expected, atol=EXACT)
     for wrong in ((0, 4, 0.1), (4, 0, 0.1), (4, 4, 0), (4, 4, float("nan"))):
         with pytest.raises(ValueError, match="positive"):
             planar_array(*wrong)
-
-
-def test_element_nearer_to_the_source_leads_in_phase():
-    """An element half a wavelength nearer to the source leads by pi; one across the wave is in phase."""
+    # Half a wavelength nearer to the source an element leads by pi; one across the wave is in phase.
     half = speed_of_light / FREQUENCY_HZ / 2
     response = array_response([[0, 0, 0], [half, 0, 0], [0, half, 0], [half / 2, 0, 0]], [1, 0, 0], FREQUENCY_HZ)
     np.testing.assert_allclose(response, [1, -1, 1, 1j], atol=EXACT)
@@ -76,11 +72,6 @@ def test_spectrum_of_a_plane_wave_is_the_array_factor():
     np.testing.assert_allclose(spectrum, factor, atol=EXACT)
     several = bartlett_spectrum(np.ones((2, 5, 16)), array, FREQUENCY_HZ, 9, 36)
     assert several.shape == (2, 5, 9, 36)
-
-
-def test_minmax_scale_maps_constant_images_to_zero():
-    images = np.array([[[1.0, 3], [2, 5]], [[7, 7], [7, 7]]])
-    np.testing.assert_allclose(minmax_scale(images), [[[0, 0.5], [0.25, 1]], [[0, 0], [0, 0]]])
 
 
 @needs("rfid-lab")

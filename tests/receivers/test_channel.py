@@ -58,7 +58,7 @@ def test_antenna_csi_of_subcarriers_is_that_of_each(size: int, monkeypatch: pyte
     assert (result[:, 3] == 0).all()
 
 
-def test_signal_strength_is_the_sum_of_powers():
+def test_signal_strength_and_power_over_a_wide_band_are_sums_of_powers():
     paths = random_paths()
     power = np.zeros((3, 4))
     for p in range(len(paths)):
@@ -67,10 +67,7 @@ def test_signal_strength_is_the_sum_of_powers():
     strength = rssi_dbm(paths)
     np.testing.assert_allclose(strength[:, :3], 10 * np.log10(power[:, :3]), rtol=EXACT)
     assert np.isnan(strength[:, 3]).all()
-
-
-def test_power_over_a_wide_band_is_the_sum_of_powers():
-    """Two equal waves in opposite phase cancel at one frequency; over a wide band they are independent."""
+    # Two equal waves in opposite phase cancel at one frequency; over a wide band they are independent.
     wavelength = 0.5
     frequency = speed_of_light / wavelength
     lengths = {"gain": np.ones(2, complex), "length_m": np.array([10.0, 10.0 + wavelength / 2])}

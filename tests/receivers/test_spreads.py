@@ -18,16 +18,13 @@ def statistics(power: list[float], length_m: list[float], azimuth_deg: list[floa
     return PathStatistics.of_paths(rows, 1, np.array(power), np.array(length_m), arrival)
 
 
-def test_two_equal_paths() -> None:
+def test_spreads_and_k_factor_of_one_to_three_paths() -> None:
     found = statistics([0.5e-8, 0.5e-8], [10.0, 13.0], [0.0, 90.0])
     assert found.path_gain_db[0] == pytest.approx(-80, abs=ROUNDING)
     assert found.delay_spread_s[0] == pytest.approx(1.5 / speed_of_light, rel=ROUNDING)
     assert found.k_factor_db[0] == pytest.approx(0, abs=ROUNDING)
     # The mean of two unit vectors at a right angle has length 1 / sqrt(2): sqrt(-2 ln) of it is sqrt(ln 2).
     assert found.azimuth_spread_deg[0] == pytest.approx(np.degrees(np.sqrt(np.log(2))), rel=ROUNDING)
-
-
-def test_k_factor_is_that_of_strongest_over_rest_and_a_path_alone_has_no_spread() -> None:
     three = statistics([8e-9, 1e-9, 1e-9], [5.0, 6.0, 7.0], [0.0, 1.0, 2.0])
     assert three.k_factor_db[0] == pytest.approx(10 * np.log10(4), abs=ROUNDING)
     alone = statistics([1e-9], [7.0], [33.0])

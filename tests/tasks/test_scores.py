@@ -48,9 +48,6 @@ def test_idw_equals_values_by_hand():
     # Distances far below one do not overflow.
     tiny = blend(SQUARE * 1e-100, [1.0, 2, 3, 4], [[0.5e-100, 0, 0]], 2, power=4)
     assert tiny == pytest.approx([1.5], rel=EXACT)
-
-
-def test_fewer_rows_than_neighbours_and_single_precision():
     spectra = np.random.default_rng(0).random((2, 8, 9)).astype(np.float32)
     mean = blend(SQUARE[:2], spectra, [[0.5, 0, 0]], 4)
     assert mean.dtype == np.float32
@@ -95,14 +92,11 @@ def test_ssim_is_computed_per_image():
         ssim(np.zeros((2, 6, 8)), np.zeros((2, 6, 8)))
 
 
-def test_abs_error_of_missing_observations_is_nan():
+def test_errors_accuracies_and_summaries_of_known_values():
     truth = np.array([[-60.0, np.nan, -70], [np.nan, -50, -90]])
     prediction = np.array([[-61.5, -10, -69], [np.nan, -50, -80]])
     np.testing.assert_array_equal(abs_error_db(prediction, truth), [[1.5, np.nan, 1], [np.nan, 0, 10]])
     assert summary(abs_error_db(prediction, truth))["median"] == 1.25
-
-
-def test_cea_of_known_errors():
     truth = np.array([[3 + 4j, 0], [1, 1j], [0, 0]])
     # Of a power of 25 an error of 0.25; of 2 an error of 2; without power there is no accuracy.
     prediction = np.array([[3 + 4.3j, 0.4], [0, 0], [0, 0]])
@@ -110,6 +104,11 @@ def test_cea_of_known_errors():
     # A complex number of phase off by a third of a turn is worse than none: |1 - exp(j 2 pi / 3)|^2 = 3.
     assert cea_db([np.exp(2j * np.pi / 3)], [1]) == pytest.approx(-10 * np.log10(3))
     assert np.isfinite(cea_db(truth[:2], truth[:2])).all()
+    assert summary([3, np.nan, 5])["mean"] == 4
+    assert summary(np.arange(11).reshape(1, 11) ** 2) == {"median": 25.0, "mean": 35.0, "p10": 1.0, "p90": 81.0}
+    for nothing in ([], [np.nan]):
+        with pytest.raises(InputError, match="no test rows"):
+            summary(nothing)
 
 
 @pytest.mark.parametrize("metric", [abs_error_db, cea_db, ssim])
@@ -124,14 +123,6 @@ def test_metrics_refuse_missing_predictions(metric):
         metric(prediction[:1], truth)
 
 
-def test_summary_of_known_values():
-    assert summary([3, np.nan, 5])["mean"] == 4
-    assert summary(np.arange(11).reshape(1, 11) ** 2) == {"median": 25.0, "mean": 35.0, "p10": 1.0, "p90": 81.0}
-    for nothing in ([], [np.nan]):
-        with pytest.raises(InputError, match="no test rows"):
-            summary(nothing)
-
-
 def test_window_moments_give_scikit_images_ssim_of_the_mean():
     rng = np.random.default_rng(0)
     predictions, truth = rng.random((3, 5, 12, 20)), rng.random((5, 12, 20))
@@ -141,7 +132,7 @@ def test_window_moments_give_scikit_images_ssim_of_the_mean():
     assert ssim_mixtures(predictions, truth, stride=1)(weights, rows) == pytest.approx(expected, abs=SUMS)
 
 
-def test_mixtures_of_channels_are_scored_within_limits():
+def test_mixtures_of_channels_and_strengths_are_scored_within_limits():
     task, rng = TASKS["csi"], np.random.default_rng(1)
     truth = rng.normal(size=(4, 8)) + 1j * rng.normal(size=(4, 8))
     scores, rows = task.mixtures(np.stack([truth, -30 * truth]), truth), np.arange(4)
@@ -150,20 +141,20 @@ def test_mixtures_of_channels_are_scored_within_limits():
         assert scores(np.tile([first, 1 - first], (4, 1)), rows) == pytest.approx(np.full(4, expected))
     weights = np.tile([30.5 / 31, 0.5 / 31], (4, 1))
     assert scores(weights, rows) == pytest.approx(np.full(4, -20 * np.log10(0.5)))
-
-
-def test_mixtures_of_errors_are_the_better_the_smaller():
     scores = TASKS["rssi"].mixtures(np.array([[-60.0], [-70.0]]), np.array([-64.0]))
     errors = [scores(np.array([[share, 1 - share]]), np.array([0]))[0] for share in (1.0, 0.5, 0.6)]
     assert errors == pytest.approx([-4.0, -1.0, 0.0])
 
 
-def test_level_of_strengths_is_itself_and_that_of_rayleigh_fading_is_of_an_exponential_power() -> None:
+def test_levels_of_strengths_rayleigh_fading_and_phases() -> None:
     strengths = Prediction(np.array([-70.0, np.nan]), np.array([2.0, 3.0]))
     assert TASKS["rssi"].level(strengths) is strengths
     level = TASKS["csi"].level(Prediction(np.zeros((1, 1), complex), np.full((1, 1), 0.1)))
     assert level.mean[0] == pytest.approx(20 * np.log10(0.1) - EULER_DB, abs=SUMS)
     assert level.stated_std[0] == pytest.approx(RAYLEIGH_DB, abs=SUMS)
+    coefficients = np.array([[[1.0, 1j], [3.0, -1.0]]], complex)
+    assert TASKS["csi"].level(Prediction(coefficients)).mean[0] == pytest.approx(10 * np.log10(3), abs=SUMS)
+    assert np.isnan(TASKS["csi"].level(Prediction(0 * coefficients)).mean[0])
 
 
 @pytest.mark.parametrize("mean", [1.0, 3.0, 10.0])
@@ -174,12 +165,6 @@ def test_level_of_a_rician_coefficient_agrees_with_draws(mean: float) -> None:
     found = TASKS["csi"].level(Prediction(np.full((1, 1), mean + 0j), np.ones((1, 1))))
     assert found.mean[0] == pytest.approx(levels.mean(), abs=SAMPLED_DB)
     assert found.stated_std[0] == pytest.approx(levels.std(), abs=SAMPLED_DB)
-
-
-def test_channel_gain_is_the_mean_over_antennas_and_subcarriers_whatever_the_phase() -> None:
-    coefficients = np.array([[[1.0, 1j], [3.0, -1.0]]], complex)
-    assert TASKS["csi"].level(Prediction(coefficients)).mean[0] == pytest.approx(10 * np.log10(3), abs=SUMS)
-    assert np.isnan(TASKS["csi"].level(Prediction(0 * coefficients)).mean[0])
 
 
 def test_level_of_a_spectrum_is_the_mean_power_over_the_solid_angle() -> None:

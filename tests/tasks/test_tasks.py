@@ -15,13 +15,10 @@ def record(task: str, shape: tuple[int, ...]) -> Record:
     return Record("made", task, np.ones((2, 3)), (receiver,), np.zeros(shape, np.float32), frequencies_hz=np.ones(1))
 
 
-def test_names_in_the_registry_are_those_of_the_tasks() -> None:
+def test_tasks_have_their_names_and_unknown_tasks_and_instruments_without_arrays_are_refused() -> None:
     assert {name: task.name for name, task in TASKS.items()} == {name: name for name in TASKS}
     assert set(TASKS) >= {"spectrum", "rssi", "csi"}
     assert len({task.block for task in TASKS.values()}) == len(TASKS)
-
-
-def test_unknown_tasks_and_instruments_without_arrays_are_refused() -> None:
     with pytest.raises(InputError, match="made: task 'sound'; known are spectrum, rssi, csi"):
         task_of(record("sound", (1, 2)))
     with pytest.raises(InputError, match="made: holds rssi; spectra are needed"):

@@ -32,14 +32,11 @@ def test_strengths_without_a_scene_are_those_of_kriging_and_restored(flat_folder
     assert wrf_mi.evaluate_run(run.folder)["weights"] == run.metrics["weights"]
 
 
-def test_two_rows_are_interpolated_by_kriging(flat_folder: Path, tmp_path: Path):
+def test_two_rows_are_interpolated_by_kriging_and_five_spectra_have_intervals(flat_folder, tmp_path, folder):
     run = wrf_mi.train(flat_folder, tmp_path / "run", "hybrid", n_train=2)
     assert list(run.metrics["weights"][0]) == ["distance_m", "kriging"]
     assert "inside_90" not in run.metrics
-
-
-def test_five_spectra_have_intervals(folder: Path, tmp_path: Path):
-    """Three remain where two are held out, through which kriging may pass without any deviation."""
+    # Three remain where two are held out, through which kriging may pass without any deviation.
     run = wrf_mi.train(folder, tmp_path / "run", n_train=5)
     assert 0 < run.metrics["inside_90"] <= 1
 

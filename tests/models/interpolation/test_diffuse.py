@@ -1,7 +1,6 @@
 """Kriging of channels: line of sight and diffuse field, or generic."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,7 +77,7 @@ def test_the_line_of_sight_reaches_beyond_a_wavelength() -> None:
     assert model.models[0].gain == pytest.approx(GAIN, rel=1e-5)
 
 
-def test_receivers_without_a_clear_gain_are_kriged_generically(dense: Record, fitted: ByReceiver, tmp_path: Path):
+def test_receivers_without_a_clear_gain_are_kriged_generically_and_noise_is_not_kriged(dense, fitted, tmp_path):
     assert isinstance(fitted.models[1], UncertainKriged)
     assert all(isinstance(model, UncertainKriged) for model in fit(dense, np.arange(LEAST_ROWS - 1)).models)
     again = KRIGING.load(fitted.arrays(), Problem(dense, DEFAULTS), tmp_path)
@@ -87,6 +86,9 @@ def test_receivers_without_a_clear_gain_are_kriged_generically(dense: Record, fi
         np.testing.assert_array_equal(after.mean, before.mean)
         np.testing.assert_array_equal(after.std, before.std)
     assert again.facts() == fitted.facts()
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(200, 2)) @ np.array([[1], [1j]])
+    assert fit_diffuse(rng.uniform(0, 0.3, (200, 3)), values, K).share == 0
 
 
 @pytest.mark.parametrize("unknown", ["frequencies", "antennas", "covariance"])
@@ -99,9 +101,3 @@ def test_unknown_frequencies_and_several_antennas_are_kriged_generically(unknown
     model = fit(data, np.arange(40), KrigingSettings(length_m=0.1 if unknown == "covariance" else None))
     assert all(type(kriged) is Kriged for kriged in model.models)
     assert model.predict(Inputs(dense.tx_pos_m[:3]), 1).std is None
-
-
-def test_noise_is_not_kriged() -> None:
-    rng = np.random.default_rng(0)
-    values = rng.normal(size=(200, 2)) @ np.array([[1], [1j]])
-    assert fit_diffuse(rng.uniform(0, 0.3, (200, 3)), values, K).share == 0

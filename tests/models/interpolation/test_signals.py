@@ -149,13 +149,18 @@ def test_fit_recovers_the_shares() -> None:
     assert noise == pytest.approx(0.1, rel=0.5)
 
 
-def test_likelihood_ignores_components_of_rounding() -> None:
+def test_more_elements_than_rows_and_their_components_of_rounding() -> None:
     """Components of fewer rows than elements: their likelihood says nothing, and is the same for all of them."""
     rows = RowCovariances(DICTIONARY, positions(6))
     rng = np.random.default_rng(0)
     costs = [fit_shares(1e-17 * scale * rng.normal(size=6).astype(complex), rows, 10, 1e-6)[2] for scale in (1, 30)]
     assert costs[0] == pytest.approx(costs[1], abs=1e-6)
     assert np.isfinite(fit_shares(np.zeros(6, complex), rows, 10)[2])
+    where = positions(8)
+    process = fit_signals(signals(where, TOWARDS), where, ELEMENTS_M, DICTIONARY)
+    posterior = process.predict(positions(3, seed=1))
+    assert np.isfinite(posterior.mean).all()
+    assert ((posterior.ignorance > 0) & (posterior.ignorance <= 1)).all()
 
 
 def test_prediction_is_that_of_a_gaussian_process_and_restored(tmp_path: Path) -> None:
@@ -247,14 +252,6 @@ def test_realignment_corrects_single_rows(monkeypatch: pytest.MonkeyPatch) -> No
     assert np.ptp(angle) < 0.5  # all are turned a little by what was wrong
     monkeypatch.setattr(module, "align_signals", lambda *known: rows)
     assert overlaps(fit_signals(truth, where, ELEMENTS_M, DICTIONARY).signals, truth).min() > 1 - ROUNDING
-
-
-def test_more_elements_than_rows() -> None:
-    where = positions(8)
-    process = fit_signals(signals(where, TOWARDS), where, ELEMENTS_M, DICTIONARY)
-    posterior = process.predict(positions(3, seed=1))
-    assert np.isfinite(posterior.mean).all()
-    assert ((posterior.ignorance > 0) & (posterior.ignorance <= 1)).all()
 
 
 @pytest.mark.parametrize("dtype", [np.complex128, np.complex64])

@@ -82,7 +82,7 @@ def test_prediction_is_ordinary_kriging_and_restored_from_arrays(tmp_path: Path)
     np.testing.assert_array_equal(again.std(where), process.std(where))
 
 
-def test_constant_field_is_reproduced() -> None:
+def test_constant_fields_are_reproduced_and_coincident_rows_fitted() -> None:
     """Weights sum to one, near and far, for any row left out."""
     process = process_of()
     process.observed[:] = 0.25
@@ -90,6 +90,14 @@ def test_constant_field_is_reproduced() -> None:
     held_out, deviation = process.held_out(0.2, np.arange(25))
     np.testing.assert_allclose(held_out, 0.25, atol=SINGLE)
     assert deviation.max() < 1e-3
+    # All spectra the same, and all at one place.
+    where = positions(10)
+    same = fit_anisotropic(where, np.full((10, 30), 0.5, np.float32), RECEIVER_M, WAVELENGTH_M)
+    np.testing.assert_allclose(same.predict(positions(2, seed=1)), 0.5, atol=SINGLE)
+    one_place = np.repeat(where[:1], 10, axis=0)
+    observed = np.random.default_rng(0).uniform(size=(10, 30)).astype(np.float32)
+    found = fit_anisotropic(one_place, observed, RECEIVER_M, WAVELENGTH_M)
+    np.testing.assert_allclose(found.predict(where[:1])[0], observed.mean(axis=0), atol=SINGLE)
 
 
 @pytest.mark.parametrize("radius_m", [0.0, 0.1, 0.3, 100.0])
@@ -142,17 +150,6 @@ def test_fit_recovers_lengths_and_noise(most: int, monkeypatch: pytest.MonkeyPat
     assert fitted.noise == pytest.approx(NOISE, rel=0.3)
     assert np.mean(fitted.scale) == pytest.approx(0.1, rel=0.05)
     assert fitted.observed.shape == observed.shape
-
-
-def test_equal_spectra_and_coincident_rows_can_be_fitted() -> None:
-    """All spectra the same, and all at one place."""
-    where = positions(10)
-    same = fit_anisotropic(where, np.full((10, 30), 0.5, np.float32), RECEIVER_M, WAVELENGTH_M)
-    np.testing.assert_allclose(same.predict(positions(2, seed=1)), 0.5, atol=SINGLE)
-    one_place = np.repeat(where[:1], 10, axis=0)
-    observed = np.random.default_rng(0).uniform(size=(10, 30)).astype(np.float32)
-    found = fit_anisotropic(one_place, observed, RECEIVER_M, WAVELENGTH_M)
-    np.testing.assert_allclose(found.predict(where[:1])[0], observed.mean(axis=0), atol=SINGLE)
 
 
 @pytest.fixture(scope="module")

@@ -137,17 +137,14 @@ def test_stated_noise_lowers_the_error() -> None:
     assert np.median(np.abs(errors(weighted, record, test))) < 0.75 * np.median(np.abs(errors(plain, record, test)))
 
 
-def test_learns_offsets_exponent_and_pattern(turning: tuple[Record, Strengths]) -> None:
+def test_learns_offsets_exponent_and_a_pattern_that_receivers_share(turning: tuple[Record, Strengths]) -> None:
     record, model = turning
     test = np.arange(200, 300)
     # Noise of 1 dB alone has a median of 0.67 dB.
     assert np.median(np.abs(errors(model, record, test))) < 0.95
     unturned = replace(record, tx_heading_rad=None)
     assert np.median(np.abs(errors(fit_strengths(unturned, np.arange(200)), unturned, test))) > 1.5
-
-
-def test_receivers_share_the_transmitters_pattern() -> None:
-    """The third receiver has four rows: the pattern that it shares must come from the other two."""
+    # The third receiver has four rows: the pattern that it shares must come from the other two.
     record = made(300, noise_db=0.5, body_db=6.0)
     observation = record.observation.copy()
     observation[2, 4:] = np.nan

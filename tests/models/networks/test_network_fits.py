@@ -119,7 +119,7 @@ def test_rows_without_positions_or_observations_are_refused(name: str, one_gatew
             fit(name, record, rows)
 
 
-def test_settings_out_of_range_are_refused():
+def test_settings_out_of_range_and_other_constants_are_refused():
     for kind, wrong in (
         (VaeSettings, {"latent": 0}),
         (VaeSettings, {"scale_m": 0.0}),
@@ -132,9 +132,6 @@ def test_settings_out_of_range_are_refused():
     ):
         with pytest.raises(InputError, match="choose"):
             kind(**wrong)
-
-
-def test_constants_that_were_settings_are_read_where_they_are_the_same():
     constants = {"latent": 4, "pool": 6, "noise": 0.1, "beta": 0.03, "prior_share": 0.8}
     assert settings_from(VaeSettings, constants, "run") == VaeSettings(latent=4)
     with pytest.raises(InputError, match=r"^run, setting beta: 0\.1, where this version has 0\.03 alone"):

@@ -253,12 +253,14 @@ def test_gradients_of_the_evidence_bound():
     assert_gradients(function, list(weights.values()), rng)
 
 
-def test_divergence_and_softplus_equal_their_formulas():
+def test_divergence_softplus_and_means_over_blocks_equal_their_formulas():
     """KL(N(m, v) || N(0, 1)) = (m^2 + v - 1 - log v) / 2."""
     divergence = normal_divergence(doubles(np.array([[0.7]])), doubles(np.log([[0.25]]))).array[0]
     assert divergence == pytest.approx((0.49 + 0.25 - 1 - np.log(0.25)) / 2, abs=EXACT)
     x = np.array([-800.0, -1, 0, 2, 800])
     np.testing.assert_allclose(softplus(doubles(x)).numpy(), np.logaddexp(0, x), atol=EXACT)
+    image = np.arange(24.0).reshape(1, 4, 6)
+    np.testing.assert_array_equal(pooled(image, 3)[0], image.reshape(2, 2, 3, 2).mean(axis=(1, 3)).ravel())
 
 
 def test_paths_of_weights_are_those_of_attributes_and_lists():
@@ -270,11 +272,6 @@ def test_paths_of_weights_are_those_of_attributes_and_lists():
     assert {"in.noise", "norm0.scale", "0.hidden"} <= set(generator.state())
     other = vae.with_state({path: weight + 1 for path, weight in state.items()})
     assert (other.p.layers[0].latent == vae.p.layers[0].latent + 1).all()
-
-
-def test_pooled_spectra_are_means_over_blocks():
-    image = np.arange(24.0).reshape(1, 4, 6)
-    np.testing.assert_array_equal(pooled(image, 3)[0], image.reshape(2, 2, 3, 2).mean(axis=(1, 3)).ravel())
 
 
 class Numbers(Module):

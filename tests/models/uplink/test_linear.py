@@ -46,7 +46,7 @@ def fit(record: Record, split: Split, **settings: float) -> LinearMap:
     return MODEL.fit(Problem(record, LinearSettings(**settings), 0), split, FitSession())
 
 
-def test_exact_on_a_noise_free_linear_relation() -> None:
+def test_exact_on_a_noise_free_linear_relation_and_zero_for_zeros() -> None:
     record, matrix = linear_record()
     split = split_of()
     fitted = fit(record, split)
@@ -55,6 +55,12 @@ def test_exact_on_a_noise_free_linear_relation() -> None:
     found, truth = fitted.predict(inputs_of(record, split.test), 0).mean, record.observation[0, split.test]
     assert found.dtype == np.complex64
     assert relative_error(found, truth).max() < EXACT**2
+    record, _ = linear_record()
+    uplink = np.ones((2, ANTENNAS, UP), np.complex64)
+    uplink[1, 2] = 0
+    found = fit(record, split_of()).predict(Inputs(np.full((2, 3), np.nan), uplink=uplink), 0).mean
+    assert not found[1, 2].any()
+    assert found[1, 1].all()
 
 
 def test_penalty_is_chosen_on_validation_rows_and_fitted_to_all_training_rows() -> None:
@@ -111,15 +117,6 @@ def test_without_validation_rows_every_fifth_training_row_chooses() -> None:
     assert fit(record, split).penalty == expected
     two = fit(record, replace(split, train=rows[:2]))
     assert np.isfinite(two.matrix).all()
-
-
-def test_uplink_of_zeros_at_an_antenna_gives_a_downlink_of_zeros() -> None:
-    record, _ = linear_record()
-    uplink = np.ones((2, ANTENNAS, UP), np.complex64)
-    uplink[1, 2] = 0
-    found = fit(record, split_of()).predict(Inputs(np.full((2, 3), np.nan), uplink=uplink), 0).mean
-    assert not found[1, 2].any()
-    assert found[1, 1].all()
 
 
 def test_penalties_out_of_range_and_rows_without_energy_are_refused() -> None:

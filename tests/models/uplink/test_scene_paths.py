@@ -64,6 +64,12 @@ def test_known_lengths_carry_close_paths_into_the_next_band():
     assert median["known"] > median["searched"] + GAIN_DB
 
 
+def test_distinct_paths_are_the_strongest_of_those_that_are_alike():
+    theta = np.array([[5.0, 0.1, 0.2], [5.01, 0.105, 0.2], [5.0, 0.3, 0.2], [9.0, 0.1, 0.2], [7.0, 0, 0]])
+    found = distinct(theta, np.array([0.5, 1.0, 0.2, 1e-4, 0.0]))
+    assert found == pytest.approx(theta[[1, 2]])
+
+
 def test_scene_raises_the_accuracy_of_the_downlink(room: Record, tmp_path: Path):
     run = {
         scene: wrf_mi.train(room, tmp_path / str(scene), "r2f2", scene=scene, settings=SETTINGS[: None if scene else 4])
@@ -79,9 +85,3 @@ def test_scene_raises_the_accuracy_of_the_downlink(room: Record, tmp_path: Path)
         opened.predict(tx_pos_m=np.full((1, 3), np.nan), uplink=room.uplink[:1])
     with pytest.raises(InputError, match="another wavefront than free"):
         wrf_mi.train(room, tmp_path / "free", "r2f2", scene="laboratory", settings=["wavefront=free"])
-
-
-def test_distinct_paths_are_the_strongest_of_those_that_are_alike():
-    theta = np.array([[5.0, 0.1, 0.2], [5.01, 0.105, 0.2], [5.0, 0.3, 0.2], [9.0, 0.1, 0.2], [7.0, 0, 0]])
-    found = distinct(theta, np.array([0.5, 1.0, 0.2, 1e-4, 0.0]))
-    assert found == pytest.approx(theta[[1, 2]])
