@@ -131,7 +131,7 @@ def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[
             f"{run} resumed": ["train", "--resume", folder / run, "--json"],
             f"{run} scored": ["evaluate", folder / run, "--json"],
             f"{run} predicted": ["predict", folder / of, "--tx", folder / "tx.csv", "--out", folder / f"{of}.npz"],
-            f"{run} compared": ["compare", folder / of, folder / run, "--out", folder / f"{run} page"],
+            f"{run} compared": ["compare", *{folder / of, folder / run}, "--out", folder / f"{run} page"],
         }
     return folder, results | commands(environment, calls)
 

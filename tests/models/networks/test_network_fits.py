@@ -127,8 +127,8 @@ def test_settings_out_of_range_and_other_constants_are_refused():
         (DcganSettings, {"noise": 0}),
         (Nerf2Settings, {"samples": 0}),
         (Nerf2Settings, {"near_m": 2.0, "far_m": 1.0}),
-        (Networks, {"layers": 0}),
-        (Networks, {"scale_m": 0.0}),
+        (Nerf2Settings, {"networks": Networks(layers=0)}),
+        (Nerf2Settings, {"networks": Networks(scale_m=0.0)}),
     ):
         with pytest.raises(InputError, match="choose"):
             kind(**wrong)
