@@ -240,7 +240,7 @@ def test_fit_resolves_phases_and_mirror_images(elements_m, most, monkeypatch) ->
 def test_realignment_corrects_single_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the alignment of neighbours got wrong: a mirror image, and a phase."""
     monkeypatch.setattr(module, "STEPS", 10)
-    where, opposite = positions(40, seed=2), mirror_order(ELEMENTS_M)
+    where, opposite = positions(60, seed=2), mirror_order(ELEMENTS_M)
     truth = unit_signals(where)
     right = fit_signals(truth, where, ELEMENTS_M, DICTIONARY)
     rows = right.signals.copy()
