@@ -75,7 +75,7 @@ def measure():
 ATTENUATED = replace(RECEIVERS["power"], name="attenuated", make=make)
 CHECK = Check("attenuator", "attenuators:measure")
 '''
-DELAYS = '''
+DELAYS = """
 import csv
 
 import numpy as np
@@ -107,7 +107,7 @@ def read(path, name):
     return Record(name or path.name, TASK.name, table[:, :3], (receiver,), values, official=official, source=str(path))
 
 LAYOUT = Layout("delays", TASK.name, read, files=("delays.csv",))
-'''
+"""
 SOURCES = {"nearest_of_others": NEAREST, "attenuators": ATTENUATORS, "delays_of_others": DELAYS}
 ENTRY_POINTS = """
 [wrf_mi.models]
