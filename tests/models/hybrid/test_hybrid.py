@@ -37,7 +37,7 @@ def test_two_rows_are_interpolated_by_kriging_and_five_spectra_have_intervals(fl
     assert list(run.metrics["weights"][0]) == ["distance_m", "kriging"]
     assert "inside_90" not in run.metrics
     # Three remain where two are held out, through which kriging may pass without any deviation.
-    run = wrf_mi.train(folder, tmp_path / "run", n_train=5)
+    run = wrf_mi.train(folder, tmp_path / "five", n_train=5)
     assert 0 < run.metrics["inside_90"] <= 1
 
 
