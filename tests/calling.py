@@ -5,9 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
-import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,27 +101,3 @@ def damaged_models_refused(run: Path, key: str, capsys: pytest.CaptureFixture[st
     refused(asked, f"model.npz: not readable .*{key.partition('/')[2]}.*; train the run anew", capsys)
     np.savez(model, **arrays | {"run/format": np.array(99)})
     refused(asked, f"model.npz: format 99, this version reads {FORMAT}; use the version that wrote it", capsys)
-
-
-IN_TURN = """
-import contextlib, io, json, sys
-from wrf_mi.cli.main import main
-
-outputs = []
-for arguments in json.loads(sys.argv[1]):
-    with contextlib.redirect_stdout(io.StringIO()) as out:
-        status = main(arguments)
-    assert not status, arguments
-    outputs.append(out.getvalue())
-print(json.dumps(outputs))
-"""
-
-
-def in_subprocess(environment: dict[str, str], *commands: Sequence[Any]) -> list[str]:
-    """Standard output of commands that run one after the other in a new process."""
-    words = json.dumps([[str(word) for word in command] for command in commands])
-    process = [sys.executable, "-c", IN_TURN, words]
-    done = subprocess.run(process, env=environment, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    outputs: list[str] = json.loads(done.stdout.splitlines()[-1])
-    return outputs

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from calling import SMALL
 
 from wrf_mi.core import Receiver, Record
 
@@ -14,6 +15,11 @@ FAR_M = {"attic": (0.5, 7.5, 2.5), "cellar": (11.5, 7.5, 2.5)}
 """Receivers of which a test states the received rows."""
 UPRIGHT = np.array([0.0, 0, 0, 1])
 TRAINED, TESTED = 40, 12
+FITS = dict.fromkeys(("idw", "kriging", "mri", "trees", "hybrid"), ()) | {
+    "wrf-gs+": tuple(SMALL),
+    "nerf2": ("steps=2", "validate_every=2"),
+}
+"""Settings of short fits of the models of strengths that need no scene."""
 
 
 def building(**received: tuple[int, ...]) -> Record:

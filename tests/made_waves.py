@@ -1,7 +1,5 @@
 """Plane waves that leave transmitters in a cone around the line of sight, and what an array reports of them."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.constants import speed_of_light
 
@@ -18,10 +16,7 @@ ELEMENTS_M = planar_array(3, 3, 0.45 * WAVELENGTH_M)
 SIZE = (16, 32)
 CONE_DEG = 70.0
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
-RECEIVERS = (
-    Receiver("one", np.array([3.0, 1.0, -0.5]), UPRIGHT),
-    Receiver("two", np.array([-1.0, 4.0, 1.0]), UPRIGHT),
-)
+RECEIVERS = (Receiver("one", np.array([3.0, 1.0, -0.5]), UPRIGHT), Receiver("two", np.array([-1.0, 4.0, 1.0]), UPRIGHT))
 """Some 3 m from the transmitters."""
 
 
@@ -34,7 +29,6 @@ def signals(
     tx_pos_m: np.ndarray, towards: np.ndarray, elements_m: np.ndarray = ELEMENTS_M, seed: int = 0, count: int = 40
 ) -> np.ndarray:
     """Element signals [n, m] of waves of random directions and complex amplitudes, without the line of sight's phase.
-
     They leave at most `CONE_DEG` from ``towards``, the direction of the receiver.
     """
     rng = np.random.default_rng([seed, 2])
@@ -62,16 +56,11 @@ def wave_record(rows: int = 40, held_out: int = 12, receivers: int = 2, seed: in
         h = signals(tx_pos, towards(receiver, tx_pos), seed=seed + 10 * number)
         spectra.append(minmax_scale(bartlett_spectrum(h, ELEMENTS_M, FREQUENCY_HZ, *SIZE)))
     every = np.arange(rows)
-    return Record(
-        "made-waves",
-        "spectrum",
-        tx_pos,
-        RECEIVERS[:receivers],
-        (np.floor(255 * np.stack(spectra)) / 255).astype(np.float32),
-        official=(every[:-held_out], every[-held_out:]),
-        folds=every % 2,
-        frequencies_hz=np.array([FREQUENCY_HZ]),
-    ).with_array(ELEMENTS_M)
+    observation = (np.floor(255 * np.stack(spectra)) / 255).astype(np.float32)
+    rows_of = {"official": (every[:-held_out], every[-held_out:]), "folds": every % 2}
+    hz = np.array([FREQUENCY_HZ])
+    record = Record("made-waves", "spectrum", tx_pos, RECEIVERS[:receivers], observation, frequencies_hz=hz, **rows_of)
+    return record.with_array(ELEMENTS_M)
 
 
 def without_array(record: Record) -> Record:

@@ -1,7 +1,5 @@
 """Intervals from held-out errors, and held-out rows themselves."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from calling import refused
+from scipy.stats import norm
 
 import wrf_mi
 from wrf_mi.core import InputError, Record, Split
@@ -22,17 +21,13 @@ from wrf_mi.tasks.scores import crps, inside_interval
 from wrf_mi.training.by_distance import fit_intervals
 from wrf_mi.training.selection import HeldOut, hold_out
 
-ROUNDING_DB = 2e-5
-"""Of powers near -60 dBm in single precision, a few units in the last place."""
-COVERED = 0.02
-"""Allowed difference of a coverage of 0.9 over 4,000 draws: four standard errors."""
+ROUNDING_DB = 2e-5  # of powers near -60 dBm in single precision, a few units in the last place
+COVERED = 0.02  # allowed difference of a coverage of 0.9 over 4,000 draws: four standard errors
 
 
 def fold_of(record: Record, n_train: int | None = None) -> tuple[Split, Split]:
     split = make_splits(record, "official", n_train=n_train)[0]
-    fold = hold_out(record, split)
-    assert fold is not None
-    return split, fold
+    return split, hold_out(record, split)
 
 
 @pytest.mark.parametrize("n_train", [None, 20, 6, 4, 3])
@@ -40,25 +35,19 @@ def test_held_out_rows_are_a_part_of_the_training_rows(flat_folder: Path, n_trai
     split, fold = fold_of(load(flat_folder), n_train)
     assert not set(fold.test) & set(fold.all_train)
     assert set(fold.test) | set(fold.all_train) == set(split.all_train)
-    assert len(fold.test) <= len(split.all_train) / 2
-    assert len(fold.test) >= min(2, len(split.all_train) - 2)
+    assert min(2, len(split.all_train) - 2) <= len(fold.test) <= len(split.all_train) / 2
 
 
-def test_nothing_is_held_out_of_two_rows_or_one_position(flat_folder: Path):
+def test_nothing_is_held_out_of_two_rows_or_one_position_and_distances_are_those_to_remaining_rows(flat_folder: Path):
     record = load(flat_folder)
-    assert hold_out(record, make_splits(record, "official", n_train=2)[0]) is None
-    rows = np.arange(6)
-    still = replace(record, tx_pos_m=np.zeros_like(record.tx_pos_m))
+    assert fold_of(record, 2)[1] is None
+    rows, still = np.arange(6), replace(record, tx_pos_m=np.zeros_like(record.tx_pos_m))
     assert hold_out(still, Split("still", 0, rows, rows[:0], rows[:0])) is None
-
-
-def test_distances_are_those_to_the_rows_that_remain(flat_folder: Path):
-    record = load(flat_folder)
     _, fold = fold_of(record)
     held = HeldOut.of(record, fold, 0)
     for place in (0, len(held) // 2, len(held) - 1):
-        seen = fold.all_train[np.isfinite(record.observation[held.receiver[place], fold.all_train])]
-        apart = np.linalg.norm(record.tx_pos_m[seen] - record.tx_pos_m[held.row[place]], axis=1)
+        known = fold.all_train[np.isfinite(record.observation[held.receiver[place], fold.all_train])]
+        apart = np.linalg.norm(record.tx_pos_m[known] - record.tx_pos_m[held.row[place]], axis=1)
         assert held.distance_m[place] == pytest.approx(apart.min())
 
 
@@ -101,28 +90,22 @@ def test_intervals_of_few_rows_are_not_too_narrow():
     assert np.mean(inside) == pytest.approx(0.9, abs=0.03)
 
 
-def test_intervals_beyond_all_distances_are_as_wide_as_the_widest():
+def test_intervals_beyond_all_distances_are_as_wide_as_the_widest_and_those_of_exact_predictions_not_empty():
     rng = np.random.default_rng(1)
     distance, mean = np.linspace(0, 1, 100), np.zeros((100, 5))
     intervals = fit_intervals(mean, rng.normal(size=mean.shape), np.ones(mean.shape), distance, np.arange(100))
     far = intervals(np.zeros((1, 5)), np.ones((1, 5)), np.array([np.inf])).stated_std
-    near = intervals(np.zeros((100, 5)), np.ones((100, 5)), distance).stated_std
     assert np.isfinite(far).all()
-    assert far.max() >= near.max()
-
-
-@pytest.mark.parametrize("level", [-50.0, 0.0, 1e-6])
-def test_exact_predictions_have_intervals_that_are_not_empty(level: float):
-    mean = np.full((20, 3), level, np.float32)
-    found = fit_intervals(mean, mean, np.abs(mean), np.arange(20.0), np.arange(20))(mean, np.abs(mean), np.arange(20.0))
-    assert (found.stated_std.astype(np.float32) > 0).all()
+    assert far.max() >= intervals(mean, np.ones(mean.shape), distance).stated_std.max()
+    distance = np.arange(20.0)
+    for level in (-50.0, 0.0, 1e-6):
+        exact = np.full((20, 3), level, np.float32)
+        predicted = fit_intervals(exact, exact, np.abs(exact), distance, np.arange(20))(exact, np.abs(exact), distance)
+        assert (predicted.stated_std.astype(np.float32) > 0).all(), level
 
 
 def test_crps_equals_its_integral():
-    mean, std, truth = 1.0, 2.0, 2.5
-    x = np.linspace(-30, 30, 600_001)
-    from scipy.stats import norm
-
+    mean, std, truth, x = 1.0, 2.0, 2.5, np.linspace(-30, 30, 600_001)
     integral = np.trapezoid((norm.cdf(x, mean, std) - (x >= truth)) ** 2, x)
     assert crps([mean], [std], [truth]) == pytest.approx(integral, abs=1e-4)
     assert crps([mean + 1j * mean], [std * 2**0.5], [truth + 1j * truth]) == pytest.approx(integral, abs=1e-4)
@@ -166,17 +149,11 @@ def test_training_with_intervals_predicts_as_without_and_is_restored(flat_folder
     assert not (run.folder / "held_out").exists()
 
 
-def test_intervals_without_rows_to_hold_out_are_refused(
-    flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_intervals_without_rows_to_hold_out_are_refused(flat_folder: Path, tmp_path: Path, capsys):
     arguments = ["train", flat_folder, "--model", "kriging", "--n-train", "2", "--intervals", "--out", tmp_path / "run"]
     refused(arguments, "2 training rows; intervals need three at least", capsys)
     assert not (tmp_path / "run").exists()
-
-
-def test_intervals_of_unknown_positions_are_refused(flat_folder: Path, tmp_path: Path):
     record = load(flat_folder)
-    positions = record.tx_pos_m.copy()
-    positions[0] = np.nan
+    record.tx_pos_m[0] = np.nan
     with pytest.raises(wrf_mi.InputError, match="positions are not known"):
-        wrf_mi.train(replace(record, tx_pos_m=positions), tmp_path / "run", "kriging", intervals=True)
+        wrf_mi.train(record, tmp_path / "run", "kriging", intervals=True)

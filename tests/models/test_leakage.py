@@ -1,7 +1,5 @@
 """Arrays of every model: bit for bit the same if test rows hold NaN and infinity, and finite but for stated gaps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,16 +66,12 @@ def test_test_rows_do_not_reach_the_fit(name: str, one_gateway: Record, flat_fol
     init("llvm", threads=1)
     records = {"spectrum": one_gateway, "rssi": load(flat_folder), "csi": channels()}
     record = records[TASK.get(name) or (MODELS[name].tasks or ("rssi",))[0]]
-    assert record.official is not None
     train, test = record.official
-    split = Split("own", 0, train[:-3], train[-3:], test)
-    found = []
-    for version in (record, broken(record, test)):
-        folder = tmp_path / str(len(found))
+    split, folders = Split("official", 0, train[:-3], train[-3:], test), [tmp_path / "clean", tmp_path / "broken"]
+    for folder in folders:
         folder.mkdir()
-        found.append(fitted_arrays(name, version, split, folder))
-    clean, other = found
+    records = record, broken(record, test)
+    clean, other = (fitted_arrays(name, *of, split, folder) for *of, folder in zip(records, folders, strict=True))
     assert clean.keys() == other.keys()
     for key in clean.keys() - {"trace_seconds"}:
-        values = clean[key]
-        np.testing.assert_array_equal(np.asarray(values), np.asarray(other[key]), err_msg=key)
+        np.testing.assert_array_equal(np.asarray(clean[key]), np.asarray(other[key]), err_msg=key)

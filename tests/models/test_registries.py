@@ -1,10 +1,9 @@
-"""Receiver models and benchmarks from outside the package, by registration and by an installed entry point."""
+"""Models, receiver models, benchmarks, tasks and layouts from outside the package, registered or installed."""
 
-from __future__ import annotations
-
+import csv
 import json
-import os
 import sys
+import types
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,139 +11,167 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import in_subprocess
+from calling import refused
+from outside_packages import ATTENUATORS, CABLE_DB, NEAREST, commands, installed
+from small_fits import stop_after
 from wrf_mi_bench import bench
 from wrf_mi_bench.bench import CHECKS, Check
 
+from wrf_mi import models
 from wrf_mi.core import InputError
+from wrf_mi.core.registry import Registry
 from wrf_mi.datasets import load
 from wrf_mi.graph import receivers
 from wrf_mi.graph.receivers import RECEIVERS
 from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
 
-CABLE_DB = 17.0
-PACKAGE = '''
-"""A package with a receiver model and a benchmark: a power meter behind an attenuator."""
-
-from dataclasses import dataclass, replace
-
-from wrf_mi.graph.receivers import RECEIVERS
-from wrf_mi.receivers.receiver_models import PowerReceiver
-
-CABLE_DB = 17.0
+SETTINGS = ("steps=60", "batch=8", "validate_every=20", "checkpoint_every=20", "initial.gaussians=6")
+SETTINGS += ("network.layers=2", "network.width=8", "view.height=4", "view.columns=8", "deterministic=true")
+SERVED = {"trees": "rssi", "wrf-gs": "spectrum, rssi and csi", "factorised": "spectrum, rssi and csi"}
+"""Tasks of models that do not serve a task of others."""
 
 
-@dataclass(frozen=True)
-class Attenuated(PowerReceiver):
-    def __call__(self, traced, learned):
-        return super().__call__(traced, learned) - CABLE_DB
-
-
-def make(form, receiver):
-    return Attenuated(*form.size, (0.0,), interference=False)
-
-
-ATTENUATED = replace(RECEIVERS["power"], name="attenuated", make=make)
-
-
-def measure():
-    return {"rows": [{"what": "attenuation", "value": f"{CABLE_DB} dB", "asked": "17 dB"}]}
-'''
-SETTINGS = (
-    "steps=60",
-    "batch=8",
-    "validate_every=20",
-    "checkpoint_every=20",
-    "initial.gaussians=6",
-    "network.layers=2",
-    "network.width=8",
-    "view.height=4",
-    "view.columns=8",
-    "deterministic=true",
-)
+def registered(name: str, source: str, entry: str, of: Any, registry: Any) -> Iterator[None]:
+    """Register an entry of a module; another of its name is refused."""
+    module = sys.modules[name] = types.ModuleType(name)  # where its dataclass looks for its types
+    exec(source, module.__dict__)
+    of.register(getattr(module, entry))
+    added = getattr(module, entry).name
+    with pytest.raises(InputError, match=f"{registry._what} '{added}': there is one of that name; choose another"):
+        of.register(getattr(module, entry))
+    yield
+    del registry._known[added], sys.modules[name]
 
 
 @pytest.fixture
-def registered() -> Iterator[Any]:
-    module: dict[str, Any] = {"__name__": "attenuators"}
-    sys.modules["attenuators"] = type(sys)("attenuators")  # where its dataclass looks for its types
-    exec(PACKAGE, module)
-    receivers.register(module["ATTENUATED"])
-    with pytest.raises(InputError, match="receiver model 'attenuated': there is one of that name; choose another"):
-        receivers.register(module["ATTENUATED"])
-    yield module
-    del receivers._RECEIVERS._known["attenuated"], sys.modules["attenuators"]
+def nearest() -> Iterator[None]:
+    yield from registered("nearest_of_others", NEAREST, "MODEL", models, models.MODELS)
 
 
-def test_registered_receiver_is_trained_resumed_evaluated_and_compared(
-    registered: Any, flat_folder: Path, tmp_path: Path
-) -> None:
-    out, steps = tmp_path / "run", 0
+@pytest.fixture
+def attenuated() -> Iterator[None]:
+    yield from registered("attenuators", ATTENUATORS, "ATTENUATED", receivers, receivers._RECEIVERS)
 
-    def stop() -> bool:
-        nonlocal steps
-        steps += 1
-        return steps == 30
 
+def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, flat_folder, tmp_path, capsys) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(Interrupted, match=rf"stopped in nearest rows; go on with: wrf-mi train --resume {out}"):
+        train(flat_folder, out, "nearest", settings=("neighbours=2",), stop=lambda: True)
+    refused(["evaluate", out], r"model\.npz: missing, the fit was stopped; finish it with train --resume", capsys)
+    reported: list[tuple[str, float]] = []
+    run = resume(out, on_progress=lambda stage, share, _: reported.append((stage, share)))
+    assert reported == [("nearest rows", 0.0)]
+    assert (run.metrics["model"], run.metrics["rows"]) == ("nearest", 24)
+    assert 0 < run.metrics["inside_90"] <= 1
+    assert evaluate_run(out)["abs_error_db"] == run.metrics["abs_error_db"]
+    record = load(flat_folder)
+    first = open_run(out).predict(record.tx_pos_m[:1], "anchor1")
+    rows = np.argsort(np.linalg.norm(record.tx_pos_m[:24] - record.tx_pos_m[0], axis=1))[:2]
+    assert first.mean == pytest.approx([record.observation[0, rows].mean()])
+    with pytest.raises(InputError, match="does not know how the transmitter is turned; omit heading_rad"):
+        run.predict(record.tx_pos_m[:1], 0, [0.5])
+    other = train(flat_folder, tmp_path / "blocked", "nearest", split="blocked")
+    compare([out, other.folder], tmp_path / "page")
+    with (tmp_path / "page" / "compare.csv").open(newline="") as file:
+        assert [row["model"] for row in csv.DictReader(file)][:2] == ["nearest", "nearest"]
+    refused(["train", flat_folder, "--model", "nearest", "--scene", "x", "--out", "y"], "takes no scene", capsys)
+
+
+def test_registered_receiver_is_trained_resumed_evaluated_and_compared(attenuated, flat_folder, tmp_path) -> None:
+    out = tmp_path / "run"
     with pytest.raises(Interrupted):
-        train(flat_folder, out, "wrf-gs+", settings=SETTINGS, receiver="attenuated", stop=stop)
+        train(flat_folder, out, "wrf-gs+", settings=SETTINGS, receiver="attenuated", stop=stop_after(30))
     run = resume(out)
     assert evaluate_run(out)["abs_error_db"] == run.metrics["abs_error_db"]
     positions = load(flat_folder).tx_pos_m[:2]
-    found = open_run(out).predict(positions, 0).mean
+    predicted = open_run(out).predict(positions, 0).mean
     # The field is the same but for the attenuator.
     field = open_run(out).field
     field.form = replace(field.form, receiver="power")
-    np.testing.assert_allclose(field.predictor(positions, 0), found + CABLE_DB, atol=1e-3)
+    np.testing.assert_allclose(field.predictor(positions, 0), predicted + CABLE_DB, atol=1e-3)
     assert compare([out], tmp_path / "page")
 
 
-def test_receiver_of_another_task_or_unknown_is_refused(registered: Any, flat_folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="receiver model pixel does not report rssi; choose from power, attenuated"):
-        train(flat_folder, tmp_path / "run", "wrf-gs+", receiver="pixel")
-    with pytest.raises(InputError, match="receiver model 'horn': unknown; choose from power, attenuated"):
-        train(flat_folder, tmp_path / "run", "wrf-gs+", receiver="horn")
+def test_receiver_of_another_task_or_unknown_is_refused(attenuated, flat_folder: Path, tmp_path: Path) -> None:
+    for name, reason in (("pixel", "pixel does not report rssi"), ("horn", "'horn': unknown")):
+        with pytest.raises(InputError, match=f"receiver model {reason}; choose from power, attenuated"):
+            train(flat_folder, tmp_path / "run", "wrf-gs+", receiver=name)
     assert not (tmp_path / "run").exists()
 
 
-def test_receivers_and_benchmarks_of_installed_packages_are_found(
-    flat_folder: Path, tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
-) -> None:
-    site = tmp_path_factory.mktemp("site")
-    (site / "attenuators.py").write_text(PACKAGE)
-    info = site / "attenuators-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: attenuators\nVersion: 1.0\n")
-    named = (
-        "[wrf_mi.receivers]\nattenuated = attenuators:ATTENUATED\n[wrf_mi.benchmarks]\nattenuator = own_check:CHECK\n"
-    )
-    (info / "entry_points.txt").write_text(named)
-    check = 'from wrf_mi_bench.bench import Check\nCHECK = Check("attenuator", "attenuators:measure")\n'
-    (site / "own_check.py").write_text(check)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), *(part for part in sys.path if part)])}
-
-    settings = [word for setting in SETTINGS for word in ("--set", setting)]
-    trained, _ = in_subprocess(
+@pytest.fixture(scope="module")
+def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[int, str, str]]]:
+    """A folder of runs by commands, whose packages are installed, and what each command returned."""
+    folder = tmp_path_factory.mktemp("runs")
+    environment, data = installed(folder / "site"), folder / "corridor"
+    data.mkdir()
+    places = np.random.default_rng(0).uniform(0, 5, (40, 3))
+    delay_ns = 30 + 5 * places[:, 0] + np.sin(places[:, 1])
+    table = np.column_stack([places, delay_ns])
+    np.savetxt(data / "delays.csv", table, "%.4f", ",", header="x,y,z,delay_ns", comments="")
+    (folder / "tx.csv").write_text("x,y,z\n1,2,1\n3,1,2\n")
+    words = [word for setting in SETTINGS for word in ("--set", setting)]
+    asked = ["--model", "wrf-gs+", "--receiver", "attenuated", "--json", *words, "--out", folder / "attenuated"]
+    nearest = ["--model", "nearest", "--set", "neighbours=1", "--json", "--out", folder / "nearest"]
+    models = ("idw", "kriging", "hybrid", *SERVED)
+    results = commands(
         environment,
-        [
-            "train",
-            flat_folder,
-            "--model",
-            "wrf-gs+",
-            "--receiver",
-            "attenuated",
-            "--out",
-            tmp_path / "run",
-            "--json",
-            *settings,
-        ],
-        ["bench", "attenuator", "--out", tmp_path / "results", "--runs", tmp_path / "runs"],
+        {model: ["train", data, "--model", model, "--out", folder / model] for model in models}
+        | {
+            "nearest": ["train", flat_folder, *nearest],
+            "receiver": ["train", flat_folder, "--model", "wrf-gs+", *asked],
+        },
     )
-    assert json.loads(trained)["task"] == "rssi"
-    stored = json.loads((tmp_path / "results" / "attenuator.json").read_text())
+    for name in ("nearest/model.npz", "nearest/metrics.json", "nearest/predictions.npz", "idw/metrics.json"):
+        (folder / name).unlink()  # as of runs that were stopped
+    calls = {"benchmark": ["bench", "attenuator", "--out", folder / "results", "--runs", folder / "benchmarks"]}
+    for run, of in (("nearest", "nearest"), ("idw", "kriging")):
+        calls |= {
+            f"{run} resumed": ["train", "--resume", folder / run, "--json"],
+            f"{run} scored": ["evaluate", folder / run, "--json"],
+            f"{run} predicted": ["predict", folder / of, "--tx", folder / "tx.csv", "--out", folder / f"{of}.npz"],
+            f"{run} compared": ["compare", *{folder / of, folder / run}, "--out", folder / f"{run} page"],
+        }
+    return folder, results | commands(environment, calls)
+
+
+def test_commands_find_the_model_of_an_installed_package(outcome: Any) -> None:
+    folder, results = outcome
+    asked = [f"nearest{how}" for how in ("", " resumed", " scored", " predicted", " compared")]
+    assert [results[name][0] for name in asked] == [0] * 5, results
+    errors = [json.loads(results[name][1])["abs_error_db"] for name in asked[:3]]
+    assert errors[0] == errors[1] == errors[2]
+    with np.load(folder / "nearest.npz") as predicted:
+        assert predicted["prediction"].shape == predicted["std"].shape == (2, 2)
+    assert "nearest" in (folder / "nearest page" / "index.html").read_text()
+
+
+def test_commands_find_the_receiver_and_the_benchmark_of_an_installed_package(outcome: Any) -> None:
+    folder, results = outcome
+    assert json.loads(results["receiver"][1])["task"] == "rssi"
+    assert results["benchmark"][0] == 0
+    stored = json.loads((folder / "results" / "attenuator.json").read_text())
     assert stored["figures"]["rows"] == [{"what": "attenuation", "value": "17.0 dB", "asked": "17 dB"}]
-    assert "attenuation" in (tmp_path / "results" / "README.md").read_text()
+    assert "attenuation" in (folder / "results" / "README.md").read_text()
+
+
+def test_commands_find_the_task_and_the_layout_of_an_installed_package(outcome: Any) -> None:
+    folder, results = outcome
+    for model in ("idw", "kriging", "hybrid"):
+        status, out, err = results[model]
+        assert status == 0, err
+        assert "absolute error (ns) on 10 test rows" in out
+    for model, tasks in SERVED.items():
+        status, _, err = results[model]
+        assert (status, err.count("\n")) == (2, 1), err
+        assert f"holds delay-spread; {model} serves {tasks}, so choose another model: hybrid, idw, kriging" in err
+        assert not (folder / model).exists()
+    again = [results[f"idw {how}"] for how in ("resumed", "scored", "predicted", "compared")]
+    assert [status for status, _, _ in again] == [0] * 4, again
+    with np.load(folder / "kriging.npz") as predicted:
+        assert predicted["prediction"] == pytest.approx([30 + 5 + np.sin(2), 30 + 15 + np.sin(1)], abs=3)
+    assert "absolute error (ns)" in (folder / "idw page" / "index.html").read_text()
 
 
 def test_registered_benchmark_is_listed() -> None:
@@ -156,3 +183,13 @@ def test_registered_benchmark_is_listed() -> None:
     finally:
         del bench._CHECKS._known["own"]
     assert {"pixel", "array", "power", "csi"} <= set(RECEIVERS)
+
+
+def test_registry_imports_entries_on_access() -> None:
+    registry: Registry[Any] = Registry("parser", "no.such.group", {"json": "json:loads"})
+    assert list(registry) == ["json"]
+    assert registry["json"] is json.loads
+    registry.add("other", json.dumps)
+    assert len(registry) == 2
+    with pytest.raises(KeyError):
+        registry["none"]

@@ -12,17 +12,14 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import load
 from wrf_mi.receivers import array as module
 from wrf_mi.receivers.array import array_response, bartlett_spectrum, mirror_order
-from wrf_mi.receivers.reports import minmax_scale
 
 FREQUENCY_HZ = 920e6
 SPACING_M = 0.16
-EXACT = 1e-9
-"""Sums of 16 terms of size one in float64."""
+EXACT = 1e-9  # sums of 16 terms of size one in float64
 ROUNDING_RMS = 0.0013
 """8-bit greys are off by up to 1/510; squared, the real spectra's residual was measured as 0.0012 rms."""
 
-ROUNDING = 1e-12
-"""Sums of some hundred products in double precision, of signals of size 1."""
+ROUNDING = 1e-12  # sums of some hundred products in double precision, of signals of size 1
 SIZE = 14, 31
 
 RNG = np.random.default_rng(0)
@@ -39,23 +36,15 @@ ARRAYS = {
     "coinciding": np.array([[0.2, 0, 0], [0.2, 0, 0], [-0.2, 0, 0], [-0.2, 0, 0.0]]),
 }
 
-needs_data = needs("rfid-lab")
 
-
-def test_planar_array_is_a_centred_grid():
+def test_planar_array_is_a_centred_grid_whose_nearer_elements_lead_in_phase():
     array = planar_array(2, 3, 0.1)
-    np.testing.assert_allclose(
-        array,
-        [[-0.1, -0.05, 0], [0, -0.05, 0], [0.1, -0.05, 0], [-0.1, 0.05, 0], [0, 0.05, 0], [0.1, 0.05, 0]],
-        atol=EXACT,
-    )
+    expected = [[x, y, 0] for y in (-0.05, 0.05) for x in (-0.1, 0, 0.1)]
+    np.testing.assert_allclose(array, expected, atol=EXACT)
     for wrong in ((0, 4, 0.1), (4, 0, 0.1), (4, 4, 0), (4, 4, float("nan"))):
         with pytest.raises(ValueError, match="positive"):
             planar_array(*wrong)
-
-
-def test_element_nearer_to_the_source_leads_in_phase():
-    """An element half a wavelength nearer to the source leads by pi; one across the wave is in phase."""
+    # Half a wavelength nearer to the source an element leads by pi; one across the wave is in phase.
     half = speed_of_light / FREQUENCY_HZ / 2
     response = array_response([[0, 0, 0], [half, 0, 0], [0, half, 0], [half / 2, 0, 0]], [1, 0, 0], FREQUENCY_HZ)
     np.testing.assert_allclose(response, [1, -1, 1, 1j], atol=EXACT)
@@ -85,12 +74,7 @@ def test_spectrum_of_a_plane_wave_is_the_array_factor():
     assert several.shape == (2, 5, 9, 36)
 
 
-def test_minmax_scale_maps_constant_images_to_zero():
-    images = np.array([[[1.0, 3], [2, 5]], [[7, 7], [7, 7]]])
-    np.testing.assert_allclose(minmax_scale(images), [[[0, 0.5], [0.25, 1]], [[0, 0], [0, 0]]])
-
-
-@needs_data
+@needs("rfid-lab")
 @pytest.mark.parametrize(("first_row", "obeys"), [(0, True), (1, False)])
 def test_measured_spectra_are_bartlett_spectra_of_their_array(first_row: int, obeys: bool):
     """Squared, they lie in the span of the array's 49 lag harmonics; with elevations 1 to 90 they would not."""
@@ -109,27 +93,23 @@ def test_measured_spectra_are_bartlett_spectra_of_their_array(first_row: int, ob
 def test_spectrum_is_the_plain_sum(name: str, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch):
     elements = ARRAYS[name]
     h = RNG.normal(size=(3, 2, len(elements))) + 1j * RNG.normal(size=(3, 2, len(elements)))
-    expected = np.abs(
-        h @ array_response(elements, pixel_directions(*size), FREQUENCY_HZ).conj().reshape(-1, len(elements)).T
-    )
+    response = array_response(elements, pixel_directions(*size), FREQUENCY_HZ).reshape(-1, len(elements))
+    expected = np.abs(h @ response.conj().T)
     largest = np.abs(h).sum(axis=-1).max()
-    found = bartlett_spectrum(h, elements, FREQUENCY_HZ, *size)
-    np.testing.assert_allclose(found, expected.reshape(3, 2, *size), rtol=0, atol=ROUNDING * largest)
+    spectrum = bartlett_spectrum(h, elements, FREQUENCY_HZ, *size)
+    np.testing.assert_allclose(spectrum, expected.reshape(3, 2, *size), rtol=0, atol=ROUNDING * largest)
     monkeypatch.setattr(module, "TABLE_BYTES", 16 * 50 * len(elements))
     monkeypatch.setattr(module, "CHUNK_SIZE", 4)
     blocks = bartlett_spectrum(h, elements, FREQUENCY_HZ, *size)
-    np.testing.assert_allclose(blocks, found, rtol=0, atol=ROUNDING * largest)
+    np.testing.assert_allclose(blocks, spectrum, rtol=0, atol=ROUNDING * largest)
 
 
-@pytest.mark.parametrize("factor", [0.0, 1e-200, 1e200])
-def test_spectrum_scales_with_signals_of_any_size(factor: float):
-    elements = ARRAYS["regular"]
+def test_spectrum_scales_with_signals_of_any_size_and_number():
     h = RNG.normal(size=16) + 1j * RNG.normal(size=16)
-    expected = factor * bartlett_spectrum(h, elements, FREQUENCY_HZ, *SIZE)
-    np.testing.assert_allclose(bartlett_spectrum(factor * h, elements, FREQUENCY_HZ, *SIZE), expected, rtol=ROUNDING)
-
-
-def test_no_signals_have_no_spectra():
+    spectrum = bartlett_spectrum(h, ARRAYS["regular"], FREQUENCY_HZ, *SIZE)
+    for factor in (0.0, 1e-200, 1e200):
+        scaled = bartlett_spectrum(factor * h, ARRAYS["regular"], FREQUENCY_HZ, *SIZE)
+        np.testing.assert_allclose(scaled, factor * spectrum, rtol=ROUNDING)
     assert bartlett_spectrum(np.zeros((0, 16)), ARRAYS["regular"], FREQUENCY_HZ, *SIZE).shape == (0, *SIZE)
 
 

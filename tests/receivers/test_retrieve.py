@@ -1,7 +1,5 @@
 """Retrieval of element signals from stored spectra, for spectra made from known signals and for measured ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from changed_folders import needs
@@ -19,7 +17,7 @@ HEIGHT, WIDTH = 30, 120
 PHASE_DEG = np.array([0, 50, -20, 70, 0, -60, 30, 10, -80, 45, -35, 15, 0, 60, -10, -25])
 AMPLITUDE = np.array([1.3, 0.7, 1.0, 0.8, 1.2, 1.1, 0.9, 1.0, 0.8, 1.2, 0.7, 1.1, 0.9, 1.0, 1.3, 0.8])
 
-needs_data = needs("rfid-lab")
+LAGS = Lags(ELEMENTS, FREQUENCY_HZ, HEIGHT, WIDTH)
 
 
 def walk(rows: int = 50) -> tuple[np.ndarray, np.ndarray]:
@@ -51,32 +49,30 @@ def largest_error(found: np.ndarray, truth: np.ndarray) -> float:
 
 def test_lowest_magnitude_is_found_to_a_fifth_of_a_grey_level():
     magnitude = bartlett_spectrum(walk()[1], ELEMENTS, FREQUENCY_HZ, HEIGHT, WIDTH)
-    low = magnitude.min(axis=(1, 2))
-    span = magnitude.max(axis=(1, 2)) - low
-    found = unscale(stored(magnitude), Lags(ELEMENTS, FREQUENCY_HZ, HEIGHT, WIDTH))
-    np.testing.assert_allclose(found.lowest, low / span, atol=0.2 / 255)
-    assert low.max() > 0.02 * span.max()
-    np.testing.assert_allclose(found.residual, found.rounding, rtol=0.1)
+    low, high = magnitude.min(axis=(1, 2)), magnitude.max(axis=(1, 2))
+    images = unscale(stored(magnitude), LAGS)
+    np.testing.assert_allclose(images.lowest, low / (high - low), atol=0.2 / 255)
+    assert low.max() > 0.02 * (high - low).max()
+    np.testing.assert_allclose(images.residual, images.rounding, rtol=0.1)
 
 
 def test_signals_are_retrieved_from_grey_images():
     """Relative error of the grey levels' size, 1/255 over a thousand pixels for 16 signals, and a few times that."""
     positions, signals = walk()
     magnitude = bartlett_spectrum(signals, ELEMENTS, FREQUENCY_HZ, HEIGHT, WIDTH)
-    lags = Lags(ELEMENTS, FREQUENCY_HZ, HEIGHT, WIDTH)
-    found = retrieve_signals(unscale(stored(magnitude[:20]), lags), lags)
-    assert found.explained.all()
-    aligned = align_signals(found.signals, positions[:20], ELEMENTS)
+    retrieved = retrieve_signals(unscale(stored(magnitude[:20]), LAGS), LAGS)
+    assert retrieved.explained.all()
+    aligned = align_signals(retrieved.signals, positions[:20], ELEMENTS)
     assert largest_error(aligned, signals[:20]) < 0.01
     # Two incoherent snapshots have no spectrum of a single snapshot.
     mixed = stored(np.sqrt(magnitude[:3] ** 2 + magnitude[20:23] ** 2))
-    assert not retrieve_signals(unscale(mixed, lags), lags, starts=5).explained.any()
+    assert not retrieve_signals(unscale(mixed, LAGS), LAGS, starts=5).explained.any()
     line = Lags(planar_array(1, 6, 0.16), FREQUENCY_HZ, HEIGHT, WIDTH)
     with pytest.raises(InputError, match="two dimensions"):
         retrieve_signals(unscale(stored(magnitude[:1]), line), line)
 
 
-@needs_data
+@needs("rfid-lab")
 def test_measured_spectra_are_cut_magnitudes_of_single_snapshots():
     """16 rows: the residual outside the lags is that of 8 bits, and 16 complex numbers explain each spectrum."""
     record = load("rfid-lab")

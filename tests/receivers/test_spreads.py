@@ -1,7 +1,5 @@
 """Delay spread, angular spread and K-factor of paths in closed form."""
 
-from __future__ import annotations
-
 from dataclasses import astuple
 
 import numpy as np
@@ -10,8 +8,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.receivers.spreads import PathStatistics, joined
 
-ROUNDING = 1e-6
-"""Of float64 sums; angles near zero lose half the digits."""
+ROUNDING = 1e-6  # of float64 sums; angles near zero lose half the digits
 
 
 def statistics(power: list[float], length_m: list[float], azimuth_deg: list[float], elevation_deg: float = 0.0):
@@ -21,18 +18,17 @@ def statistics(power: list[float], length_m: list[float], azimuth_deg: list[floa
     return PathStatistics.of_paths(rows, 1, np.array(power), np.array(length_m), arrival)
 
 
-def test_two_equal_paths() -> None:
+def test_spreads_and_k_factor_of_one_to_three_paths() -> None:
     found = statistics([0.5e-8, 0.5e-8], [10.0, 13.0], [0.0, 90.0])
     assert found.path_gain_db[0] == pytest.approx(-80, abs=ROUNDING)
     assert found.delay_spread_s[0] == pytest.approx(1.5 / speed_of_light, rel=ROUNDING)
     assert found.k_factor_db[0] == pytest.approx(0, abs=ROUNDING)
     # The mean of two unit vectors at a right angle has length 1 / sqrt(2): sqrt(-2 ln) of it is sqrt(ln 2).
     assert found.azimuth_spread_deg[0] == pytest.approx(np.degrees(np.sqrt(np.log(2))), rel=ROUNDING)
-
-
-def test_a_path_alone_has_no_spread_and_an_infinite_k_factor() -> None:
-    found = statistics([1e-9], [7.0], [33.0])
-    assert (found.delay_spread_s[0], found.azimuth_spread_deg[0], found.k_factor_db[0]) == (0, 0, np.inf)
+    three = statistics([8e-9, 1e-9, 1e-9], [5.0, 6.0, 7.0], [0.0, 1.0, 2.0])
+    assert three.k_factor_db[0] == pytest.approx(10 * np.log10(4), abs=ROUNDING)
+    alone = statistics([1e-9], [7.0], [33.0])
+    assert (alone.delay_spread_s[0], alone.azimuth_spread_deg[0], alone.k_factor_db[0]) == (0, 0, np.inf)
 
 
 def test_azimuth_spread_ignores_turns_elevation_and_vertical_paths() -> None:
@@ -42,12 +38,6 @@ def test_azimuth_spread_ignores_turns_elevation_and_vertical_paths() -> None:
     arrival = np.array([[1.0, 0, 0], [0, 0, 1.0]])
     vertical = PathStatistics.of_paths(np.zeros(2, np.int64), 1, np.ones(2), np.array([4.0, 5.0]), arrival)
     assert vertical.azimuth_spread_deg[0] == 0
-
-
-def test_k_factor_is_that_of_strongest_over_rest() -> None:
-    assert statistics([8e-9, 1e-9, 1e-9], [5.0, 6.0, 7.0], [0.0, 1.0, 2.0]).k_factor_db[0] == pytest.approx(
-        10 * np.log10(4), abs=ROUNDING
-    )
 
 
 def test_transmitters_without_paths_are_not_a_number_and_rows_are_placed() -> None:

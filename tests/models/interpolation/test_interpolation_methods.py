@@ -1,10 +1,7 @@
 """Registry of models, settings, and predictions of interpolation methods."""
 
-from __future__ import annotations
-
 import json
-import os
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -12,13 +9,17 @@ import numpy as np
 import pytest
 import yaml
 from calling import call, stored
+from changed_folders import needs
 from made_channels import channels
+from sklearn.ensemble import ExtraTreesRegressor
 
 import wrf_mi
 from wrf_mi.core import InputError, Record
 from wrf_mi.core.settings import describe, settings_from
 from wrf_mi.datasets import load, make_splits, write_nerf2_csi, write_spectrum_folder
 from wrf_mi.models import MODELS, known_model
+from wrf_mi.models.interpolation.kriging import Kriging, Trend
+from wrf_mi.models.interpolation.trees import GrownTrees, Trees
 from wrf_mi.runs.api import train
 from wrf_mi.tasks import TASKS
 
@@ -27,8 +28,7 @@ SETTINGS = {
     for name, model in MODELS.items()
     for what, kind in (model.settings.items() if isinstance(model.settings, dict) else [("", model.settings)])
 }
-ROUNDING = 1e-4
-"""Powers of tens of dBm are stored in single precision."""
+ROUNDING = 1e-4  # powers of tens of dBm are stored in single precision
 
 
 def test_entries_of_the_registry_are_consistent() -> None:
@@ -50,11 +50,10 @@ def test_settings_are_listed_and_accept_null(flat_folder: Path, capsys: pytest.C
     assert status == 0
     for line in ("idw:", "neighbours=null", "kriging, spectra:", "length_m=null", "mri:", "shared=False"):
         assert line in out.splitlines(), line
-    given = wrf_mi.with_settings(
-        MODELS["kriging"].serving("rssi", False).settings(length_m=2.0), ["length_m=null", "noise=1", "trend=constant"]
-    )
-    assert (given.length_m, given.noise, given.trend) == (None, 1.0, "constant")
-    assert isinstance(given.noise, float)
+    defaults = MODELS["kriging"].serving("rssi", False).settings(length_m=2.0)
+    changed = wrf_mi.with_settings(defaults, ["length_m=null", "noise=1", "trend=constant"])
+    assert (changed.length_m, changed.noise, changed.trend) == (None, 1.0, "constant")
+    assert isinstance(changed.noise, float)
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -77,8 +76,8 @@ class Several:
 
 
 def test_settings_of_every_type() -> None:
-    given = wrf_mi.with_settings(Several(), ["pair=[3, 4]", "many=[5, 6, 7]", "kind=b", "maybe=2"])
-    assert given == Several((3.0, 4.0), (5, 6, 7), "b", 2.0)
+    changed = wrf_mi.with_settings(Several(), ["pair=[3, 4]", "many=[5, 6, 7]", "kind=b", "maybe=2"])
+    assert changed == Several((3.0, 4.0), (5, 6, 7), "b", 2.0)
     for wrong, message in (
         ("pair=[3]", "setting pair: expected a list of 2 values"),
         ("many=5", "setting many: expected a list of values, got 5"),
@@ -95,11 +94,10 @@ def test_mri_recovers_an_exact_path_loss_law(flat_folder: Path, tmp_path: Path) 
     record = load(flat_folder)
     distance = np.stack([np.linalg.norm(record.tx_pos_m - r.position_m, axis=1) for r in record.receivers])
     exact = (-45 - 20 * np.log10(distance)).astype(np.float32)
-    observation = exact.copy()
-    observation[1, 3:9] = np.nan
-    made = replace(record, observation=observation)
+    record.observation[:] = exact
+    record.observation[1, 3:9] = np.nan
     for shared in ("false", "true"):
-        out = train(made, tmp_path / shared, "mri", settings=(f"shared={shared}",)).folder
+        out = train(record, tmp_path / shared, "mri", settings=(f"shared={shared}",)).folder
         with np.load(out / "model.npz") as arrays:
             np.testing.assert_allclose(arrays["1/law"], [-45, -2], atol=ROUNDING)
         np.testing.assert_allclose(stored(out)["prediction"], exact[:, 24:], atol=ROUNDING)
@@ -107,8 +105,6 @@ def test_mri_recovers_an_exact_path_loss_law(flat_folder: Path, tmp_path: Path) 
 
 def test_kriging_runs_equal_the_library_for_every_task(folder: Path, tmp_path: Path) -> None:
     """Given lengths and noise: the adapter's constant trend and, for channels, complex numbers and all antennas."""
-    from wrf_mi.models.interpolation.kriging import Kriging
-
     for data in (folder, write_nerf2_csi(tmp_path / "stations", channels())):
         out = train(data, tmp_path / f"run-{data.name}", "kriging", settings=("length_m=0.5", "noise=0.1")).folder
         record, arrays = load(data), stored(out)
@@ -119,31 +115,21 @@ def test_kriging_runs_equal_the_library_for_every_task(folder: Path, tmp_path: P
 
 def test_runs_with_headings_equal_the_library(flat_folder: Path, tmp_path: Path) -> None:
     """Kriging about each receiver's log-distance law, and trees, as the library alone has them."""
-    from wrf_mi.models.interpolation.kriging import Kriging, Trend
-    from wrf_mi.models.interpolation.trees import Trees
-
     record = load(flat_folder)
     (split,) = make_splits(record, "official")
-    place, turned = record.tx_pos_m, record.tx_heading_rad
-    given = {
-        "kriging": ("length_m=0.5", "noise=0.1", "heading_length=1.5"),
-        "trees": ("trees=20", "leaf_rows=2"),
-    }
-    for name, settings in given.items():
-        found = stored(train(flat_folder, tmp_path / name, name, settings=settings).folder)["prediction"]
+    place, turned, known = record.tx_pos_m, record.tx_heading_rad, split.all_train
+    kriging, trees = ("length_m=0.5", "noise=0.1", "heading_length=1.5"), ("trees=20", "leaf_rows=2")
+    for name, settings in (("kriging", kriging), ("trees", trees)):
+        predicted = stored(train(flat_folder, tmp_path / name, name, settings=settings).folder)["prediction"]
         for r, receiver in enumerate(record.receivers):
             law = Trend(receiver.position_m)
             model = Kriging(0.5, 0.1, 1.5, trend=law, trend_fit="ols") if name == "kriging" else Trees(20, 2)
-            known = split.all_train
             expected = model.fit(place[known], record.observation[r, known], turned[known])
-            np.testing.assert_allclose(found[r], expected.predict(place[split.test], turned[split.test]), atol=ROUNDING)
+            at_test = expected.predict(place[split.test], turned[split.test])
+            np.testing.assert_allclose(predicted[r], at_test, atol=ROUNDING)
 
 
 def test_grown_trees_predict_as_scikit_learn(flat_folder: Path) -> None:
-    from sklearn.ensemble import ExtraTreesRegressor
-
-    from wrf_mi.models.interpolation.trees import GrownTrees, Trees
-
     record = load(flat_folder)
     rng = np.random.default_rng(2)
     positions, heading = rng.uniform(0, 5, (400, 3)), rng.uniform(-3, 3, 400)
@@ -160,19 +146,16 @@ def test_grown_trees_predict_as_scikit_learn(flat_folder: Path) -> None:
         np.testing.assert_allclose(kept.predict(*asked), model.predict(np.hstack(columns)), atol=1e-6)
 
 
+@needs("flat-ble")
 def test_published_figure_of_mri(tmp_path: Path) -> None:
     """Median 4.17 dB, 90th percentile 10.2 dB, over all anchors and test rows: the data's description."""
-    if not (Path(os.environ.get("WRF_MI_DATA", "/nowhere")) / "flat-ble").is_dir():
-        pytest.skip("WRF_MI_DATA names no folder with flat-ble/")
-    score = json.loads((train("flat-ble", tmp_path / "run", "mri").folder / "metrics.json").read_text())
-    assert score["abs_error_db"]["median"] == pytest.approx(4.17, abs=0.01)
-    assert score["abs_error_db"]["p90"] == pytest.approx(10.2, abs=0.05)
+    error_db = train("flat-ble", tmp_path / "run", "mri").metrics["abs_error_db"]
+    assert error_db["median"] == pytest.approx(4.17, abs=0.01)
+    assert error_db["p90"] == pytest.approx(10.2, abs=0.05)
 
 
 def test_idw_of_one_training_row_copies_it_at_every_receiver(two_gateways: Record, tmp_path: Path) -> None:
-    """Spectra of two receivers."""
     data = write_spectrum_folder(tmp_path / "data", two_gateways, bits=16)
-    out = train(data, tmp_path / "run", "idw", n_train=1).folder
-    arrays = stored(out)
+    arrays = stored(train(data, tmp_path / "run", "idw", n_train=1).folder)
     assert arrays["prediction"].shape == arrays["truth"].shape
     assert (arrays["prediction"] == arrays["prediction"][:, :1]).all()

@@ -1,7 +1,5 @@
 """Kriging and trees against dense linear algebra, random fields and published figures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from changed_folders import DATA, needs
@@ -15,8 +13,7 @@ from wrf_mi.models.interpolation.trees import Trees
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import summary
 
-EXACT = 1e-9
-"""Systems of a few dozen rows, condition 1e4, in float64."""
+EXACT = 1e-9  # systems of a few dozen rows, condition 1e4, in float64
 
 
 def chosen(model: Kriged) -> dict[str, float]:
@@ -24,7 +21,7 @@ def chosen(model: Kriged) -> dict[str, float]:
     return dict(zip(names, map(float, model.lengths), strict=False)) | {"noise": float(model.noise)}
 
 
-def made(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
+def sampled(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
     rng = np.random.default_rng(seed)
     return rng.uniform(0, 4, (rows, 3)), rng.uniform(-9, 9, rows), rng
 
@@ -37,7 +34,7 @@ def covariance(x: np.ndarray, a: np.ndarray, y: np.ndarray, b: np.ndarray) -> np
 
 def test_universal_kriging_solves_the_augmented_system():
     """Weights of the textbook's system [[K, B], [B^T, 0]], and its variance, for two components at once."""
-    positions, heading, rng = made(25)
+    positions, heading, rng = sampled(25)
     values, at = rng.normal(size=(25, 2)), rng.uniform(0, 4, (6, 3))
     turned = rng.uniform(-9, 9, 6)
     trend = Trend(np.array([1.0, -1, 0]))
@@ -54,12 +51,9 @@ def test_universal_kriging_solves_the_augmented_system():
 
 def test_restricted_likelihood_is_that_of_contrasts_free_of_the_trend():
     """Up to the volume of B: of A^T y, A an orthonormal basis of what B leaves, for many components of rank 25."""
-    positions, heading, rng = made(25)
-    k, b, values = (
-        covariance(positions, heading, positions, heading),
-        rng.normal(size=(25, 2)),
-        rng.normal(size=(25, 90)),
-    )
+    positions, heading, rng = sampled(25)
+    k, b = covariance(positions, heading, positions, heading), rng.normal(size=(25, 2))
+    values = rng.normal(size=(25, 90))
     a = np.linalg.qr(np.concatenate([b, rng.normal(size=(25, 23))], axis=1))[0][:, 2:]
     contrasts = a.T @ (k + 0.3 * np.eye(25)) @ a
     power = np.trace(values.T @ a @ np.linalg.solve(contrasts, a.T @ values)) / 23
@@ -73,7 +67,7 @@ def test_restricted_likelihood_is_that_of_contrasts_free_of_the_trend():
 @pytest.mark.parametrize("kind", [np.float32, np.complex64])
 def test_components_are_solved_for_in_parts(kind: type, monkeypatch: pytest.MonkeyPatch):
     """As all at once in double precision, of which single-precision values are an exact part."""
-    positions, heading, rng = made(25)
+    positions, heading, rng = sampled(25)
     k, b = covariance(positions, heading, positions, heading), rng.normal(size=(25, 2))
     parts = rng.normal(size=(2, 25, 90))
     values = (parts[0] + 1j * parts[1] if kind is np.complex64 else parts[0]).astype(kind)
@@ -88,7 +82,7 @@ def test_components_are_solved_for_in_parts(kind: type, monkeypatch: pytest.Monk
 
 
 def test_regression_kriging_adds_the_residuals_of_least_squares():
-    positions, _, rng = made(20, 1)
+    positions, _, rng = sampled(20, 1)
     values, at, trend = rng.normal(size=20), rng.uniform(0, 4, (3, 3)), Trend(np.array([0.0, 0, 9]))
     beta = np.linalg.lstsq(trend(positions), values, rcond=None)[0]
     zero = np.zeros(20)
@@ -99,64 +93,46 @@ def test_regression_kriging_adds_the_residuals_of_least_squares():
     np.testing.assert_allclose(model.predict(at), expected, atol=EXACT)
 
 
-def test_complex_observations_are_two_real_components():
-    positions, _, rng = made(15, 2)
+def test_complex_observations_are_two_real_components_and_rows_with_nan_are_ignored():
+    positions, _, rng = sampled(15, 2)
     values, at = rng.normal(size=(15, 3)) + 1j * rng.normal(size=(15, 3)), rng.uniform(0, 4, (4, 3))
-    found = Kriging(1.0, 0.1).fit(positions, values).predict(at)
     real, imaginary = (Kriging(1.0, 0.1).fit(positions, part).predict(at) for part in (values.real, values.imag))
-    np.testing.assert_allclose(found, real + 1j * imaginary, atol=EXACT)
-
-
-def test_rows_with_nan_are_ignored_and_types_are_kept():
-    positions, _, rng = made(12, 3)
-    values = rng.random((12, 4, 5)).astype(np.float32)
+    np.testing.assert_allclose(Kriging(1.0, 0.1).fit(positions, values).predict(at), real + 1j * imaginary, atol=EXACT)
+    values = rng.random((15, 4, 5)).astype(np.float32)
     values[3, 2, 2] = np.nan
-    keep = np.arange(12) != 3
-    found = Kriging(1.0, 0.01).fit(positions, values).predict(positions[:2])
-    np.testing.assert_array_equal(found, Kriging(1.0, 0.01).fit(positions[keep], values[keep]).predict(positions[:2]))
-    assert found.shape == (2, 4, 5)
-    assert found.dtype == np.float32
+    keep = np.arange(15) != 3
+    predicted = Kriging(1.0, 0.01).fit(positions, values).predict(at)
+    np.testing.assert_array_equal(predicted, Kriging(1.0, 0.01).fit(positions[keep], values[keep]).predict(at))
+    assert predicted.shape == (4, 4, 5)
+    assert predicted.dtype == np.float32
     again = Kriging(1.0, 0).fit(positions[keep], values[keep]).predict(positions[keep])
     np.testing.assert_allclose(again, values[keep], atol=1e-6)  # no noise: it passes through the rows, in float32
 
 
 def test_likelihood_recovers_the_covariance_of_random_fields():
     """300 rows, 400 draws, each with a mean of its own: all three to 6 %, twice what 400 draws scatter by.
-
     The plain likelihood, which takes no account of the 400 means, is off by 7 to 14 %.
     """
-    positions, heading, rng = made(300, 0)
+    positions, heading, rng = sampled(300, 0)
     k = covariance(positions, heading, positions, heading) + 0.2 * np.eye(300)
     values = 3 + 2 * np.linalg.cholesky(k) @ rng.normal(size=(300, 400))
     truth = {"length_m": 0.8, "heading_length": 1.5, "noise": 0.2}
-    for fitted in (values, values[:, :200] + 1j * values[:, 200:]):
-        assert chosen(Kriging().fit(positions, fitted, heading)) == pytest.approx(truth, rel=0.06)
+    assert chosen(Kriging().fit(positions, values, heading)) == pytest.approx(truth, rel=0.06)
     few = chosen(Kriging(likelihood_rows=100).fit(positions, values, heading))
     assert few["length_m"] == pytest.approx(0.8, rel=0.2)
-    held = chosen(Kriging(noise=0.5).fit(positions, values[:, 0]))
-    assert held["noise"] == 0.5
-
-
-def test_likelihood_depends_on_the_gram_matrix_of_components():
-    """An image's pixels enter by their Gram matrix: the same likelihood as that of repeated components."""
-    positions, _, rng = made(10, 5)
-    values = rng.normal(size=(10, 3))
-    wide = np.tile(values, (1, 30))
-    assert chosen(Kriging().fit(positions, wide)) == pytest.approx(chosen(Kriging().fit(positions, values)), rel=1e-3)
+    # Components enter by their Gram matrix: as many complex ones of half the number, and each repeated.
+    for same in (values[:, :200] + 1j * values[:, 200:], np.tile(values, (1, 2))):
+        assert chosen(Kriging(likelihood_rows=100).fit(positions, same, heading)) == pytest.approx(few, rel=1e-3)
+    assert chosen(Kriging(noise=0.5).fit(positions, values[:, 0]))["noise"] == 0.5
 
 
 def test_bad_arguments_are_refused():
-    positions, heading, rng = made(6)
+    positions, heading, rng = sampled(6)
     values = rng.normal(size=6)
-    for wrong in (
-        {"length_m": 0.0},
-        {"noise": -0.1},
-        {"heading_length": np.nan},
-        {"kernel": "cubic"},
-        {"likelihood_rows": 1},
-    ):
-        with pytest.raises(InputError, match=f"setting {next(iter(wrong))}: "):
-            Kriging(**wrong)
+    wrong = {"length_m": 0.0, "noise": -0.1, "heading_length": np.nan, "kernel": "cubic", "likelihood_rows": 1}
+    for name, value in wrong.items():
+        with pytest.raises(InputError, match=f"setting {name}: "):
+            Kriging(**{name: value})
     for model in (Kriging(1.0, 0.1), Trees(2)):
         with pytest.raises(InputError, match="6 positions and 5 observations"):
             model.fit(positions, values[:5])
@@ -194,28 +170,28 @@ def test_trees_use_the_heading():
 def test_published_figures_of_kriging_by_pixel(split: str, published: float):
     """Exponential kernel, 0.1 m, noise 0.02, about the mean of the training rows."""
     record, scores = load(DATA / "rfid-lab"), []
+    where, observed = record.tx_pos_m, record.observation[0]
     for part in make_splits(record, split):
-        known, rows = part.all_train, part.test
-        model = Kriging(0.1, 0.02, trend_fit="ols").fit(record.tx_pos_m[known], record.observation[0, known])
-        scores.append(TASKS["spectrum"].score(model.predict(record.tx_pos_m[rows]), record.observation[0, rows]))
+        model = Kriging(0.1, 0.02, trend_fit="ols").fit(where[part.all_train], observed[part.all_train])
+        scores.append(TASKS["spectrum"].score(model.predict(where[part.test]), observed[part.test]))
     assert summary(np.concatenate(scores))["median"] == pytest.approx(published, abs=0.001)
 
 
 @needs("flat-ble")
 def test_published_figures_of_signal_strengths():
     """Kriging about a log-distance law from 256 rows, 3.34 dB, and trees with heading on all rows, 3.14 dB.
-
     The published subset is not known; ours differ by 0.1 dB from each other. 40 trees are 0.02 dB worse than 300.
     """
     record, score = load(DATA / "flat-ble"), TASKS["rssi"].score
     (few,), (every,) = (make_splits(record, "official", n_train=n) for n in (256, None))
-    kriged, grown = [], []
+    where, heading, rows, errors = record.tx_pos_m, record.tx_heading_rad, every.test, []
+    np.testing.assert_array_equal(rows, few.test)
     for receiver, observed in zip(record.receivers, record.observation, strict=True):
-        known, rows, heading = few.all_train, few.test, record.tx_heading_rad
-        model = Kriging(trend=Trend(receiver.position_m)).fit(record.tx_pos_m[known], observed[known])
-        kriged.append(score(model.predict(record.tx_pos_m[rows]), observed[rows]))
+        kriged = Kriging(trend=Trend(receiver.position_m)).fit(where[few.all_train], observed[few.all_train])
         known = every.all_train
-        trees = Trees(40).fit(record.tx_pos_m[known], observed[known], heading[known])
-        grown.append(score(trees.predict(record.tx_pos_m[rows], heading[rows]), observed[rows]))
-    assert summary(np.concatenate(kriged))["median"] == pytest.approx(3.34, abs=0.12)
-    assert summary(np.concatenate(grown))["median"] == pytest.approx(3.14, abs=0.06)
+        trees = Trees(40).fit(where[known], observed[known], heading[known])
+        predicted = kriged.predict(where[rows]), trees.predict(where[rows], heading[rows])
+        errors.append([score(values, observed[rows]) for values in predicted])
+    kriged_db, grown_db = (summary(of_method)["median"] for of_method in np.concatenate(errors, axis=1))
+    assert kriged_db == pytest.approx(3.34, abs=0.12)
+    assert grown_db == pytest.approx(3.14, abs=0.06)

@@ -1,27 +1,23 @@
 """Lengths of strengths over areas larger than a floor are told by the rows, and intervals cover there."""
 
-from __future__ import annotations
-
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from changed_folders import DATA, needs
 from threadpoolctl import threadpool_limits
 
 from wrf_mi.core import Receiver, Record, Split
+from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.datasets import load
 from wrf_mi.models import MODELS, Problem, Session
-from wrf_mi.models.interpolation.strength_fit import PooledProcess, ReceiverObservations, scales
-from wrf_mi.models.interpolation.strength_terms import Hyperparameters, Poses
-from wrf_mi.models.interpolation.strengths import StrengthSettings, fit_strengths
+from wrf_mi.models.interpolation.strength_fit import scales
+from wrf_mi.models.interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from wrf_mi.models.model import default_settings, inputs_of
 from wrf_mi.runs.api import train
 from wrf_mi.tasks.scores import REAL_90
 
-UP = np.array([0.0, 0.0, 0.0, 1.0])
-FACTOR = 2.5
-"""Of a length by the likelihood of some hundred rows about the true one, either way."""
+FACTOR = 2.5  # of a length by the likelihood of some hundred rows about the true one, either way
 COVERED = (0.84, 0.96)
 """Share inside 90 % of some hundred errors, which shadowing correlates: 0.9 within three standard errors of 2 %."""
 
@@ -38,14 +34,13 @@ def area(seed: int, shadow_m: float, extent_m: float = 400.0, receivers: int = 1
         law_dbm = -35 + rng.normal(0, 3) - 32 * np.log10(np.linalg.norm(tx_pos_m - place_m, axis=1))
         values[:] = law_dbm + 7 * lower @ rng.normal(size=rows) + rng.normal(0, 2, rows)
     observed[observed < -110] = np.nan
-    named = tuple(Receiver(f"r{k}", place_m, UP) for k, place_m in enumerate(places_m))
+    named = tuple(Receiver(f"r{k}", place_m, np.array(UPRIGHT)) for k, place_m in enumerate(places_m))
     official = np.arange(rows * 4 // 5), np.arange(rows * 4 // 5, rows)
     return Record("area", "rssi", tx_pos_m, named, observed, official=official, frequencies_hz=np.array([868e6]))
 
 
 def errors_db(record: Record, model: str, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Absolute errors of the test rows, and the same in standard deviations."""
-    assert record.official is not None
     known, test = record.official
     split = Split("official", 0, known[len(known) // 10 :], known[: len(known) // 10], test)
     entry = MODELS[model].serving("rssi", False)
@@ -55,27 +50,6 @@ def errors_db(record: Record, model: str, folder: Path) -> tuple[np.ndarray, np.
     errors = np.abs(np.stack([each.mean for each in predictions]) - record.observation[:, test])
     received = np.isfinite(errors)
     return errors[received], (errors / np.stack([each.stated_std for each in predictions]))[received]
-
-
-def test_cost_is_that_of_the_dense_likelihood() -> None:
-    rng = np.random.default_rng(1)
-    prior = np.array([5.0, 1.0])
-    places = [Poses(rng.uniform(0, 3, (n, 3))) for n in (7, 5)]
-    bases = [rng.normal(size=(len(p), 2)) for p in places]
-    values = [rng.normal(0, 4, len(p)) for p in places]
-    noise = [rng.uniform(1, 3, len(p)) for p in places]
-    costs, dense_costs = [], []
-    for shadow_m in (0.5, 2.0):
-        kernel = Hyperparameters(3.0, shadow_m, 0.0, 1.0, 1.0, 0.0, 0.0)
-        parts = [ReceiverObservations(*each) for each in zip(places, bases, values, noise, strict=True)]
-        costs.append(PooledProcess(parts, kernel.covariance, prior, kernel.variance(False)).cost)
-        dense = np.concatenate(bases) @ np.diag(prior**2) @ np.concatenate(bases).T + np.diag(np.concatenate(noise))
-        dense[:7, :7] += kernel.covariance(places[0], places[0])
-        dense[7:, 7:] += kernel.covariance(places[1], places[1])
-        y = np.concatenate(values)
-        dense_costs.append(float(y @ np.linalg.solve(dense, y) + np.linalg.slogdet(dense)[1]))
-    # The jitter on the diagonal is 1e-8 of the noise.
-    np.testing.assert_allclose(costs, dense_costs, rtol=1e-6)
 
 
 @pytest.mark.parametrize("shadow_m", [15.0, 60.0])
@@ -114,11 +88,26 @@ def test_errors_are_lower_than_by_lengths_of_rooms(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.slow
+@needs("duke-cbrs")
 def test_hybrid_over_a_real_campus(tmp_path: Path) -> None:
     """Within the error of generic kriging, whose lengths are by likelihood, and intervals that cover."""
-    folder = Path(os.environ.get("WRF_MI_DATA", "")) / "duke-cbrs"
-    if not (folder / "anchors.csv").exists():
-        pytest.skip("WRF_MI_DATA has no duke-cbrs")
-    metrics = train(load(folder), tmp_path / "run", "hybrid").metrics
+    metrics = train(load(DATA / "duke-cbrs"), tmp_path / "run", "hybrid").metrics
     assert metrics["abs_error_db"]["median"] <= 6.1
     assert 0.85 < metrics["inside_90"] < 0.95
+
+
+def test_the_mean_of_a_receiver_has_its_carrier_and_is_stored() -> None:
+    """At one place free space differs by 20 log10 of the carriers' ratio, as of Friis' law."""
+    place, carriers_hz = np.array([0.0, 0, 2]), np.array([0.9e9, 3.6e9])
+    receivers = tuple(Receiver(f"cell:{hz:g}", place, np.array(UPRIGHT)) for hz in carriers_hz)
+    positions_m = np.random.default_rng(0).uniform(1, 9, (12, 3))
+    level = -20 * np.log10(np.linalg.norm(positions_m - place, axis=1))
+    observed = np.stack([level - 40, level - 52]).astype(np.float32)
+    plain = Record("cells", "rssi", positions_m, receivers, observed, frequencies_hz=np.array([0.9e9]))
+    for record, ratio in ((plain.at_receiver_carriers(carriers_hz), 4), (plain, 1)):
+        fitted = fit_strengths(record, np.arange(12))
+        again = Strengths.from_arrays(fitted.arrays())
+        np.testing.assert_array_equal(again.field.prior.frequency_hz, fitted.field.prior.frequency_hz)
+        poses = again.field.stops.poses
+        difference_db = np.subtract(*(again.field.prior.columns(poses, receiver)[0] for receiver in (0, 1)))
+        np.testing.assert_allclose(difference_db, 20 * np.log10(ratio), rtol=1e-12)

@@ -1,7 +1,5 @@
 """Kriging of spectra: of grey values along and across the line of sight, and joined with element signals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,15 +16,8 @@ from wrf_mi.models.interpolation import spectra
 from wrf_mi.models.interpolation.by_receiver import ByReceiver
 from wrf_mi.models.interpolation.kriging import Kriged, Kriging, UncertainKriged
 from wrf_mi.models.interpolation.kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight, sight_axes
-from wrf_mi.models.interpolation.spectra import (
-    GAPS,
-    LEAST_ROWS,
-    KrigedSpectra,
-    SpectrumKrigingSettings,
-    signal_weight,
-)
+from wrf_mi.models.interpolation.spectra import GAPS, LEAST_ROWS, KrigedSpectra, SpectrumKrigingSettings, signal_weight
 from wrf_mi.models.model import Inputs, field_arrays, from_field_arrays
-from wrf_mi.receivers.array import Lags
 from wrf_mi.tasks.scores import inside_interval, ssim
 from wrf_mi.training.session import FitSession, OnProgress, quiet
 
@@ -36,28 +27,28 @@ LENGTH_M = np.array([0.4, 0.15, 0.25])
 NOISE = 0.02
 QUICK = SpectrumKrigingSettings(directions=20, lengths=2)
 KRIGING = MODELS["kriging"].serving("spectrum", False)
-SINGLE = 2e-5
-"""Observations are float32 and of size one; weights of some tens of rows go with them."""
+SINGLE = 2e-5  # observations are float32 and of size one; weights of some tens of rows go with them
 
 
 def fit(
     record: Record, rows: np.ndarray, settings: SpectrumKrigingSettings = QUICK, on_progress: OnProgress = quiet
 ) -> ByReceiver:
     """The model ``kriging`` of some rows."""
-    fitted = KRIGING.fit(
-        Problem(record, settings), Split("rows", 0, rows, rows[:0], rows), FitSession(on_progress=on_progress)
-    )
-    assert isinstance(fitted, ByReceiver)
-    return fitted
+    split = Split("rows", 0, rows, rows[:0], rows)
+    return KRIGING.fit(Problem(record, settings), split, FitSession(on_progress=on_progress))
 
 
-def signals_and_nearby(model: ByReceiver, receiver: int = 0) -> KrigedSpectra:
-    found = model.models[receiver]
-    assert isinstance(found, KrigedSpectra)
-    return found
+def coherent(model: ByReceiver, receiver: int = 0) -> KrigedSpectra:
+    kriged = model.models[receiver]
+    assert isinstance(kriged, KrigedSpectra)
+    return kriged
 
 
-def some(count: int = 25, seed: int = 0, shape: tuple[int, ...] = (4, 5)) -> AnisotropicKriging:
+def of_one_receiver(record: Record) -> Record:
+    return replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
+
+
+def process_of(count: int = 25, seed: int = 0, shape: tuple[int, ...] = (4, 5)) -> AnisotropicKriging:
     """Rows of random observations; two of them at one place."""
     where = positions(count, seed)
     where[1] = where[0]
@@ -70,57 +61,64 @@ def kriged(process: AnisotropicKriging, kept: np.ndarray, where: np.ndarray) -> 
     local = (process.tx_pos_m[kept] @ process.axes.T) / process.length_m
     asked = (where @ process.axes.T) / process.length_m
     n = len(kept)
-    system = np.ones((n + 1, n + 1))
+    system, right = np.ones((n + 1, n + 1)), np.ones((n + 1, len(where)))
     system[:n, :n] = np.exp(-cdist(local, local)) + process.noise * np.eye(n)
     system[n, n] = 0
-    right = np.ones((n + 1, len(where)))
     right[:n] = np.exp(-cdist(local, asked))
     solved = np.linalg.solve(system, right)
     return solved[:n].T, 1 + process.noise - (solved * right).sum(axis=0)
 
 
-def test_prediction_is_ordinary_kriging() -> None:
-    process, where = some(), positions(6, seed=3)
+def test_prediction_is_ordinary_kriging_and_restored_from_arrays(tmp_path: Path) -> None:
+    process, where = process_of(), positions(6, seed=3)
     weights, variance = kriged(process, np.arange(25), where)
     assert weights.sum(axis=1) == pytest.approx(np.ones(6))
     np.testing.assert_allclose(process.predict(where), np.tensordot(weights, process.observed, 1), atol=SINGLE)
     np.testing.assert_allclose(process.std(where), np.sqrt(variance)[:, None, None] * process.scale, atol=SINGLE)
+    np.savez(tmp_path / "nearby.npz", **field_arrays(process, ""))
+    with np.load(tmp_path / "nearby.npz") as stored:
+        again = from_field_arrays(AnisotropicKriging, stored, "")
+    np.testing.assert_array_equal(again.predict(where), process.predict(where))
+    np.testing.assert_array_equal(again.std(where), process.std(where))
 
 
-def test_constant_field_is_reproduced() -> None:
+def test_constant_fields_are_reproduced_and_coincident_rows_fitted() -> None:
     """Weights sum to one, near and far, for any row left out."""
-    process = some()
+    process = process_of()
     process.observed[:] = 0.25
     np.testing.assert_allclose(process.predict(positions(6, seed=3) * 5), 0.25, atol=SINGLE)
     held_out, deviation = process.held_out(0.2, np.arange(25))
     np.testing.assert_allclose(held_out, 0.25, atol=SINGLE)
     assert deviation.max() < 1e-3
+    # All spectra the same, and all at one place.
+    where = positions(10)
+    same = fit_anisotropic(where, np.full((10, 30), 0.5, np.float32), RECEIVER_M, WAVELENGTH_M)
+    np.testing.assert_allclose(same.predict(positions(2, seed=1)), 0.5, atol=SINGLE)
+    one_place = np.repeat(where[:1], 10, axis=0)
+    observed = np.random.default_rng(0).uniform(size=(10, 30)).astype(np.float32)
+    found = fit_anisotropic(one_place, observed, RECEIVER_M, WAVELENGTH_M)
+    np.testing.assert_allclose(found.predict(where[:1])[0], observed.mean(axis=0), atol=SINGLE)
 
 
-@pytest.mark.parametrize("radius_m", [0.0, 0.1, 0.3])
-def test_held_out_is_kriging_without_those_rows(radius_m: float) -> None:
-    process, rows = some(), np.array([0, 7, 24])
+@pytest.mark.parametrize("radius_m", [0.0, 0.1, 0.3, 100.0])
+def test_held_out_is_kriging_without_those_rows_or_the_mean_without_any(radius_m: float) -> None:
+    process, rows = process_of(), np.array([0, 7, 24])
     mean, deviation = process.held_out(radius_m, rows)
     for number, row in enumerate(rows):
-        here = process.tx_pos_m[[row]]
-        kept = np.flatnonzero(cdist(here, process.tx_pos_m)[0] > radius_m)
-        assert 0 < len(kept) < 25
-        weights, variance = kriged(process, kept, here)
-        np.testing.assert_allclose(mean[number], np.tensordot(weights[0], process.observed[kept], 1), atol=SINGLE)
+        kept = np.flatnonzero(cdist(process.tx_pos_m[[row]], process.tx_pos_m)[0] > radius_m)
+        assert len(kept) < 25
+        assert (len(kept) == 0) == (radius_m == 100.0)
+        weights, variance = np.full((1, 25), 1 / 25), [1 + NOISE]
+        if len(kept):
+            weights, variance = kriged(process, kept, process.tx_pos_m[[row]])
+        known = process.observed[kept] if len(kept) else process.observed
+        np.testing.assert_allclose(mean[number], np.tensordot(weights[0], known, 1), atol=SINGLE)
         np.testing.assert_allclose(deviation[number], np.sqrt(variance[0]) * process.scale, atol=SINGLE)
 
 
-def test_held_out_without_any_other_row_is_the_mean() -> None:
-    process = some()
-    mean, deviation = process.held_out(100.0, np.array([3]))
-    np.testing.assert_allclose(mean[0], process.observed.mean(axis=0), atol=SINGLE)
-    np.testing.assert_allclose(deviation[0], np.sqrt(1 + NOISE) * process.scale, atol=SINGLE)
-
-
 def test_far_away_is_the_mean_by_generalised_least_squares() -> None:
-    process = some()
-    away = process.tx_pos_m[:1] + 1000.0
-    local = (process.tx_pos_m @ process.axes.T) / LENGTH_M
+    process = process_of()
+    away, local = process.tx_pos_m[:1] + 1000.0, (process.tx_pos_m @ process.axes.T) / LENGTH_M
     inverse = np.linalg.inv(np.exp(-cdist(local, local)) + NOISE * np.eye(25))
     mean = np.tensordot(inverse.sum(axis=0) / inverse.sum(), process.observed, 1)
     np.testing.assert_allclose(process.predict(away)[0], mean, atol=SINGLE)
@@ -139,47 +137,19 @@ def test_axes_lie_along_and_across_the_line_of_sight() -> None:
     np.testing.assert_array_equal(line_of_sight(where, where.mean(axis=0)), [0, 0, 1])
 
 
-def drawn(length_m: np.ndarray, noise: float, count: int, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    where = positions(count, seed=6)
-    local = (where @ sight_axes(where, RECEIVER_M).T) / length_m
-    root = np.linalg.cholesky(np.exp(-cdist(local, local)) + noise * np.eye(count))
-    field = root @ np.random.default_rng(1).normal(size=(count, pixels))
-    return where, (0.5 + 0.1 * field).astype(np.float32)
-
-
 @pytest.mark.parametrize("most", [400, 90])
 def test_fit_recovers_lengths_and_noise(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """300 draws at 120 places tell a length to some per cent; all rows predict, even if fewer are fitted to."""
     monkeypatch.setattr(nearby, "MOST_ROWS", most)
-    where, observed = drawn(LENGTH_M, NOISE, 120, 300)
+    where = positions(120, seed=6)
+    local = (where @ sight_axes(where, RECEIVER_M).T) / LENGTH_M
+    root = np.linalg.cholesky(np.exp(-cdist(local, local)) + NOISE * np.eye(120))
+    observed = (0.5 + 0.1 * root @ np.random.default_rng(1).normal(size=(120, 300))).astype(np.float32)
     fitted = fit_anisotropic(where, observed, RECEIVER_M, WAVELENGTH_M)
     assert fitted.length_m == pytest.approx(LENGTH_M, rel=0.15)
     assert fitted.noise == pytest.approx(NOISE, rel=0.3)
     assert np.mean(fitted.scale) == pytest.approx(0.1, rel=0.05)
     assert fitted.observed.shape == observed.shape
-
-
-def test_equal_spectra_and_coincident_rows_can_be_fitted() -> None:
-    """All spectra the same, and all at one place."""
-    where = positions(10)
-    same = fit_anisotropic(where, np.full((10, 30), 0.5, np.float32), RECEIVER_M, WAVELENGTH_M)
-    np.testing.assert_allclose(same.predict(positions(2, seed=1)), 0.5, atol=SINGLE)
-    one_place = np.repeat(where[:1], 10, axis=0)
-    observed = np.random.default_rng(0).uniform(size=(10, 30)).astype(np.float32)
-    found = fit_anisotropic(one_place, observed, RECEIVER_M, WAVELENGTH_M)
-    np.testing.assert_allclose(found.predict(where[:1])[0], observed.mean(axis=0), atol=SINGLE)
-
-
-def test_kriging_is_restored_from_arrays(tmp_path: Path) -> None:
-    process, where = some(), positions(3, seed=5)
-    np.savez(tmp_path / "nearby.npz", **field_arrays(process, ""))
-    with np.load(tmp_path / "nearby.npz") as stored:
-        again = from_field_arrays(AnisotropicKriging, stored, "")
-    np.testing.assert_array_equal(again.predict(where), process.predict(where))
-    np.testing.assert_array_equal(again.std(where), process.std(where))
-
-
-# Both estimates together
 
 
 @pytest.fixture(scope="module")
@@ -194,55 +164,46 @@ def progress() -> list[tuple[str, float]]:
 
 @pytest.fixture(scope="module")
 def model(record: Record, progress: list[tuple[str, float]]) -> ByReceiver:
-    assert record.official is not None
     settings = SpectrumKrigingSettings(directions=60)
     return fit(record, record.official[0], settings, lambda *stage: progress.append(stage[:2]))
 
 
 @pytest.mark.parametrize("receiver", [0, 1])
 def test_mixture_beats_kriging_and_states_its_error(record: Record, model: ByReceiver, receiver: int) -> None:
-    assert record.official is not None
     rows, truth = record.official[1], record.observation[receiver, record.official[1]]
     where = record.tx_pos_m[rows]
     estimate = model.predict(Inputs(where, np.zeros(len(rows))), receiver)
     assert estimate.mean.shape == estimate.std.shape == (len(rows), *SIZE)
-    assert estimate.mean.min() >= 0
-    assert estimate.mean.max() <= 1
+    assert 0 <= estimate.mean.min() <= estimate.mean.max() <= 1
     error = np.square(estimate.mean - truth).mean()
     # These waves obey the model, so that signals tell most of what there is to know.
-    assert error < 0.5 * np.square(signals_and_nearby(model, receiver).nearby.predict(where) - truth).mean()
+    assert error < 0.5 * np.square(coherent(model, receiver).nearby.predict(where) - truth).mean()
     assert np.median(ssim(estimate.mean, truth)) > 0.9
-    other = model.predict_mean(Inputs(where), 1 - receiver)
-    assert error < 0.1 * np.square(other - truth).mean()
+    assert error < 0.1 * np.square(model.predict_mean(Inputs(where), 1 - receiver) - truth).mean()
     np.testing.assert_allclose(model.predict_mean(Inputs(where), receiver), estimate.mean, atol=SINGLE)
     # 20 rows of correlated pixels.
     assert inside_interval(estimate.mean, estimate.std, truth) == pytest.approx(0.9, abs=0.08)
+    with pytest.raises(InputError, match="give finite x, y, z"):
+        model.predict(Inputs(np.array([[0.0, np.nan, 0.0]])), receiver)
 
 
 def test_deviation_is_that_of_the_grey_values_far_away(record: Record, model: ByReceiver) -> None:
-    assert record.official is not None
-    known = record.observation[0, record.official[0]]
-    away = model.predict(Inputs(np.array([[100.0, 100.0, 0.0]])), 0)
-    near = model.predict(Inputs(record.tx_pos_m[record.official[0]]), 0)
-    np.testing.assert_allclose(
-        away.mean[0], signals_and_nearby(model).nearby.predict([[100.0, 100.0, 0.0]])[0], atol=1e-3
-    )
+    known, far = record.observation[0, record.official[0]], np.array([[100.0, 100.0, 0.0]])
+    away, near = (model.predict(Inputs(where), 0) for where in (far, record.tx_pos_m[record.official[0]]))
+    np.testing.assert_allclose(away.mean[0], coherent(model).nearby.predict(far)[0], atol=1e-3)
     assert np.sqrt(np.square(away.std).mean()) > 0.7 * known.std(axis=0).mean()
     assert near.std.mean() < 0.2 * away.std.mean()
     assert np.abs(near.mean - known).mean() < 0.02
 
 
-def test_fit_reports_progress_and_summary(model: ByReceiver, progress: list[tuple[str, float]]) -> None:
+def test_fit_reports_progress_and_is_restored_from_arrays(record, model, progress, tmp_path) -> None:
     assert progress[0][0] == "one: element signals of spectra"
     assert {stage for stage, _ in progress} >= {"one: signals", "one: weights", "two: weights"}
     assert all(0 <= share <= 1 for _, share in progress)
     assert progress[-1] == ("kriging: receivers", 1.0)
-    found = model.facts()["fitted"][0]
-    assert sum(found["coherent_share"]) == pytest.approx(1, abs=1e-3)
-    assert 0 < found["turned_share"] <= 1
-
-
-def test_model_is_restored_from_arrays(record: Record, model: ByReceiver, tmp_path: Path) -> None:
+    fitted = model.facts()["fitted"][0]
+    assert sum(fitted["coherent_share"]) == pytest.approx(1, abs=1e-3)
+    assert 0 < fitted["turned_share"] <= 1
     np.savez(tmp_path / "model.npz", **model.arrays())
     with np.load(tmp_path / "model.npz", allow_pickle=False) as stored:
         again = KRIGING.load(dict(stored), Problem(record, SpectrumKrigingSettings()), tmp_path)
@@ -254,62 +215,47 @@ def test_model_is_restored_from_arrays(record: Record, model: ByReceiver, tmp_pa
     assert again.facts() == model.facts()
 
 
-def test_weight_of_signals_falls_with_their_ignorance() -> None:
-    weight = signal_weight(np.array([0.0, 0.1, 0.5, 1.0]), 0.1)
-    assert weight[0] == 0  # then neighbours know as much
-    assert weight[1] == pytest.approx(0.5 * 0.9)
-    assert weight[3] == 0
-
-
 def test_weight_and_spread_are_those_that_fit_rows_held_out(record: Record, model: ByReceiver) -> None:
-    assert record.official is not None
-    observed = record.observation[0, record.official[0]]
-    fitted = signals_and_nearby(model)
+    weight = signal_weight(np.array([0.0, 0.1, 0.5, 1.0]), 0.1)
+    assert (weight[0], weight[3]) == (0, 0)  # at 0 neighbours know as much
+    assert weight[1] == pytest.approx(0.5 * 0.9)
+    observed, fitted = record.observation[0, record.official[0]], coherent(model)
     rows = np.arange(len(observed))  # fewer than would be drawn from
-
     by_gap = []
     for gap in GAPS:
         posterior = fitted.signals.held_out(gap * WAVELENGTH_M, rows)
         kriged, deviation = fitted.nearby.held_out(gap * WAVELENGTH_M, rows)
-        by_gap.append((posterior, kriged, deviation))
+        by_gap.append((fitted.report(posterior), posterior.ignorance, kriged, deviation))
 
     def left(half: float) -> float:
         errors = []
-        for posterior, kriged, _ in by_gap:
-            weight = posterior.ignorance**2 / (posterior.ignorance**2 + half**2)
-            mixed = kriged + weight[:, None, None] * (fitted.report(posterior)[0] - kriged)
-            errors.append(np.square(mixed - observed).mean())
+        for report, ignorance, kriged, _ in by_gap:
+            weight = ignorance**2 / (ignorance**2 + half**2)
+            errors.append(np.square(kriged + weight[:, None, None] * (report[0] - kriged) - observed).mean())
         return float(np.mean(errors))
 
     # Chosen between 0.01 and 3 in steps of a tenth.
     others = [half for half in fitted.half * np.array([0.1, 0.8, 1.25, 10.0]) if 0.01 < half < 3]
     assert left(fitted.half) <= min(left(half) for half in others)
-    inside = []
-    for posterior, kriged, deviation in by_gap:
-        mean, std = fitted.mixed(fitted.report(posterior), posterior.ignorance, kriged, deviation)
-        inside.append((np.abs(mean - observed) <= 1.6449 * fitted.spread * std).mean())
+    mixed = [fitted.mixed(*parts) for parts in by_gap]
+    inside = [np.abs(mean - observed) <= 1.6449 * fitted.spread * std for mean, std in mixed]
     assert np.mean(inside) == pytest.approx(0.9, abs=0.01)
 
 
 def test_receivers_with_few_rows_are_kriged_generically_beside_others(record: Record, tmp_path: Path) -> None:
     """Rows that one receiver missed are left out there; below `LEAST_ROWS` its spectra themselves are kriged."""
-    assert record.official is not None
-    rows = record.official[0][:24]
-    observed = record.observation.copy()
+    rows, observed = record.official[0][:24], record.observation.copy()
     observed[1, rows[:4]] = np.nan
     both = fit(replace(record, observation=observed), rows)
-    assert [len(signals_and_nearby(both, receiver).nearby.tx_pos_m) for receiver in (0, 1)] == [24, 20]
+    assert [len(coherent(both, receiver).nearby.tx_pos_m) for receiver in (0, 1)] == [24, 20]
     observed[1, rows[: 25 - LEAST_ROWS]] = np.nan
     mixed = fit(replace(record, observation=observed), rows)
-    few = mixed.models[1]
-    assert isinstance(few, UncertainKriged)
-    signals_and_nearby(mixed, 0)
-    arrays = mixed.arrays()
-    again = KRIGING.load(arrays, Problem(record, QUICK), tmp_path)
+    assert isinstance(mixed.models[1], UncertainKriged)
+    assert isinstance(mixed.models[0], KrigedSpectra)
+    again = KRIGING.load(mixed.arrays(), Problem(record, QUICK), tmp_path)
     asked = Inputs(record.tx_pos_m[record.official[1]])
     for receiver in (0, 1):
         before, after = (each.predict(asked, receiver) for each in (mixed, again))
-        assert before.std is not None
         np.testing.assert_array_equal(after.mean, before.mean)
         np.testing.assert_array_equal(after.std, before.std)
         assert np.isfinite(before.mean).all()
@@ -322,7 +268,8 @@ def test_deviations_of_generic_kriging_are_those_of_universal_kriging() -> None:
     where, asked = positions(12), positions(5, seed=4)
     observed = np.random.default_rng(0).normal(size=(12, 3))
     kriging = Kriging(length_m=0.3, noise=0.05).fit(where, observed)
-    estimate, uncertain = UncertainKriged.of(kriging, observed).prediction(asked), UncertainKriged.of(kriging, observed)
+    uncertain = UncertainKriged.of(kriging, observed)
+    estimate = uncertain.prediction(asked)
     process = AnisotropicKriging(where, observed.astype(np.float32), np.eye(3), np.full(3, 0.3), 0.05)
     np.testing.assert_allclose(estimate.mean, process.predict(asked), atol=SINGLE)
     np.testing.assert_allclose(estimate.std, process.std(asked), atol=SINGLE)
@@ -337,76 +284,57 @@ def test_deviations_of_generic_kriging_are_those_of_universal_kriging() -> None:
 
 def test_weights_keep_their_defaults_without_gaps(record: Record) -> None:
     """Nothing is held out, so nothing is known of how far to trust either part; and no gap is wider than the rows."""
-    one = replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
-    model = fit(replace(one, tx_pos_m=np.zeros_like(one.tx_pos_m)), np.arange(16))
-    assert (signals_and_nearby(model).half, signals_and_nearby(model).spread) == (1.0, 1.0)
-    estimate = model.predict(Inputs(np.zeros((1, 3))), 0)
-    known = one.observation[0, :16]
+    first = of_one_receiver(record)
+    model = fit(replace(first, tx_pos_m=np.zeros_like(first.tx_pos_m)), np.arange(16))
+    assert (coherent(model).half, coherent(model).spread) == (1.0, 1.0)
+    estimate, known = model.predict(Inputs(np.zeros((1, 3))), 0), first.observation[0, :16]
     np.testing.assert_allclose(estimate.mean[0], known.mean(axis=0), atol=0.3)
     assert estimate.std.mean() == pytest.approx(known.std(axis=0).mean(), rel=0.5)
-    close = signals_and_nearby(fit(replace(one, tx_pos_m=one.tx_pos_m / 10), np.arange(16)))
+    close = coherent(fit(replace(first, tx_pos_m=first.tx_pos_m / 10), np.arange(16)))
     assert np.ptp(close.nearby.tx_pos_m, axis=0).max() < GAPS[-2] * WAVELENGTH_M
     assert 0.3 < close.spread < 1.5
 
 
 def test_spectra_are_read_in_chunks(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many at once as memory bears: the parts are joined in order."""
-    assert record.official is not None
-    sizes = []
-    unscale = spectra.unscale
+    sizes, unscale, rows = [], spectra.unscale, record.official[0][:20]
 
-    def counted(grey: np.ndarray, lags: Lags) -> Any:
+    def counted(grey: np.ndarray, lags: Any) -> Any:
         sizes.append(len(grey))
         return unscale(grey, lags)
 
     monkeypatch.setattr(spectra, "UNSCALED_PER_CHUNK", 9)
     monkeypatch.setattr(spectra, "unscale", counted)
-    one = replace(record, receivers=record.receivers[:1], observation=record.observation[:1])
-    kriged = signals_and_nearby(fit(one, record.official[0][:20]))
+    kriged = coherent(fit(of_one_receiver(record), rows))
     assert sizes == [9, 9, 2]
-    near = kriged.report(kriged.signals.predict(record.tx_pos_m[record.official[0][:20]]))[0]
-    assert np.median(ssim(near, record.observation[0, record.official[0][:20]])) > 0.9
+    near = kriged.report(kriged.signals.predict(record.tx_pos_m[rows]))[0]
+    assert np.median(ssim(near, record.observation[0, rows])) > 0.9
 
 
-def test_more_rows_than_the_memory_bears_are_kriged_generically_with_a_warning(
-    record: Record, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(spectra, "MOST_COVARIANCES", 9 * 11**2)
-    model = fit(record, np.arange(12))
-    assert all(isinstance(one, UncertainKriged) for one in model.models)
-    assert "the spectra themselves are kriged: 12 rows are too many" in caplog.text
+def test_arrays_on_a_line_and_too_many_rows_are_kriged_generically_with_a_warning(record, monkeypatch, caplog) -> None:
+    """Too many for the memory."""
+    line = record.with_array(np.outer(np.arange(9), [0.1, 0, 0]))
+    for data, reason in ((line, "retrieval: 9 elements on a line"), (record, "12 rows are too many")):
+        if data is record:
+            monkeypatch.setattr(spectra, "MOST_COVARIANCES", 9 * 11**2)
+        assert all(isinstance(kriged, UncertainKriged) for kriged in fit(data, np.arange(12)).models)
+        assert f"the spectra themselves are kriged: {reason}" in caplog.text
 
 
 @pytest.mark.parametrize("settings", [QUICK, replace(QUICK, generic=True), replace(QUICK, length_m=0.2)])
 @pytest.mark.parametrize("change", ["array", "frequencies_hz", None])
-def test_unknown_instruments_and_stated_covariances_are_kriged_generically(
-    settings: SpectrumKrigingSettings, change: str | None, record: Record, two_gateways: Record
-) -> None:
+def test_unknown_instruments_and_stated_covariances_are_kriged_generically(settings, change, record, two_gateways):
     if change is None and settings is QUICK:
         record = two_gateways  # an instrument of which nothing is known
-    unknown = {"array": without_array, "frequencies_hz": lambda one: replace(one, frequencies_hz=None)}
-    model = fit(unknown.get(change or "", lambda one: one)(record), np.arange(12), settings)
-    assert all(type(one) is Kriged for one in model.models)
+    unknown = {"array": without_array, "frequencies_hz": lambda known: replace(known, frequencies_hz=None)}
+    model = fit(unknown.get(change or "", lambda known: known)(record), np.arange(12), settings)
+    assert all(type(kriged) is Kriged for kriged in model.models)
     assert model.predict(Inputs(record.tx_pos_m[:2]), 0).std is None
 
 
-def test_an_array_on_a_line_is_kriged_generically_with_a_warning(
-    record: Record, caplog: pytest.LogCaptureFixture
-) -> None:
-    model = fit(record.with_array(np.outer(np.arange(9), [0.1, 0, 0])), np.arange(12))
-    assert all(isinstance(one, UncertainKriged) for one in model.models)
-    assert "the spectra themselves are kriged: retrieval: 9 elements on a line" in caplog.text
-
-
 @pytest.mark.parametrize(
-    ("setting", "value"),
-    [("cone_deg", 0.0), ("cone_deg", 181.0), ("directions", 0), ("lengths", 0)],
+    ("setting", "value"), [("cone_deg", 0.0), ("cone_deg", 181.0), ("directions", 0), ("lengths", 0)]
 )
 def test_settings_that_cannot_be_fitted_are_refused(setting: str, value: float) -> None:
     with pytest.raises(InputError, match=f"setting {setting}: {value} is out of range, choose"):
         SpectrumKrigingSettings(**{setting: value})
-
-
-def test_invalid_positions_are_refused(model: ByReceiver) -> None:
-    with pytest.raises(InputError, match="give finite x, y, z"):
-        model.predict(Inputs(np.array([[0.0, np.nan, 0.0]])), 0)

@@ -1,7 +1,5 @@
 """Convolutions, the march along rays and the training of networks, against NumPy and finite differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -36,14 +34,11 @@ from wrf_mi.training.adam import NumericsError
 
 pytestmark = pytest.mark.all_threads
 
-EXACT = 1e-12
-"""Some hundred float64 products of numbers around one."""
+EXACT = 1e-12  # some hundred float64 products of numbers around one
 
-DIFFERENCE = 1e-6
-"""Step of central differences in float64: their error is about its square plus 1e-16 / 1e-6."""
-
-GRADIENT_TOLERANCE = 1e-7
-"""Ten times that error, for derivatives around one."""
+DIFFERENCE, GRADIENT_TOLERANCE = 1e-6, 1e-7
+"""Step of central differences in float64, whose error is about its square plus 1e-16 / 1e-6, and ten times that error,
+for derivatives around one."""
 
 
 def doubles(values: np.ndarray) -> Any:
@@ -63,9 +58,8 @@ def assert_gradients(function: Callable[[list[Any]], Any], arrays: list[np.ndarr
             for step in (DIFFERENCE, -DIFFERENCE)
         )
         slope = float(np.sum(dr.grad(tensors[i]).numpy() * direction))
-        assert slope == pytest.approx(
-            (ahead - behind) / (2 * DIFFERENCE), rel=GRADIENT_TOLERANCE, abs=GRADIENT_TOLERANCE
-        )
+        difference = (ahead - behind) / (2 * DIFFERENCE)
+        assert slope == pytest.approx(difference, rel=GRADIENT_TOLERANCE, abs=GRADIENT_TOLERANCE)
 
 
 def weighted(x: Any, weights: np.ndarray) -> Any:
@@ -73,36 +67,25 @@ def weighted(x: Any, weights: np.ndarray) -> Any:
     return dr.sum(x.array * doubles(weights).array)
 
 
-def padded(images: np.ndarray) -> np.ndarray:
-    """Images [c, b, h, w] with a row of zeros above and below, and a column of the other side at each."""
-    wide = np.concatenate([images[..., -1:], images, images[..., :1]], axis=-1)
-    return np.pad(wide, [(0, 0), (0, 0), (1, 1), (0, 0)])
-
-
+@pytest.mark.gradcheck
 @pytest.mark.parametrize("side", [2, 3])
-def test_convolution_equals_its_sum_over_neighbours(side: int):
+def test_convolution_equals_its_sum_over_neighbours_and_has_its_gradient(side: int):
+    """Outside are zeros above and below, and the columns of the other side at each."""
     rng = np.random.default_rng(0)
     c, out, b, h, w = 3, 2, 2, 4, 5
     images, kernel, bias = rng.standard_normal((c, b, h, w)), rng.standard_normal((out, side, side, c)), [[0.5], [-1]]
-    wide, expected = padded(images), np.zeros((out, b, h, w))
+    wide = np.concatenate([images[..., -1:], images, images[..., :1]], axis=-1)
+    wide, expected = np.pad(wide, [(0, 0), (0, 0), (1, 1), (0, 0)]), np.zeros((out, b, h, w))
     for down in range(side):
         for right in range(side):
             part = wide[:, :, down : down + h, right : right + w]
             expected += np.einsum("oc,cbhw->obhw", kernel[:, down, right], part)
-    layer = Convolution(c, side, out, rng).with_state(
-        {"hidden": doubles(kernel.reshape(out, -1)), "bias": doubles(np.array(bias))}
-    )
-    found = layer(doubles(images.reshape(c, -1)), BatchShape(b, h, w))
-    np.testing.assert_allclose(found.numpy(), expected.reshape(out, -1) + bias, atol=EXACT)
-
-
-@pytest.mark.gradcheck
-@pytest.mark.parametrize("side", [2, 3])
-def test_gradients_of_patches(side: int):
-    rng = np.random.default_rng(1)
-    grid = BatchShape(2, 3, 4)
-    images, weights = rng.standard_normal((2, grid.columns)), rng.standard_normal((side * side * 2, grid.columns))
-    assert_gradients(lambda x: weighted(patches(x[0], grid, side), weights), [images], rng)
+    state = {"hidden": doubles(kernel.reshape(out, -1)), "bias": doubles(np.array(bias))}
+    grid, flat = BatchShape(b, h, w), images.reshape(c, -1)
+    result = Convolution(c, side, out, rng).with_state(state)(doubles(flat), grid)
+    np.testing.assert_allclose(result.numpy(), expected.reshape(out, -1) + bias, atol=EXACT)
+    weights = rng.standard_normal((side * side * c, grid.columns))
+    assert_gradients(lambda x: weighted(patches(x[0], grid, side), weights), [flat], rng)
 
 
 def test_finer_and_coarser_undo_each_other():
@@ -126,8 +109,8 @@ def test_gradients_of_layouts_and_normalisation():
     x, scale, bias = (rng.standard_normal(shape) for shape in ((4, grid.columns), (4, 1), (4, 1)))
     weights = rng.standard_normal((1, 2 * 3 * 5))
 
-    def function(given: list[Any]) -> Any:
-        y = InstanceNorm(4).with_state({"scale": given[1], "bias": given[2]})(given[0], grid)
+    def function(tensors: list[Any]) -> Any:
+        y = InstanceNorm(4).with_state({"scale": tensors[1], "bias": tensors[2]})(tensors[0], grid)
         y, fine = finer(y, grid)
         cut, _ = resized(y, fine, 3, 5)
         y, _ = coarser(y, fine)
@@ -135,29 +118,25 @@ def test_gradients_of_layouts_and_normalisation():
 
     assert_gradients(function, [x, scale, bias], rng)
     norm = InstanceNorm(4).with_state({"scale": doubles(scale * 0 + 1), "bias": doubles(bias * 0)})
-    images = norm(doubles(x), grid)
     each = x.reshape(4, 2, -1)
     expected = (each - each.mean(-1, keepdims=True)) / np.sqrt(each.var(-1, keepdims=True) + NORM_FLOOR)
-    np.testing.assert_allclose(images.numpy().reshape(each.shape), expected, atol=EXACT)
-
-
-def test_resized_fills_with_zeros():
-    found, grid = resized(doubles(np.ones((1, 4))), BatchShape(1, 2, 2), 3, 3)
-    np.testing.assert_array_equal(found.numpy().reshape(3, 3), [[1, 1, 0], [1, 1, 0], [0, 0, 0]])
+    np.testing.assert_allclose(norm(doubles(x), grid).numpy().reshape(each.shape), expected, atol=EXACT)
+    padded, grid = resized(doubles(np.ones((1, 4))), BatchShape(1, 2, 2), 3, 3)
+    np.testing.assert_array_equal(padded.numpy().reshape(3, 3), [[1, 1, 0], [1, 1, 0], [0, 0, 0]])
     assert grid.pixels == 9
 
 
-@pytest.mark.parametrize("picked", [[2, 0, 2], [1]])
-def test_columns_by_index(picked: list[int]):
+def test_columns_by_index():
     x = np.arange(12.0).reshape(3, 4)
-    np.testing.assert_array_equal(columns(doubles(x), mi.UInt32(picked)).numpy(), x[:, picked])
+    for picked in ([2, 0, 2], [1]):
+        np.testing.assert_array_equal(columns(doubles(x), mi.UInt32(picked)).numpy(), x[:, picked])
 
 
 def test_coordinates_are_centred_and_stored():
     frame = Coordinates.of([[0, 0, 1], [2, 0, 1]])
     again = from_field_arrays(Coordinates, field_arrays(frame))
     features = again.features([[2, 0, 1]], octaves=1, scale_m=2.0).numpy()[:, 0]
-    # One unit of plain coordinate; a half turn in two units of scale is 1 m.
+    # A unit of plain coordinate; a half turn in two units of scale is 1 m.
     np.testing.assert_allclose(features, [1, 0, 0, 1, 0, 0, 0, 1, 1], atol=1e-6)
 
 
@@ -178,16 +157,15 @@ def small_march(seed: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]
         if name.endswith("bias"):
             weights[name] += rng.standard_normal(weights[name].shape) * 0.3
     directions = rng.standard_normal((3, 4))
-    rays = {"origin": np.array([[0.2], [-0.2], [0.1]])}
-    rays |= constant_parts(2.0, 0.0, FAR_M, SAMPLES, FREQUENCIES_HZ)
+    rays = constant_parts(2.0, 0.0, FAR_M, SAMPLES, FREQUENCIES_HZ) | {"origin": np.array([[0.2], [-0.2], [0.1]])}
     rays["direction"] = directions / np.linalg.norm(directions, axis=0)
     return weights, rays, rng.standard_normal((2, 2))
 
 
 def marched(weights: dict[str, Any], rays: dict[str, np.ndarray], condition: np.ndarray) -> Any:
     module = network(np.random.default_rng(0)).with_state(weights | {"offset": None})
-    seen = look(module, {name: doubles(values) for name, values in rays.items()})
-    return march(module, seen, doubles(condition), SAMPLES)
+    views = look(module, {name: doubles(values) for name, values in rays.items()})
+    return march(module, views, doubles(condition), SAMPLES)
 
 
 def twin_of_march(w: dict[str, np.ndarray], rays: dict[str, np.ndarray], condition: np.ndarray) -> np.ndarray:
@@ -229,23 +207,18 @@ def twin_of_march(w: dict[str, np.ndarray], rays: dict[str, np.ndarray], conditi
     return total
 
 
-def test_march_equals_its_sum_point_by_point():
-    weights, rays, condition = small_march(4)
+@pytest.mark.gradcheck
+def test_march_equals_its_sum_point_by_point_and_has_its_gradient():
+    """By every weight of both networks; kinks are further off than the step for this seed."""
+    weights, rays, condition = small_march(5)
     re, im = marched({k: doubles(v) for k, v in weights.items()}, rays, condition)
     expected = twin_of_march(weights, rays, condition)
     np.testing.assert_allclose((re.numpy() + 1j * im.numpy()).reshape(expected.shape), expected, atol=EXACT)
-
-
-@pytest.mark.gradcheck
-def test_gradients_of_march():
-    """By every weight of both networks; kinks are further off than the step for this seed."""
-    weights, rays, condition = small_march(5)
-    names = list(weights)
     rng = np.random.default_rng(6)
     by_re, by_im = rng.standard_normal((2, 2 * 2 * 4))
 
-    def function(given: list[Any]) -> Any:
-        re, im = marched(dict(zip(names, given, strict=True)), rays, condition)
+    def function(tensors: list[Any]) -> Any:
+        re, im = marched(dict(zip(weights, tensors, strict=True)), rays, condition)
         return dr.sum(re * doubles(by_re).array + im * doubles(by_im).array)
 
     assert_gradients(function, list(weights.values()), rng)
@@ -263,8 +236,7 @@ def test_normalisation_of_uplinks_is_undone_for_channels():
         normalised_uplink(np.where(np.arange(3)[:, None, None] == 1, 0, uplink))
 
 
-VAE = VaeSettings(latent=2, width=5, last=5, octaves=0)
-"""Of four cells, three coordinates and six pixels."""
+VAE = VaeSettings(latent=2, width=5, last=5, octaves=0)  # of four cells, three coordinates and six pixels
 
 
 @pytest.mark.gradcheck
@@ -272,10 +244,8 @@ def test_gradients_of_the_evidence_bound():
     rng = np.random.default_rng(8)
     vae = Vae(VAE, 4, (2, 3), rng)
     weights = {path: rng.standard_normal(weight.shape) for path, weight in vae.state().items()}
-    sizes = {"cells": 4, "where": 3, "pixels": 6}
-    data = {name: doubles(rng.uniform(size=(size, 3))) for name, size in sizes.items()}
-    given = {"rows": mi.UInt32([2, 0]), "noise": doubles(rng.standard_normal((2, 2)))}
-    given["prior"] = doubles(rng.standard_normal((2, 2)))
+    data = {name: doubles(rng.uniform(size=(n, 3))) for name, n in {"cells": 4, "where": 3, "pixels": 6}.items()}
+    given = {"rows": mi.UInt32([2, 0])} | {name: doubles(rng.standard_normal((2, 2))) for name in ("noise", "prior")}
 
     def function(tensors: list[Any]) -> Any:
         return elbo_loss(vae.with_state(dict(zip(weights, tensors, strict=True))), data, given, VAE.latent)
@@ -283,10 +253,14 @@ def test_gradients_of_the_evidence_bound():
     assert_gradients(function, list(weights.values()), rng)
 
 
-def test_divergence_is_that_of_normal_distributions():
+def test_divergence_softplus_and_means_over_blocks_equal_their_formulas():
     """KL(N(m, v) || N(0, 1)) = (m^2 + v - 1 - log v) / 2."""
-    found = normal_divergence(doubles(np.array([[0.7]])), doubles(np.log([[0.25]]))).array[0]
-    assert found == pytest.approx((0.49 + 0.25 - 1 - np.log(0.25)) / 2, abs=EXACT)
+    divergence = normal_divergence(doubles(np.array([[0.7]])), doubles(np.log([[0.25]]))).array[0]
+    assert divergence == pytest.approx((0.49 + 0.25 - 1 - np.log(0.25)) / 2, abs=EXACT)
+    x = np.array([-800.0, -1, 0, 2, 800])
+    np.testing.assert_allclose(softplus(doubles(x)).numpy(), np.logaddexp(0, x), atol=EXACT)
+    image = np.arange(24.0).reshape(1, 4, 6)
+    np.testing.assert_array_equal(pooled(image, 3)[0], image.reshape(2, 2, 3, 2).mean(axis=(1, 3)).ravel())
 
 
 def test_paths_of_weights_are_those_of_attributes_and_lists():
@@ -294,21 +268,10 @@ def test_paths_of_weights_are_those_of_attributes_and_lists():
     state = vae.state()
     assert list(state)[:4] == ["q.0.image", "q.0.position", "q.0.bias", "q.1.hidden"]
     assert {"p.0.latent", "p.1.hidden", "p.out.bias"} <= set(state)
-    assert {"in.noise", "norm0.scale", "0.hidden"} <= set(
-        Generator(DcganSettings(), (8, 8), np.random.default_rng(0)).state()
-    )
+    generator = Generator(DcganSettings(), (8, 8), np.random.default_rng(0))
+    assert {"in.noise", "norm0.scale", "0.hidden"} <= set(generator.state())
     other = vae.with_state({path: weight + 1 for path, weight in state.items()})
     assert (other.p.layers[0].latent == vae.p.layers[0].latent + 1).all()
-
-
-def test_pooled_spectra_are_means_over_blocks():
-    image = np.arange(24.0).reshape(1, 4, 6)
-    np.testing.assert_array_equal(pooled(image, 3)[0], image.reshape(2, 2, 3, 2).mean(axis=(1, 3)).ravel())
-
-
-def test_softplus_does_not_overflow():
-    x = np.array([-800.0, -1, 0, 2, 800])
-    np.testing.assert_allclose(softplus(doubles(x)).numpy(), np.logaddexp(0, x), atol=EXACT)
 
 
 class Numbers(Module):
@@ -327,12 +290,11 @@ def trainer_of(goal: list[float], draw: Any, score: Any = None, *settings: str) 
     """Numbers that start at 0 and are to reach ``goal``; of samples 0 to 9 the last two validate."""
     rows = [np.arange(8)], [np.arange(10)]
     network = Network("x", Numbers(len(goal)), quadratic, to_float(goal), draw, *rows, score, "distance")
-    own = ("optimiser.warm_up=1", "optimiser.ema_decay=0", "log_every=1000", *settings)
-    return NetworkTrainer(network, with_settings(NetworkSettings(), own), (0,))
+    steps = ("optimiser.warm_up=1", "optimiser.ema_decay=0", "log_every=1000", *settings)
+    return NetworkTrainer(network, with_settings(NetworkSettings(), steps), (0,))
 
 
 def test_a_non_finite_step_keeps_the_weights_and_is_reported():
-
     def draw(rows: Any, receiver: int, rng: np.random.Generator) -> Any:
         return dr.opaque(mi.Float, np.nan if trainer.state.step == 99 else 0.0)
 
@@ -357,8 +319,8 @@ def test_training_goes_on_from_the_best_validation_score_with_all_rows():
     def score(numbers: Numbers) -> float:
         return abs(float(numbers.bias.numpy()[0]) - 1.0)
 
-    own = ("steps=120", "batch=8", "optimiser.network=0.05", f"holdout_steps_fraction={80 / 120}", "validate_every=20")
-    trainer = trainer_of([4], draw, score, *own)
+    settings = ("steps=120", "batch=8", "optimiser.network=0.05", f"holdout_steps_fraction={80 / 120}")
+    trainer = trainer_of([4], draw, score, *settings, "validate_every=20")
     assert trainer.run()
     # Adam moves by about its rate a step: 1 after 20 steps.
     assert trainer.state.chosen == 20
@@ -369,9 +331,7 @@ def test_training_goes_on_from_the_best_validation_score_with_all_rows():
     assert 1.1 < trainer.state.mean_params()["bias"][0] < 1.6
 
 
-@pytest.mark.parametrize(
-    "wrong", ["steps=0", "optimiser.ema_decay=1", "holdout_steps_fraction=1.5", "validate_every=0", "batch=0"]
-)
-def test_loop_settings_out_of_range_are_refused(wrong: str):
-    with pytest.raises(InputError, match=r"^setting .* is out of range, choose"):
-        with_settings(NetworkSettings(), [wrong])
+def test_loop_settings_out_of_range_are_refused():
+    for wrong in ("steps=0", "optimiser.ema_decay=1", "holdout_steps_fraction=1.5", "validate_every=0", "batch=0"):
+        with pytest.raises(InputError, match=r"^setting .* is out of range, choose"):
+            with_settings(NetworkSettings(), [wrong])

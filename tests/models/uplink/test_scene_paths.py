@@ -1,7 +1,5 @@
 """R2F2 with the paths of a scene: uplink and downlink of transmitters in the laboratory, traced and noisy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,10 +22,8 @@ from wrf_mi.tracing.options import TraceOptions
 HZ = 2.437e9 + 312.5e3 * np.arange(-16, 16)
 HALF = 16
 SNR_DB = 25.0
-GAIN_DB = 8.0
-"""Least gain by lengths that are known to centimetres: half of the one in these draws."""
-SCENE_GAIN_DB = 4.0
-"""Least gain by the exact scene: 6.8 dB with this noise."""
+GAIN_DB = 8.0  # least gain by lengths that are known to centimetres: half of the one in these draws
+SCENE_GAIN_DB = 4.0  # least gain by the exact scene: 6.8 dB with this noise
 SETTINGS = ["depth=2", "reflections=2", "max_paths=20", "wavefront=spherical"]
 
 
@@ -43,19 +39,11 @@ def room() -> Record:
     positions = transmitter_path(16)
     options = TraceOptions(transmission=True, depth=2)
     h = trace_channels(open_scene("laboratory", 2.437e9), receiver, positions, HZ, [options])
-    seen = noisy(h, np.random.default_rng(0)).astype(np.complex64)
-    return Record(
-        "room",
-        "csi",
-        positions,
-        (receiver,),
-        seen[None, :, :, HALF:],
-        (np.arange(8), np.arange(8, 16)),
-        frequencies_hz=HZ[HALF:],
-        uplink_hz=HZ[:HALF],
-        uplink=seen[:, :, :HALF],
-        truth=h[None, :, :, HALF:].astype(np.complex64),
-    )
+    measured = noisy(h, np.random.default_rng(0)).astype(np.complex64)
+    hz = {"frequencies_hz": HZ[HALF:], "uplink_hz": HZ[:HALF]}
+    truth, official = h[None, :, :, HALF:].astype(np.complex64), (np.arange(8), np.arange(8, 16))
+    uplink, downlink = measured[:, :, :HALF], measured[None, :, :, HALF:]
+    return Record("room", "csi", positions, (receiver,), downlink, official, uplink=uplink, truth=truth, **hz)
 
 
 def test_known_lengths_carry_close_paths_into_the_next_band():
@@ -76,6 +64,12 @@ def test_known_lengths_carry_close_paths_into_the_next_band():
     assert median["known"] > median["searched"] + GAIN_DB
 
 
+def test_distinct_paths_are_the_strongest_of_those_that_are_alike():
+    theta = np.array([[5.0, 0.1, 0.2], [5.01, 0.105, 0.2], [5.0, 0.3, 0.2], [9.0, 0.1, 0.2], [7.0, 0, 0]])
+    found = distinct(theta, np.array([0.5, 1.0, 0.2, 1e-4, 0.0]))
+    assert found == pytest.approx(theta[[1, 2]])
+
+
 def test_scene_raises_the_accuracy_of_the_downlink(room: Record, tmp_path: Path):
     run = {
         scene: wrf_mi.train(room, tmp_path / str(scene), "r2f2", scene=scene, settings=SETTINGS[: None if scene else 4])
@@ -87,20 +81,7 @@ def test_scene_raises_the_accuracy_of_the_downlink(room: Record, tmp_path: Path)
     opened = wrf_mi.open_run(tmp_path / "laboratory", room)
     asked = {"tx_pos_m": room.tx_pos_m[8:10], "uplink": room.uplink[8:10]}
     assert np.array_equal(opened.predict(**asked).mean, run["laboratory"].predict(**asked).mean)
-
-
-def test_unknown_positions_are_refused_beside_a_scene(room: Record, tmp_path: Path):
-    run = wrf_mi.train(room, tmp_path / "run", "r2f2", scene="laboratory", settings=SETTINGS)
     with pytest.raises(InputError, match="position"):
-        run.predict(tx_pos_m=np.full((1, 3), np.nan), uplink=room.uplink[:1])
-
-
-def test_waves_without_directions_are_refused_beside_a_scene(room: Record, tmp_path: Path):
+        opened.predict(tx_pos_m=np.full((1, 3), np.nan), uplink=room.uplink[:1])
     with pytest.raises(InputError, match="another wavefront than free"):
-        wrf_mi.train(room, tmp_path / "run", "r2f2", scene="laboratory", settings=["wavefront=free"])
-
-
-def test_distinct_paths_are_the_strongest_of_those_that_are_alike():
-    theta = np.array([[5.0, 0.1, 0.2], [5.01, 0.105, 0.2], [5.0, 0.3, 0.2], [9.0, 0.1, 0.2], [7.0, 0, 0]])
-    found = distinct(theta, np.array([0.5, 1.0, 0.2, 1e-4, 0.0]))
-    assert found == pytest.approx(theta[[1, 2]])
+        wrf_mi.train(room, tmp_path / "free", "r2f2", scene="laboratory", settings=["wavefront=free"])

@@ -1,8 +1,5 @@
 """Methods from the uplink: exactness on sparse paths, gain over a copy of the uplink, stored models, refused data."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,21 +33,15 @@ HZ = CARRIER_HZ + OFFSETS
 EXACT_DB = 60.0
 """Coefficients are stored as complex64, whose 140 dB the step to the next band and single antennas in a fade may cost
 some; a wrong path, or one of them missing, gives less than 30."""
-METHODS = {"linear": linear.MODEL, "fire": fire.MODEL, "r2f2": r2f2.MODEL, "optml": optml.MODEL}
-"""Methods that predict from the uplink alone."""
-FIELDS = {"nerf2": nerf2.MODEL}
+METHODS = {"linear": linear.MODEL, "fire": fire.MODEL, "r2f2": r2f2.MODEL, "optml": optml.MODEL, "nerf2": nerf2.MODEL}
+UPLINK_ALONE = ("linear", "fire", "r2f2", "optml")
+PLANE = {"steps": 5, "batch": 4, "wavefront": "plane"}
 SMALL = {
     "linear": LinearSettings(),
     "fire": FireSettings(steps=50, batch=32, validate_every=20, sample="antenna", width=16, latent=4),
     "r2f2": PathSettings(max_paths=3, choice_rows=2),
     "optml": OptMLSettings(
-        steps=5,
-        batch=4,
-        simulation=Simulation(channels=12, paths=2),
-        width=4,
-        rounds=1,
-        wavefront="plane",
-        max_distance_m=30.0,
+        simulation=Simulation(channels=12, paths=2), width=4, rounds=1, max_distance_m=30.0, **PLANE
     ),
     "nerf2": Nerf2Settings(12, 8, networks=Networks(layers=2, width=8), sphere_rays=8, samples=2),
 }
@@ -66,17 +57,10 @@ def channels(gains, theta, elements, spherical):
 
 def record_of(h, elements=None, known=True):
     """A record of coefficients [n, antennas, 52]."""
-    receiver = Receiver("bs", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
-    return Record(
-        "made",
-        "csi",
-        np.full((len(h), 3), np.nan),
-        (receiver,),
-        h[None, :, :, HALF:].astype(np.complex64),
-        frequencies_hz=HZ[HALF:] if known else None,
-        uplink_hz=HZ[:HALF] if known else None,
-        uplink=h[:, :, :HALF].astype(np.complex64),
-    ).with_array(elements)
+    receiver, nowhere = Receiver("bs", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])), np.full((len(h), 3), np.nan)
+    uplink, downlink = (part.astype(np.complex64) for part in np.split(h, 2, axis=-1))
+    hz = {"frequencies_hz": HZ[HALF:], "uplink_hz": HZ[:HALF]} if known else {}
+    return Record("made", "csi", nowhere, (receiver,), downlink[None], uplink=uplink, **hz).with_array(elements)
 
 
 def split_of(n, test=0):
@@ -84,6 +68,17 @@ def split_of(n, test=0):
     rows = np.arange(n)
     cut = (n - test) - (n - test) // 5
     return Split("made", 0, rows[:cut], rows[cut : n - test], rows[n - test :])
+
+
+def accuracy_db(fitted, record, rows, truth):
+    """Accuracy [n] of predictions from the uplinks of some rows, against coefficients [n, antennas, 52]."""
+    return cea_db(fitted.predict(inputs_of(record, rows), 0).mean, truth[:, :, HALF:])
+
+
+def gain_db(fitted, record, rows, truth):
+    """Median accuracy over that of a copy of the uplink."""
+    copied = cea_db(record.uplink[rows], truth[rows][:, :, HALF:])
+    return np.median(accuracy_db(fitted, record, rows, truth[rows])) - np.median(copied)
 
 
 def noisy(h, snr_db, rng):
@@ -121,33 +116,27 @@ def walk(elements):
 @pytest.mark.parametrize("wavefront", ["plane", "spherical"])
 def test_r2f2_is_exact_on_noise_free_sparse_paths(elements, wavefront):
     rng = np.random.default_rng(1)
-    h = channels(*sparse(10, 4, rng, 1.5 if wavefront == "spherical" else 10), elements, wavefront == "spherical")
+    h = channels(*sparse(5, 4, rng, 1.5 if wavefront == "spherical" else 10), elements, wavefront == "spherical")
     record = record_of(h, elements)
-    fitted = r2f2.MODEL.fit(Problem(record, PathSettings(max_paths=5, choice_rows=2), 0), split_of(10), FitSession())
+    fitted = r2f2.MODEL.fit(Problem(record, PathSettings(max_paths=5, choice_rows=2), 0), split_of(5), FitSession())
     assert fitted.kind == wavefront, "the kind of wave is found on validation rows"
-    cea = cea_db(fitted.predict(inputs_of(record, np.arange(10)), 0).mean, h[:, :, HALF:])
-    assert cea.min() > EXACT_DB
+    assert accuracy_db(fitted, record, np.arange(5), h).min() > EXACT_DB
 
 
-def test_r2f2_without_elements_is_exact_where_delays_are_apart():
+@pytest.mark.parametrize("known", [True, False])
+def test_r2f2_without_elements_is_exact_where_delays_are_apart_and_finds_the_gap_of_unknown_bands(known):
     rng = np.random.default_rng(2)
-    delays = np.array([5.0, 60.0]) + rng.uniform(-4, 4, (6, 2))
+    delays = np.array([5.0, 60.0]) + rng.uniform(-4, 4, (6, 2)) if known else np.array([[30.0, 80.0]])
     gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
-    h = np.einsum("nka,nkf->naf", gains, np.exp(-2j * np.pi / speed_of_light * delays[..., None] * OFFSETS))
-    fitted = r2f2.MODEL.fit(Problem(record_of(h), PathSettings(), 0), split_of(6), FitSession())
-    record = record_of(h)
-    cea = cea_db(fitted.predict(inputs_of(record, np.arange(6)), 0).mean, h[:, :, HALF:])
-    assert fitted.kind == "free"
-    assert cea.min() > EXACT_DB
-
-
-def test_r2f2_finds_the_gap_between_unknown_bands():
-    rng = np.random.default_rng(3)
-    gains = rng.standard_normal((6, 2, 12, 2)) @ np.array([1, 1j])
-    waves = np.exp(-2j * np.pi / speed_of_light * np.array([30.0, 80.0])[:, None] * OFFSETS)
-    record = record_of(np.einsum("nka,kf->naf", gains, waves), known=False)
+    waves = np.exp(-2j * np.pi / speed_of_light * delays[..., None] * OFFSETS)
+    h = np.einsum("nka,nkf->naf", gains, np.broadcast_to(waves, (6, 2, len(OFFSETS))))
+    record = record_of(h, known=known)
     fitted = r2f2.MODEL.fit(Problem(record, PathSettings(), 0), split_of(6), FitSession())
-    assert fitted.bands.downlink_hz[0] - fitted.bands.uplink_hz[-1] == pytest.approx(2 * SPACING_HZ)
+    if known:
+        assert fitted.kind == "free"
+        assert accuracy_db(fitted, record, np.arange(6), h).min() > EXACT_DB
+    else:
+        assert fitted.bands.downlink_hz[0] - fitted.bands.uplink_hz[-1] == pytest.approx(2 * SPACING_HZ)
 
 
 def test_search_finds_as_many_paths_as_there_are_in_noise(elements):
@@ -183,48 +172,41 @@ def test_gradient_of_the_projected_residual_equals_finite_differences(kind, elem
         np.testing.assert_allclose(-2 * right[:, number], (up - down) / (2 * step), rtol=1e-4, atol=1e-2)
 
 
-def test_fire_beats_copying_the_uplink(walk):
+@pytest.mark.parametrize(
+    ("name", "settings", "least_db"),
+    [
+        # Noise of 25 dB is not what limits a network of 300 steps; a wrong unit gives 0 dB.
+        ("fire", network_settings(FireSettings, 375, 128, 2e-3, 100, sample="antenna", width=64, latent=16), 6),
+        # Its phase alone, put right, gives 2 dB.
+        ("linear", LinearSettings(), 10),
+    ],
+)
+def test_methods_beat_copying_the_uplink(walk, name, settings, least_db):
     truth, record = walk
     split = split_of(80, 16)
-    settings = network_settings(FireSettings, 375, 128, 2e-3, 100, sample="antenna", width=64, latent=16)
-    fitted = fire.MODEL.fit(Problem(record, settings, 0), split, FitSession())
-    inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
-    mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0).mean, inputs.uplink))
-    assert mine > copied + 6, "noise of 25 dB is not what limits a network of 300 steps; a wrong unit gives 0 dB"
+    fitted = METHODS[name].fit(Problem(record, settings, 0), split, FitSession())
+    assert gain_db(fitted, record, split.test, truth) > least_db
 
 
 def test_fire_ignores_rows_without_downlink(walk):
     truth, record = walk
     split, settings = split_of(80, 16), FireSettings(steps=75, sample="row", width=32)
-    inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
     observation = record.observation.copy()
     observation[0, :2] = 0
-    lost = replace(record, observation=observation)
-    first, second = (
-        np.median(cea_db(fire.MODEL.fit(Problem(one, settings, 0), split, FitSession()).predict(inputs, 0).mean, down))
-        for one in (record, lost)
+    every, fewer = (
+        gain_db(fire.MODEL.fit(Problem(data, settings, 0), split, FitSession()), record, split.test, truth)
+        for data in (record, replace(record, observation=observation))
     )
-    assert second > first - 0.5, "2 of 80 rows are silent; a weight of their own makes all rows so"
-
-
-def test_linear_map_beats_copying_the_uplink(walk):
-    truth, record = walk
-    split = split_of(80, 16)
-    fitted = linear.MODEL.fit(Problem(record, LinearSettings(), 0), split, FitSession())
-    inputs, down = inputs_of(record, split.test), truth[split.test][:, :, HALF:]
-    mine, copied = (np.median(cea_db(p, down)) for p in (fitted.predict(inputs, 0).mean, inputs.uplink))
-    assert mine > copied + 10, "its phase alone, put right, gives 2 dB"
+    assert fewer > every - 0.5, "2 of 80 rows are silent; a weight of their own makes all rows so"
 
 
 @pytest.mark.parametrize(
     ("name", "known"),
     # Fields alone use poses.
-    [(name, "nothing") for name in METHODS]
-    + [(name, known) for name in FIELDS for known in ("nothing", "its position", "its orientation")],
+    [(name, "nothing") for name in SMALL] + [("nerf2", "its position"), ("nerf2", "its orientation")],
 )
 def test_captures_without_a_pose_are_fitted_and_predicted(name, known, walk):
     """As in Argos' captures, the base station's position, elements and frequencies are unknown.
-
     Networks of ten steps predict no better than zeros; the other methods reach a median CEA of 15 dB.
     """
     truth, _ = walk
@@ -232,43 +214,34 @@ def test_captures_without_a_pose_are_fitted_and_predicted(name, known, walk):
     turned = np.array([0.5, 0.5, 0.5, 0.5]) if known == "its orientation" else np.full(4, np.nan)
     record = replace(record_of(truth[:30, :6], known=False), receivers=(Receiver("base-station", place, turned),))
     settings = replace(SMALL[name], wavefront="auto") if name == "optml" else SMALL[name]
-    method, split = (METHODS | FIELDS)[name], split_of(30, 5)
+    method, split = METHODS[name], split_of(30, 5)
     fitted = method.fit(Problem(record, settings, 0), split, FitSession())
     inputs = inputs_of(record, split.test)
-    found = fitted.predict(inputs, 0).mean
-    assert found.shape == (5, 6, HALF)
-    assert np.isfinite(found).all()
-    assert np.abs(found).min() > 0
+    predicted = fitted.predict(inputs, 0).mean
+    assert predicted.shape == (5, 6, HALF)
+    assert np.isfinite(predicted).all()
+    assert np.abs(predicted).min() > 0
     if name in ("linear", "r2f2", "optml"):
-        assert np.median(cea_db(found, record.observation[0][split.test])) > 15
-    np.testing.assert_array_equal(
-        method.load(fitted.arrays(), Problem(record, None), Path()).predict(inputs, 0).mean, found
-    )
+        assert np.median(cea_db(predicted, record.observation[0][split.test])) > 15
+    again = method.load(fitted.arrays(), Problem(record, None), Path())
+    np.testing.assert_array_equal(again.predict(inputs, 0).mean, predicted)
 
 
 def test_optml_finds_all_paths_with_few_steps(elements):
     rng = np.random.default_rng(6)
     h = channels(*sparse(20, 3, rng), elements, spherical=False)
     record, split = record_of(noisy(h, 25, rng), elements), split_of(20, 8)
-    settings = OptMLSettings(
-        steps=125,
-        batch=8,
-        optimiser=network_adam(5e-3),
-        simulation=Simulation(channels=150, paths=4),
-        width=16,
-        wavefront="plane",
-        rounds=2,
-        max_distance_m=60.0,
-    )
+    training = PLANE | {"steps": 125, "batch": 8, "optimiser": network_adam(5e-3)}
+    simulation = Simulation(channels=150, paths=4)
+    settings = OptMLSettings(simulation=simulation, width=16, rounds=2, max_distance_m=60.0, **training)
     fitted = optml.MODEL.fit(Problem(record, settings, 0), split, FitSession())
-    cea = cea_db(fitted.predict(inputs_of(record, split.test), 0).mean, h[split.test][:, :, HALF:])
+    cea = accuracy_db(fitted, record, split.test, h[split.test])
     assert np.median(cea) > 25, "as good as the uplink was measured: all paths were seen"
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", UPLINK_ALONE)
 def test_loaded_model_predicts_the_same(name, walk, tmp_path):
-    _, record = walk
-    split = split_of(80, 16)
+    record, split = walk[1], split_of(80, 16)
     fitted = METHODS[name].fit(Problem(record, SMALL[name]), split, FitSession())
     arrays = fitted.arrays()
     assert not any(key.startswith("run/") for key in arrays)
@@ -281,35 +254,29 @@ def test_loaded_model_predicts_the_same(name, walk, tmp_path):
     assert prediction.shape == (5, 48, HALF)
     assert prediction.dtype == np.complex64
     np.testing.assert_array_equal(again.predict(inputs, 0).mean, prediction)
+    if name == "r2f2":
+        silent = Inputs(np.full((2, 3), np.nan), uplink=np.zeros((2, 48, 26), np.complex64))
+        assert not fitted.predict(silent, 0).mean.any()
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_records_of_two_receivers_or_of_another_array_are_refused(name, walk):
+@pytest.mark.parametrize("name", UPLINK_ALONE)
+def test_single_rows_and_records_of_two_receivers_or_of_another_array_are_refused(name, walk):
     """All other checks of a record are those of `train` (test_uplink_runs.py)."""
-    record = walk[1]
+    record, nothing = walk[1], np.zeros(0, np.int64)
     doubled = replace(record, receivers=record.receivers * 2, observation=np.repeat(record.observation, 2, axis=0))
-    with pytest.raises(InputError, match="needs one receiver"):
-        METHODS[name].fit(Problem(doubled, SMALL[name]), split_of(80), FitSession())
-    if name != "linear":  # which does not use the array
-        fewer = record.with_array(record.receivers[0].array_m[:-1])
-        with pytest.raises(InputError, match="47, 3"):
-            METHODS[name].fit(Problem(fewer, SMALL[name]), split_of(80), FitSession())
+    fewer = record.with_array(record.receivers[0].array_m[:-1])
+    for data, split, message in (
+        (doubled, split_of(80), "needs one receiver"),
+        (fewer, split_of(80), "47, 3"),
+        (record, Split("made", 0, np.array([0]), nothing, nothing), "1 training row"),
+    ):
+        if data is fewer and name == "linear":  # which does not use the array
+            continue
+        with pytest.raises(InputError, match=message):
+            METHODS[name].fit(Problem(data, SMALL[name]), split, FitSession())
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_a_single_row_is_refused(name, walk):
-    nothing = np.zeros(0, np.int64)
-    split = Split("made", 0, np.array([0]), nothing, nothing)
-    with pytest.raises(InputError, match="1 training row"):
-        METHODS[name].fit(Problem(walk[1], SMALL[name]), split, FitSession())
-
-
-def test_uplink_of_zeros_gives_a_downlink_of_zeros(walk):
-    fitted = r2f2.MODEL.fit(Problem(walk[1], SMALL["r2f2"], 0), split_of(80), FitSession())
-    assert not fitted.predict(Inputs(np.full((2, 3), np.nan), uplink=np.zeros((2, 48, 26), np.complex64)), 0).mean.any()
-
-
-@pytest.mark.parametrize("settings", [lambda: PathSettings(wavefront="cylinder"), lambda: FireSettings(sample="x")])
-def test_unknown_words_are_refused_by_the_settings_themselves(settings: Callable[[], object]) -> None:
-    with pytest.raises(InputError, match="choose from"):
-        settings()
+def test_unknown_words_are_refused_by_the_settings_themselves() -> None:
+    for kind, wrong in ((PathSettings, {"wavefront": "cylinder"}), (FireSettings, {"sample": "x"})):
+        with pytest.raises(InputError, match="choose from"):
+            kind(**wrong)

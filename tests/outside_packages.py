@@ -1,0 +1,154 @@
+"""Packages of others with a model, a receiver model, a benchmark, a task and a layout, and commands that find them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+NEAREST = '''
+from dataclasses import dataclass
+
+import numpy as np
+
+from wrf_mi.core import Prediction
+from wrf_mi.models import Fitted, Model
+
+@dataclass(frozen=True)
+class NearestSettings:
+    neighbours: int = 3
+
+class Nearest(Fitted):
+    """The mean of the nearest training rows."""
+
+    def __init__(self, arrays, settings):
+        self.kept, self.settings = arrays, settings
+
+    def predict(self, inputs, receiver):
+        apart = np.linalg.norm(inputs.tx_pos_m[:, None] - self.kept["tx_pos"], axis=2)
+        nearest = self.kept["observation"][receiver, np.argsort(apart, axis=1)[:, : self.settings.neighbours]]
+        return Prediction(np.nanmean(nearest, axis=1), np.nanstd(nearest, axis=1) + 1)
+
+    def arrays(self):
+        return self.kept
+
+    def facts(self):
+        return {"rows": len(self.kept["tx_pos"])}
+
+class NearestModel(Model):
+    name, source, settings, tasks = "nearest", "this test", NearestSettings, ("rssi",)
+
+    def fit(self, problem, split, session):
+        session.report("nearest rows", 0.0)
+        record, rows = problem.record, problem.rows(split)
+        return self.load({"tx_pos": record.tx_pos_m[rows], "observation": record.observation[:, rows]}, problem, None)
+
+    def load(self, arrays, problem, folder):
+        return Nearest(arrays, problem.settings)
+
+MODEL = NearestModel()
+'''
+CABLE_DB = 17.0
+ATTENUATORS = '''
+from dataclasses import dataclass, replace
+
+from wrf_mi.graph.receivers import RECEIVERS
+from wrf_mi.receivers.receiver_models import PowerReceiver
+from wrf_mi_bench.bench import Check
+
+CABLE_DB = 17.0
+
+@dataclass(frozen=True)
+class Attenuated(PowerReceiver):
+    """A power meter behind an attenuator."""
+
+    def __call__(self, traced, learned):
+        return super().__call__(traced, learned) - CABLE_DB
+
+def make(form, receiver):
+    return Attenuated(*form.size, (0.0,), interference=False)
+
+def measure():
+    return {"rows": [{"what": "attenuation", "value": f"{CABLE_DB} dB", "asked": "17 dB"}]}
+
+ATTENUATED = replace(RECEIVERS["power"], name="attenuated", make=make)
+CHECK = Check("attenuator", "attenuators:measure")
+'''
+DELAYS = """
+import csv
+
+import numpy as np
+
+from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.datasets.layouts import Layout
+from wrf_mi.tasks.task import Task
+
+class DelaySpread(Task):
+    name, block, label, higher_is_better = "delay-spread", "abs_error_ns", "absolute error (ns)", False
+    axes = 0
+    heading, quantity, note = "delay spread", "delay spread (ns)", "The absolute error in ns."
+
+    def score(self, prediction, truth):
+        return np.abs(np.asarray(prediction, float) - np.asarray(truth, float))
+
+    def instrument(self, record):
+        raise InputError(f"{record.name}: nothing traces delay spreads")
+
+TASK = DelaySpread()
+
+def read(path, name):
+    with (path / "delays.csv").open() as file:
+        table = np.array([[float(value) for value in row] for row in list(csv.reader(file))[1:]])
+    rows = np.arange(len(table))
+    receiver = Receiver("sounder", np.array([0.0, 0, 2]), np.array([0.0, 0, 0, 1]))
+    official = rows[rows % 4 > 0], rows[rows % 4 == 0]
+    values = table[None, :, 3].astype(np.float32)
+    return Record(name or path.name, TASK.name, table[:, :3], (receiver,), values, official=official, source=str(path))
+
+LAYOUT = Layout("delays", TASK.name, read, files=("delays.csv",))
+"""
+SOURCES = {"nearest_of_others": NEAREST, "attenuators": ATTENUATORS, "delays_of_others": DELAYS}
+ENTRY_POINTS = """
+[wrf_mi.models]
+nearest = nearest_of_others:MODEL
+[wrf_mi.receivers]
+attenuated = attenuators:ATTENUATED
+[wrf_mi.benchmarks]
+attenuator = attenuators:CHECK
+[wrf_mi.tasks]
+delay-spread = delays_of_others:TASK
+[wrf_mi.layouts]
+delays = delays_of_others:LAYOUT
+"""
+CALLS = """
+import contextlib, io, json, sys
+from wrf_mi.cli.main import main
+
+for words in json.loads(sys.argv[1]):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = main(words)
+    print(json.dumps([status, out.getvalue(), err.getvalue()]))
+"""
+
+
+def installed(site: Path) -> dict[str, str]:
+    """The environment of a Python that has the packages in the folder ``site``, which is made."""
+    info = site / "of_others-1.0.dist-info"
+    info.mkdir(parents=True)
+    for module, source in SOURCES.items():
+        (site / f"{module}.py").write_text(source)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: of-others\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    path = os.pathsep.join([str(site), *filter(None, sys.path)])
+    return {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "error::RuntimeWarning"}
+
+
+def commands(environment: dict[str, str], calls: dict[str, list[Any]]) -> dict[str, tuple[int, str, str]]:
+    """Status, standard output and standard error of commands, one after the other in a process of their own."""
+    words = json.dumps([[str(word) for word in call] for call in calls.values()])
+    process = [sys.executable, "-c", CALLS, words]
+    done = subprocess.run(process, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    return dict(zip(calls, map(json.loads, done.stdout.splitlines()), strict=True))
