@@ -80,7 +80,11 @@ print({"drjit", "mitsuba", "sionna"} & set(sys.modules))
 
 def test_version_and_settings(command: Command) -> None:
     assert re.fullmatch(r"\d+\.\d+\.\d+\n", command.done(["--version"]))
-    assert "optimiser.network=0.001\n" in command.done(["train", "--help-settings"])
+    listed = command.done(["train", "--help-settings"])
+    for line in ("optimiser.network=0.001\n", "kriging, signal strengths:", "kriging, spectra:", "cone_deg=80.0"):
+        assert line in listed
+    assert "shadow_db=" in listed
+    assert "generic=False" in listed
 
 
 def test_train_prints_a_table_and_progress_elsewhere(folder: Path, tmp_path: Path, command: Command) -> None:
@@ -318,7 +322,7 @@ def test_demo_in_the_embedded_room(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     few = replace(
         room, tx_pos_m=room.tx_pos_m[rows], observation=room.observation[:, rows], official=(rows[6:], rows[:6])
     )
-    monkeypatch.setattr(synthetic, "laboratory_record", lambda *asked: few)
+    monkeypatch.setattr(synthetic, "laboratory_record", lambda progress: few)
     monkeypatch.setattr(demo, "find_data", lambda name: None)
     monkeypatch.setattr(config, "PRESETS", {"quick": tuple(SMALL)})
     command.done(["demo", "--out", tmp_path / "run"])

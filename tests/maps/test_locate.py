@@ -187,7 +187,8 @@ def observations(path: Path, record: Record) -> Path:
 def test_command_writes_positions_and_picture(fitted: tuple[Path, Record], tmp_path: Path, command: Command) -> None:
     run, record = fitted
     file, out = observations(tmp_path / "in.csv", record), tmp_path / "out.csv"
-    figures = command.json(["locate", run, "--input", file, "--out", out, "--posterior", tmp_path / "p.npz"])
+    located = ["locate", run, "--step", "0.5", "--out"]
+    figures = command.json([*located, out, "--input", file, "--posterior", tmp_path / "p.npz"])
     assert figures["n"] == 20
     assert figures["error_m"]["median"] < 1.0
     assert 0.5 < figures["held_out"]["inside"] <= 1
@@ -200,7 +201,7 @@ def test_command_writes_positions_and_picture(fitted: tuple[Path, Record], tmp_p
     assert stored["probability"].shape == (20, len(stored["y_m"]), len(stored["x_m"]))
     np.testing.assert_allclose(stored["probability"].sum(axis=(1, 2)), 1, atol=SINGLE)
     # The choice is kept, and the test rows of the run are the default.
-    before, again = (run / FILE).stat().st_mtime_ns, ["locate", run, "--out", tmp_path / "again.csv"]
+    before, again = (run / FILE).stat().st_mtime_ns, [*located, tmp_path / "again.csv"]
     assert command.json(again)["error_m"]["median"] == pytest.approx(figures["error_m"]["median"], abs=1e-6)
     assert (run / FILE).stat().st_mtime_ns == before
     assert "nearest neighbours (m)" in command.done(again)

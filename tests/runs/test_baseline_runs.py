@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -231,14 +230,6 @@ def test_bad_calls_are_refused(flat_folder: Path, tmp_path: Path, command: Comma
     ):
         command.refused(["train", data, "--out", tmp_path / "out", "--model", *options.split()], message)
         assert not (tmp_path / "out").exists(), options
-
-
-def test_refused_fit_writes_nothing(flat_folder: Path, tmp_path: Path) -> None:
-    record = load(flat_folder)
-    still = replace(record, tx_pos_m=np.ones_like(record.tx_pos_m))
-    with pytest.raises(InputError, match="rows at one distance"):
-        train(still, tmp_path / "run", "mri")
-    assert not (tmp_path / "run").exists()
 
 
 def test_damaged_runs_are_refused(

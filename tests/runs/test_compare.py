@@ -61,6 +61,7 @@ def write_log(path):
             file.write(json.dumps(entry | {"validation_score": 0.2 * step if step else None}) + "\n")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_table_contains_the_metrics_of_the_runs(tmp_path):
     good, bad = make_run(tmp_path / "good", seed=3), make_run(tmp_path / "bad", model="idw", noise=0.5, trained=False)
     page = compare([good, bad], tmp_path / "out")
@@ -146,6 +147,7 @@ def test_runs_without_common_rows_leave_plots_empty(tmp_path, monkeypatch):
         assert of_b is None
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_reference_is_drawn_once_for_equal_rows(tmp_path, monkeypatch):
     calls = captured(monkeypatch, "score_cdf")
     runs = [make_run(tmp_path / "a"), make_run(tmp_path / "b", noise=0.2), make_run(tmp_path / "c", rows=[3, 4])]
@@ -168,6 +170,7 @@ def test_several_receivers_are_pooled_and_named(tmp_path, monkeypatch):
     assert all(re.fullmatch(r"row \d, gateway[01]", name) for name, _ in pictures[-1][0])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_runs_of_equal_names_get_different_names(tmp_path):
     compare([make_run(tmp_path / "x" / "run"), make_run(tmp_path / "y" / "run")], tmp_path / "out")
     assert [row["run"] for row in rows_of(tmp_path / "out" / "compare.csv")][:2] == ["x/run", "y/run"]
@@ -247,6 +250,7 @@ def test_polar_picture_puts_a_lobe_at_its_azimuth_and_elevation(tmp_path):
     assert row == pytest.approx(middle * (1 - 30 / 90), abs=2)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_comparison_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     run, out = make_run(tmp_path / "run"), tmp_path / "out"
     compare([run], out)

@@ -156,6 +156,7 @@ def test_commands_parse_and_give_the_same_configuration(folder: Path, flat_folde
         assert again == config, line
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_settings_of_a_run_are_those_that_differ(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
     steps = [*SMALL, "loss.ssim_weight=0.25"]
     run = train(folder, tmp_path / "run", "wrf-gs+", settings=steps, seed=2).folder
@@ -191,6 +192,7 @@ class Tags(HTMLParser):
             assert self.open.pop() == tag
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_page_is_one_well_formed_file_of_several_data_sets(tmp_path: Path) -> None:
     runs = [make_run(tmp_path / "a<b>&"), make_run(tmp_path / "second", noise=0.4, model="idw")]
     other = make_run(tmp_path / "other")

@@ -155,9 +155,3 @@ def test_record_in_memory_and_progress(tmp_path: Path) -> None:
     run = train(wave_record(36, 10, receivers=1), tmp_path / "run", "kriging", **known)
     assert set(heard) == {"one: element signals of spectra", "one: signals", "one: weights", "kriging: receivers"}
     assert stored(run.folder)["std"].shape == (10, *SIZE)  # one receiver: no axis for it
-
-
-def test_settings_of_every_task_are_listed(command: Command) -> None:
-    out = command.done(["train", "--help-settings"])
-    for line in ("kriging, signal strengths:", "kriging, spectra:", "cone_deg=80.0", "shadow_db=", "generic=False"):
-        assert line in out

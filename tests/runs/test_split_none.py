@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import scored_again_as_before, strength_commands
+from calling import SMALL, scored_again_as_before, strength_commands
 from commands import Command
 from made_channels import channels
 
@@ -81,7 +81,7 @@ def test_it_is_the_default_of_data_without_a_split(table: Path, tmp_path: Path, 
         train(table, tmp_path / "official", "idw", split="official")
 
 
-GAUSSIANS = ("steps=10", "initial.gaussians=40", "patience=0")
+GAUSSIANS = (*SMALL, "patience=0")
 
 
 @pytest.mark.parametrize(
