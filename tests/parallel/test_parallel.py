@@ -91,6 +91,12 @@ def test_parts_of_a_lost_worker_are_computed_by_another(two: Scheduler, tmp_path
     lossy.assert_one_was_lost()
 
 
+def test_part_that_ends_four_workers_fails(two: Scheduler) -> None:
+    with pytest.raises(SchedulerFailed, match="computing: 4 workers in a row ended in one part"):
+        two.map(worker_tasks.die, [0])
+    assert two.map(worker_tasks.double, [1]) == [2]
+
+
 def test_errors_of_parts_are_raised_unchanged(two: Scheduler) -> None:
     with pytest.raises(InputError, match=r"^part -1: negative; give another$"):
         two.map(worker_tasks.refuse_negative, [1, 2, -1, 3])
@@ -334,9 +340,3 @@ def test_errors_of_parts_name_the_row_of_the_whole_input(
     assert status == 0
     assert re.fullmatch("tracing: 8 of 8, [12] workers?", err.splitlines()[-1])
     assert_same_bits(arrays_in(run / "predictions.npz"), arrays_in(tmp_path / "again" / "predictions.npz"))
-
-
-def test_part_that_ends_four_workers_fails(two: Scheduler) -> None:
-    with pytest.raises(SchedulerFailed, match="computing: 4 workers in a row ended in one part"):
-        two.map(worker_tasks.die, [0])
-    assert two.map(worker_tasks.double, [1]) == [2]
