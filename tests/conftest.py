@@ -19,6 +19,8 @@ from made_flat import write_flat, write_plain_flat
 from wrf_mi.backend import init
 
 if TYPE_CHECKING:
+    from commands import Command
+
     from wrf_mi.core import Record
     from wrf_mi.parallel import Scheduler
 
@@ -54,6 +56,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
         workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
         set_threads(max(2, CORES) if item.get_closest_marker("all_threads") else max(1, CORES // workers))
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    """The command within this process."""
+    from commands import Command
+
+    return Command(capsys)
 
 
 @pytest.fixture

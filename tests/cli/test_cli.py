@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import re
@@ -12,16 +11,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 import pytest
-from calling import SET, SMALL, call, refused
+from calling import SET, SMALL
+from commands import Command, rows_of
 from made_spectra import SIZE
 
+from wrf_mi import synthetic
 from wrf_mi.backend.device import Recorded
 from wrf_mi.cli import demo
 from wrf_mi.cli.main import build_parser, main
@@ -35,13 +36,8 @@ from wrf_mi.training.loop import Progress
 
 SECONDS_TO_START = 120
 """Importing, compiling and a first step take some 3 s; a busy machine needs much longer."""
-
-
-@pytest.fixture(scope="module")
-def run(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("runs") / "run"
-    assert main(["train", str(folder), "--model", "wrf-gs+", "--out", str(out), *SET]) == 0
-    return out
+COMMANDS = {"doctor", "check", "data", "mesh", "correct", "edit", "train", "trace", "sweep", "evaluate", "predict"}
+COMMANDS |= {"compare", "map", "locate", "view", "export", "import", "bench", "demo"}
 
 
 def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -53,30 +49,17 @@ def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Ite
                 yield from commands(sub, (*name, key))
 
 
-def test_commands_are_complete() -> None:
-    expected = {
-        "doctor",
-        "check",
-        "data",
-        "mesh",
-        "correct",
-        "edit",
-        "train",
-        "trace",
-        "sweep",
-        "evaluate",
-        "predict",
-        "compare",
-    }
-    expected |= {"map", "locate", "view", "export", "import", "bench", "demo"}
-    assert {name[0] for name in commands(build_parser()) if name} == expected
+def training(folder: Path, out: Path, *more: Any, model: str = "wrf-gs+") -> list[Any]:
+    return ["train", folder, "--model", model, "--out", out, *SET, *more]
 
 
-@pytest.mark.parametrize("name", list(commands(build_parser())), ids=" ".join)
-def test_every_command_has_help(name: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, err = call([*name, "--help"], capsys)
-    assert (status, err) == (0, "")
-    assert out.startswith(f"usage: {' '.join(('wrf-mi', *name))} ")
+def test_every_command_has_help(command: Command) -> None:
+    names = list(commands(build_parser()))
+    assert {name[0] for name in names if name} == COMMANDS
+    for name in names:
+        status, out, err = command([*name, "--help"])
+        assert (status, err) == (0, ""), name
+        assert out.startswith(f"usage: {' '.join(('wrf-mi', *name))} ")
 
 
 def test_help_and_bad_arguments_import_no_tracer() -> None:
@@ -95,20 +78,18 @@ print({"drjit", "mitsuba", "sionna"} & set(sys.modules))
     assert done.stdout.splitlines()[-1] == "set()"
 
 
-def test_version_and_settings(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = call(["--version"], capsys)
-    assert status == 0
-    assert re.fullmatch(r"\d+\.\d+\.\d+\n", out)
-    status, out, _ = call(["train", "--help-settings"], capsys)
-    assert status == 0
-    assert "optimiser.network=0.001\n" in out
+def test_version_and_settings(command: Command) -> None:
+    assert re.fullmatch(r"\d+\.\d+\.\d+\n", command.done(["--version"]))
+    listed = command.done(["train", "--help-settings"])
+    for line in ("optimiser.network=0.001\n", "kriging, signal strengths:", "kriging, spectra:", "cone_deg=80.0"):
+        assert line in listed
+    assert "shadow_db=" in listed
+    assert "generic=False" in listed
 
 
-def test_train_prints_a_table_and_progress_elsewhere(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_train_prints_a_table_and_progress_elsewhere(folder: Path, tmp_path: Path, command: Command) -> None:
     out_folder = tmp_path / "run"
-    status, out, err = call(["train", folder, "--out", out_folder, "--model", "wrf-gs", "--seed", 3, *SET], capsys)
+    status, out, err = command(training(folder, out_folder, "--seed", 3, model="wrf-gs"))
     assert status == 0
     head, own, blend, facts, worse, where = out.splitlines()
     assert head.split() == ["SSIM", "on", "5", "test", "rows", "median", "mean", "p10", "p90"]
@@ -125,23 +106,18 @@ def test_train_prints_a_table_and_progress_elsewhere(
     )
 
 
-def test_train_as_json(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    own = ["--split", "random", "--n-train", "0.5", "--deterministic", "--json"]
-    status, out, _ = call(["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "run", *own, *SET], capsys)
-    assert status == 0
-    printed = json.loads(out)
+def test_train_as_json(folder: Path, tmp_path: Path, command: Command) -> None:
+    more = ["--split", "random", "--n-train", "0.5", "--deterministic"]
+    printed = command.json(training(folder, tmp_path / "run", *more))
     assert printed == json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (printed["split"], printed["n_train"], printed["n_test"]) == ("random", 10, 5)
     assert "deterministic: true" in (tmp_path / "run" / "config.yaml").read_text()
 
 
-def test_train_with_one_row_logs_no_validation_score(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_training_with_one_row_logs_null_for_the_validation_score(
+    folder: Path, tmp_path: Path, command: Command
 ) -> None:
-    """Without validation rows the logged score is null, not NaN."""
-    status, _, err = call(
-        ["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "run", "--n-train", 1, *SET], capsys
-    )
+    status, _, err = command(training(folder, tmp_path / "run", "--n-train", 1))
     assert status == 0
     assert "4/4" in err
     assert "nan" not in err
@@ -149,45 +125,35 @@ def test_train_with_one_row_logs_no_validation_score(
         assert json.loads(line, parse_constant=pytest.fail)["validation_score"] is None
 
 
-def test_settings_override_the_preset(folder: Path, tmp_path: Path) -> None:
-    """``--set`` takes precedence over ``--preset``."""
-    chosen = ["--preset", "paper", *SET, "--set", "encoding.tx_octaves=3"]
-    assert main(["train", str(folder), "--model", "wrf-gs+", "--out", str(tmp_path / "run"), *chosen]) == 0
+def test_settings_override_the_preset(folder: Path, tmp_path: Path, command: Command) -> None:
+    command.done(training(folder, tmp_path / "run", "--preset", "paper", "--set", "encoding.tx_octaves=3"))
     text = (tmp_path / "run" / "config.yaml").read_text()
     assert "position_octaves: 10" in text
     assert "tx_octaves: 3" in text
 
 
-def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, table, _ = call(["evaluate", run], capsys)
-    assert status == 0
-    assert table.splitlines()[-1] == f"results: {run}"
-    status, out, err = call(["evaluate", run, "--json"], capsys)
+def test_evaluate(run: Path, command: Command) -> None:
+    assert command.done(["evaluate", run]).splitlines()[-1] == f"results: {run}"
+    status, out, err = command(["evaluate", run, "--json"])
     assert (status, err) == (0, "")
-    assert json.loads(out) == json.loads((run / "metrics.json").read_text())
-
-
-def test_evaluate_on_other_rows(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = (run / "metrics.json").read_bytes()
-    status, out, _ = call(["evaluate", run, "--split", "blocked", "--json"], capsys)
-    assert status == 0
-    assert json.loads(out)["n_test"] == 5  # every row is in a block; five of them were not trained on
+    assert json.loads(out) == json.loads(before)
+    # Every row is in a block; five of them were not trained on.
+    assert command.json(["evaluate", run, "--split", "blocked"])["n_test"] == 5
     assert (run / "metrics.json").read_bytes() == before
 
 
-def test_predict(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_predict(run: Path, tmp_path: Path, command: Command) -> None:
     positions = np.array([[0.1, -0.2, 0.3], [0.5, 0.5, -0.5], [0.0, 0.0, 0.0]])
     rows = "\n".join(f"{z},{x},tag,{y}" for x, y, z in positions)
     (tmp_path / "tx.csv").write_text(f"Z, X,name,Y\n{rows}\n\n")
     np.savez(tmp_path / "tx.npz", tx_pos=positions)
-    status, out, err = call(["predict", run, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "a.npz"], capsys)
-    assert (status, out, err) == (0, f"3 predictions: {tmp_path / 'a.npz'}\n", "")
-    arguments = ["predict", run, "--input", tmp_path / "tx.npz", "--out", tmp_path / "new" / "b.npz", "--json"]
-    status, out, _ = call(arguments, capsys)
-    assert status == 0
-    printed = json.loads(out)
-    with np.load(tmp_path / "a.npz") as a, np.load(tmp_path / "new" / "b.npz") as b:
-        assert printed == {"out": str(tmp_path / "new" / "b.npz"), "arrays": {k: list(b[k].shape) for k in b.files}}
+    first, second = tmp_path / "a.npz", tmp_path / "new" / "b.npz"
+    ended = command(["predict", run, "--tx", tmp_path / "tx.csv", "--out", first])
+    assert ended == (0, f"3 predictions: {first}\n", "")
+    printed = command.json(["predict", run, "--input", tmp_path / "tx.npz", "--out", second])
+    with np.load(first) as a, np.load(second) as b:
+        assert printed == {"out": str(second), "arrays": {k: list(b[k].shape) for k in b.files}}
         for key in a.files:
             np.testing.assert_array_equal(a[key], b[key])
         np.testing.assert_array_equal(a["row"], [0, 1, 2])
@@ -197,52 +163,47 @@ def test_predict(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         np.testing.assert_allclose(a["prediction"], open_run(run).predictor()(positions), atol=1e-6)
 
 
-def test_compare(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = call(["compare", run, "--out", tmp_path / "page"], capsys)
-    assert (status, out) == (0, f"comparison: {tmp_path / 'page' / 'index.html'}\n")
-    assert (tmp_path / "page" / "compare.csv").is_file()
+def test_compare(run: Path, tmp_path: Path, command: Command) -> None:
+    page = tmp_path / "page"
+    assert command.done(["compare", run, "--out", page]) == f"comparison: {page / 'index.html'}\n"
+    assert (page / "compare.csv").is_file()
 
 
-def test_data_list(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_data_list(folder: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
     monkeypatch.setenv("WRF_MI_DATA", str(folder.parent))
-    status, out, _ = call(["data", "list", "--json"], capsys)
-    assert status == 0
-    assert {"rfid-lab", "laboratory"} <= {entry["name"] for entry in json.loads(out)}
-    status, table, _ = call(["data", "list"], capsys)
-    assert status == 0
-    assert "rfid-lab" in table
+    assert {"rfid-lab", "laboratory"} <= {entry["name"] for entry in command.json(["data", "list"])}
+    assert "rfid-lab" in command.done(["data", "list"])
 
 
-def test_non_finite_fit_ends_with_status_1(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_non_finite_fit_ends_with_status_1(folder: Path, tmp_path: Path, command: Command) -> None:
     """The error is one line, without traceback."""
-    own = [*SET, "--set", "optimiser.signal=1e38", "--set", "steps=20"]
-    status, out, err = call(["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "run", *own], capsys)
+    status, out, err = command(
+        training(folder, tmp_path / "run", "--set", "optimiser.signal=1e38", "--set", "steps=20")
+    )
     assert (status, out) == (1, "")
     assert re.fullmatch(r"wrf-mi: .*not finite.*\n", err.splitlines(keepends=True)[-1])
     assert "Traceback" not in err
 
 
 def test_stopped_run_ends_with_status_130(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
-    monkeypatch.setattr(Watch, "stop", lambda self: True)
-    status, out, err = call(["train", folder, "--model", "wrf-gs+", "--out", tmp_path / "run", *SET], capsys)
-    assert (status, out) == (130, "")
-    assert err == f"wrf-mi: stopped after step 1 of 4; go on with: wrf-mi train --resume {tmp_path / 'run'}\n"
-    refused(["evaluate", tmp_path / "run"], "model.npz: missing, the fit was stopped; finish it with train", capsys)
-    refused(["compare", tmp_path / "run", "--out", tmp_path / "out"], "finish it with train --resume", capsys)
-    monkeypatch.undo()
-    status, out, _ = call(["train", "--resume", tmp_path / "run", "--json"], capsys)
-    assert status == 0
-    assert json.loads(out)["steps"] == 4
+    run = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        patched.setattr(Watch, "stop", lambda self: True)
+        ended = command(training(folder, run))
+    assert ended == (130, "", f"wrf-mi: stopped after step 1 of 4; go on with: wrf-mi train --resume {run}\n")
+    command.refused(["evaluate", run], "model.npz: missing, the fit was stopped; finish it with train")
+    command.refused(["compare", run, "--out", tmp_path / "out"], "finish it with train --resume")
+    assert command.json(["train", "--resume", run])["steps"] == 4
 
 
 def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path) -> None:
     """A training process receives SIGINT."""
     out = tmp_path / "run"
-    own = [*SET, "--set", "steps=400", "--set", "log_every=1", "--set", "validate_every=400"]
+    words = training(folder, out, "--set", "steps=200", "--set", "log_every=1", "--set", "validate_every=200")
     process = subprocess.Popen(
-        [sys.executable, "-m", "wrf_mi.cli", "train", str(folder), "--model", "wrf-gs+", "--out", str(out), *own],
+        [sys.executable, "-m", "wrf_mi.cli", *map(str, words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -258,11 +219,11 @@ def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path)
     assert stdout == ""
     assert stderr.splitlines()[0] == "stopping after this step; Ctrl-C again ends at once"
     step = int(read_checkpoint(out)["step"])
-    assert 0 < step < 400
-    assert stderr.splitlines()[-1].startswith(f"wrf-mi: stopped after step {step} of 400; go on with:")
+    assert 0 < step < 200
+    assert stderr.splitlines()[-1].startswith(f"wrf-mi: stopped after step {step} of 200; go on with:")
     assert main(["train", "--resume", str(out)]) == 0
     lines = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
-    assert lines == list(range(1, 401))
+    assert lines == list(range(1, 201))
     assert (out / "metrics.json").exists()
 
 
@@ -290,26 +251,31 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.Capt
         watch.on_progress("fold1", 0.5, progress(step=20, validation_score=0.75, held_out=False))
         watch.on_progress("fold2", 0.5, progress(step=20, validation_score=float("nan")))
         watch.on_progress("vae", 0.5, progress(step=20, validation_score=0.5, gaussians=0))
-    lines = capsys.readouterr().err.splitlines()
-    assert lines == [
+        for stage, share in (("a", 0.0), ("a", 0.5), ("b", 0.1), ("b", 1.0)):  # of fits without steps: named once
+            watch.on_progress(stage, share)
+    assert capsys.readouterr().err.splitlines() == [
         "training 20/40  loss 0.2500  SSIM 0.500 (validation rows)  8 Gaussians  1:01 left",
         "fold1 20/40  loss 0.2500  SSIM 0.750 (validation rows, now trained on)  8 Gaussians  1:01 left",
         "fold2 20/40  loss 0.2500    8 Gaussians  1:01 left",
         "vae 20/40  loss 0.2500  SSIM 0.500 (validation rows)  1:01 left",
+        "a",
+        "b",
     ]
 
 
 def test_watch_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setenv("TTY_COMPATIBLE", "1")
-    monkeypatch.setenv("FORCE_COLOR", "1")
-    monkeypatch.setenv("COLUMNS", "150")
+    for name, value in (("TTY_COMPATIBLE", "1"), ("FORCE_COLOR", "1"), ("COLUMNS", "150")):
+        monkeypatch.setenv(name, value)
     with Watch() as watch:
         for fold in ("fold0", "fold1"):
             for step in (20, 40):
                 watch.on_progress(fold, step / 40, progress(step=step, validation_score=0.5))
+    with Watch() as watch:
+        watch.on_progress("first stage", 0.5)
+        watch.on_progress("second stage", 1.0)
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
-    assert "fold0" in shown
-    assert "fold1" in shown
+    for text in ("fold0", "fold1", "first stage", "second stage"):
+        assert text in shown
     assert "SSIM 0.500 (validation rows)  8 Gaussians  1:01 left" in shown
 
 
@@ -332,14 +298,14 @@ def test_demo_finds_or_fetches_real_data(
 
 
 def test_demo_on_real_data(
-    folder: Path, flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
     """A field on spectra and a traced flat, with synthetic data in the layouts of the real data sets."""
     monkeypatch.setattr(demo, "REAL", str(folder))
     monkeypatch.setattr(demo, "FLAT", str(flat_folder))
     monkeypatch.setattr(demo, "find_data", Path)
     monkeypatch.setattr(config, "PRESETS", {"quick": tuple(SMALL)})
-    status, out, err = call(["demo", "--out", tmp_path / "run", "--json"], capsys)
+    status, out, err = command(["demo", "--out", tmp_path / "run", "--json"])
     assert status == 0, err
     assert json.loads(out) == json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert f"pictures: {tmp_path / 'run' / 'compare' / 'index.html'}" in err
@@ -349,44 +315,39 @@ def test_demo_on_real_data(
     assert json.loads((tmp_path / "run" / "traced" / "metrics.json").read_text())["task"] == "rssi"
 
 
-def test_demo_in_the_embedded_room(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_demo_in_the_embedded_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
     """Without real data the field and the ray tracer are scored on the same rows of the embedded room."""
+    room = synthetic.load_record("laboratory")
+    rows = np.arange(30)
+    few = replace(
+        room, tx_pos_m=room.tx_pos_m[rows], observation=room.observation[:, rows], official=(rows[6:], rows[:6])
+    )
+    monkeypatch.setattr(synthetic, "laboratory_record", lambda progress: few)
     monkeypatch.setattr(demo, "find_data", lambda name: None)
     monkeypatch.setattr(config, "PRESETS", {"quick": tuple(SMALL)})
-    status, _, err = call(["demo", "--out", tmp_path / "run"], capsys)
-    assert status == 0, err
-    with (tmp_path / "run" / "compare" / "compare.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["model"] for row in rows] == ["wrf-gs+", "ray-tracing", "idw4"]
-    assert {row["dataset"] for row in rows} == {"laboratory"}
+    command.done(["demo", "--out", tmp_path / "run"])
+    table = rows_of(tmp_path / "run" / "compare" / "compare.csv")
+    assert [row["model"] for row in table] == ["wrf-gs+", "ray-tracing", "idw4"]
+    assert {row["dataset"] for row in table} == {"laboratory"}
     assert (tmp_path / "run" / "scene" / "preview.png").is_file()
 
 
-def test_unexpected_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*arguments: Any) -> None:
-        raise RuntimeError("a bug")
+def raising(error: type[BaseException]) -> Any:
+    def evaluate(*arguments: Any) -> None:
+        raise error("a bug")
 
-    monkeypatch.setattr(runs, "evaluate_run", broken)
+    return evaluate
+
+
+def test_unexpected_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runs, "evaluate_run", raising(RuntimeError))
     with pytest.raises(RuntimeError, match="a bug"):
         main(["evaluate", "run"])
 
 
-def test_ctrl_c_before_training_starts(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted(*arguments: Any) -> SimpleNamespace:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(runs, "evaluate_run", interrupted)
-    assert call(["evaluate", "run"], capsys) == (130, "", "wrf-mi: interrupted\n")
-
-
-def test_ctrl_c_while_a_kernel_is_recorded(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def pressed(x: Any) -> None:
-        raise KeyboardInterrupt
-
-    def interrupted(*arguments: Any) -> None:
-        Recorded(pressed)(dr.llvm.Float(1, 2))
-
-    monkeypatch.setattr(runs, "evaluate_run", interrupted)
-    assert call(["evaluate", "run"], capsys) == (130, "", "wrf-mi: interrupted\n")
+@pytest.mark.parametrize("recording", [False, True], ids=["before training", "while a kernel is recorded"])
+def test_ctrl_c_ends_with_status_130(recording: bool, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    pressed = raising(KeyboardInterrupt)
+    evaluate = (lambda *arguments: Recorded(pressed)(dr.llvm.Float(1, 2))) if recording else pressed
+    monkeypatch.setattr(runs, "evaluate_run", evaluate)
+    assert command(["evaluate", "run"]) == (130, "", "wrf-mi: interrupted\n")

@@ -25,8 +25,7 @@ class System:
     """A system whose only commands are stand-ins that write down how they were called."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.bin = folder / "bin"
-        self.log = folder / "calls"
+        self.bin, self.log, self.monkeypatch = folder / "bin", folder / "calls", monkeypatch
         self.bin.mkdir()
         self.log.touch()
         monkeypatch.setenv("PATH", str(self.bin))
@@ -36,8 +35,27 @@ class System:
         file.write_text(f'#!/bin/sh\necho "{name} $*" >>"{self.log}"\n{body}\n')
         file.chmod(0o755)
 
-    def calls(self) -> list[str]:
-        return self.log.read_text().splitlines()
+    def calls(self, start: str = "") -> list[str]:
+        return [line for line in self.log.read_text().splitlines() if line.startswith(start)]
+
+    def works_after(self, call: str) -> None:
+        """No backend works until ``call`` was made."""
+
+        def choose(name: str = "auto", *, fresh: bool = False) -> None:
+            if not self.calls(call):
+                raise BackendError("no usable LLVM (none was found): install one")
+
+        self.monkeypatch.setattr(doctor, "choose", choose)
+
+
+PACKAGES = """/bin/cat <<'END'
+libllvm14 - runtime library
+libllvm19 - runtime library
+libllvm22t64 - runtime library
+libllvmlibc-19-dev - LLVM C Library
+libllvm-19-ocaml-dev - bindings
+END"""
+INSTALL = "apt-get install -y --no-install-recommends"
 
 
 @pytest.fixture
@@ -47,25 +65,12 @@ def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> System:
     return System(tmp_path, monkeypatch)
 
 
-def works_after(monkeypatch: pytest.MonkeyPatch, system: System, call: str) -> None:
-    """No backend works until ``call`` was made."""
-
-    def choose(name: str = "auto", *, fresh: bool = False) -> None:
-        if not any(line.startswith(call) for line in system.calls()):
-            raise BackendError("no usable LLVM (none was found): install one")
-
-    monkeypatch.setattr(doctor, "choose", choose)
-
-
-PACKAGES = """cat <<'END'
-libllvm14 - runtime library
-libllvm19 - runtime library
-libllvm22t64 - runtime library
-libllvmlibc-19-dev - LLVM C Library
-libllvm-19-ocaml-dev - bindings
-END"""
-
-INSTALL = "apt-get install -y --no-install-recommends"
+@pytest.fixture
+def apt(system: System) -> System:
+    """A system with apt and its lists of packages."""
+    system.command("apt-get")
+    system.command("apt-cache", PACKAGES)
+    return system
 
 
 def test_report_of_this_machine() -> None:
@@ -84,16 +89,17 @@ def test_report_of_this_machine() -> None:
     assert all(library["path"] in text for library in found["llvm"])
 
 
-def test_report_without_any_llvm(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_report_without_any_llvm(apt: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(libraries, "_library_folders", lambda: [])
     monkeypatch.setattr(libraries, "_linker_cache", lambda start: [])
-    monkeypatch.setattr(backend, "find_cuda", lambda: None)
-    monkeypatch.setattr(doctor, "find_cuda", lambda: None)
+    for part in (backend, doctor):
+        monkeypatch.setattr(part, "find_cuda", lambda: None)
     found = doctor.report()
     assert not found["ok"]
     assert found["backend"] is None
-    assert {"problem": "no usable LLVM (none was found)", "remedy": libraries.install_line()} in found["problems"]
-    assert f"remedy: {libraries.install_line()}" in doctor.render(found)
+    remedy = libraries.install_line()
+    assert {"problem": "no usable LLVM (none was found)", "remedy": remedy} in found["problems"]
+    assert f"remedy: {remedy}" in doctor.render(found)
 
 
 def test_report_names_data_that_can_be_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,21 +116,18 @@ def test_report_names_data_that_can_be_fetched(tmp_path: Path, monkeypatch: pyte
     assert "wrf-mi data fetch rfid-lab" not in [entry["remedy"] for entry in found["problems"]]
 
 
-def test_nothing_is_installed_where_a_backend_works(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_installed_where_a_backend_works(system: System) -> None:
     system.command("apt-get")
-    works_after(monkeypatch, system, "")
+    system.works_after("")
     system.log.write_text("\n")
     doctor.install_llvm()
     assert system.calls() == [""]
 
 
-def test_apt_installs_the_newest_working_llvm(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
-    system.command("apt-get")
-    system.command("apt-cache", PACKAGES.replace("cat", "/bin/cat"))
-    works_after(monkeypatch, system, f"{INSTALL} libllvm19")
+def test_apt_installs_the_newest_working_llvm(apt: System) -> None:
+    apt.works_after(f"{INSTALL} libllvm19")
     doctor.install_llvm()
-    changes = [call for call in system.calls() if call.startswith("apt-get")]
-    assert changes == [f"{INSTALL} libllvm22t64 libatomic1", f"{INSTALL} libllvm19 libatomic1"]
+    assert apt.calls("apt-get") == [f"{INSTALL} libllvm22t64 libatomic1", f"{INSTALL} libllvm19 libatomic1"]
 
 
 def test_line_for_a_system_without_package_lists(system: System) -> None:
@@ -133,52 +136,48 @@ def test_line_for_a_system_without_package_lists(system: System) -> None:
     assert libraries.install_line() == f"apt-get update && {INSTALL} libllvm19 libatomic1"
 
 
-def test_apt_fetches_missing_lists(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_apt_fetches_missing_lists(system: System) -> None:
     lists = system.bin / "lists"
     system.command("apt-get", f'[ "$1" = update ] && : >"{lists}"; [ -e "{lists}" ]')
-    system.command("apt-cache", f'[ -e "{lists}" ] && {PACKAGES.replace("cat", "/bin/cat")}')
-    works_after(monkeypatch, system, f"{INSTALL} libllvm22t64")
+    system.command("apt-cache", f'[ -e "{lists}" ] && {PACKAGES}')
+    system.works_after(f"{INSTALL} libllvm22t64")
     doctor.install_llvm()
     assert "apt-get update" in system.calls()
 
 
-def test_an_install_that_does_not_help_is_an_error(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_install_that_does_not_help_is_an_error(system: System) -> None:
     system.command("dnf")
-    works_after(monkeypatch, system, "never")
+    system.works_after("never")
     with pytest.raises(BackendError, match=r"did not help: no usable LLVM \(none was found\)"):
         doctor.install_llvm()
     assert "dnf install -y llvm-libs libatomic" in system.calls()
 
 
-def test_without_rights_the_error_is_the_line_to_run(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rights_the_error_is_the_line_to_run(apt: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    system.command("apt-get")
-    system.command("apt-cache", PACKAGES.replace("cat", "/bin/cat"))
-    works_after(monkeypatch, system, "never")
+    apt.works_after("never")
     assert libraries.install_line() == f"sudo {INSTALL} libllvm22t64 libatomic1"
     with pytest.raises(BackendError, match="no usable LLVM"):
         doctor.install_llvm()
-    system.command("sudo", "exit 1")  # asks for a password
+    apt.command("sudo", "exit 1")  # asks for a password
     with pytest.raises(BackendError, match="no usable LLVM"):
         doctor.install_llvm()
-    assert not [call for call in system.calls() if call.startswith("apt-get")]
+    assert not apt.calls("apt-get")
 
 
-def test_passwordless_sudo_is_used(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_passwordless_sudo_is_used(apt: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    system.command("sudo", 'shift; [ "$1" = true ] || "$@"')
-    system.command("apt-get")
-    system.command("apt-cache", PACKAGES.replace("cat", "/bin/cat"))
-    works_after(monkeypatch, system, f"{INSTALL} libllvm22t64")
+    apt.command("sudo", 'shift; [ "$1" = true ] || "$@"')
+    apt.works_after(f"{INSTALL} libllvm22t64")
     doctor.install_llvm()
-    assert f"sudo -n {INSTALL} libllvm22t64 libatomic1" in system.calls()
+    assert f"sudo -n {INSTALL} libllvm22t64 libatomic1" in apt.calls()
 
 
 def test_brew_needs_no_root(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "darwin")
     monkeypatch.setattr(os, "geteuid", lambda: 501)
     system.command("brew")
-    works_after(monkeypatch, system, "brew install llvm")
+    system.works_after("brew install llvm")
     doctor.install_llvm()
     assert system.calls() == ["brew install llvm"]
 
@@ -190,7 +189,7 @@ def test_unknown_system_gets_advice(system: System) -> None:
 
 def test_a_named_library_is_not_replaced(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
     system.command("apt-get")
-    works_after(monkeypatch, system, "never")
+    system.works_after("never")
     monkeypatch.setenv(libraries.LLVM_VARIABLE, "/nowhere/libLLVM.so")
     with pytest.raises(BackendError, match="no usable LLVM"):
         doctor.install_llvm()

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from calling import call, refused
+from commands import Command, positions_file
 
 from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.runs.api import plan_run, train
@@ -52,9 +52,9 @@ def test_settings_of_kinds_of_path_that_are_not_traced_have_no_effect(settings: 
     ],
 )
 def test_options_of_trace_without_effect_are_refused(
-    arguments: list[str], message: str, flat_folder: Path, room: Path, tmp_path: Path, capsys: Any
+    arguments: list[str], message: str, flat_folder: Path, room: Path, tmp_path: Path, command: Command
 ) -> None:
-    refused(["trace", room, flat_folder, *arguments, "--out", tmp_path / "run"], message, capsys)
+    command.refused(["trace", room, flat_folder, *arguments, "--out", tmp_path / "run"], message)
     assert not (tmp_path / "run").exists()
 
 
@@ -68,10 +68,7 @@ def test_options_of_trace_without_effect_are_refused(
         (
             {"settings": TracingSettings(target_error_db=1.0, depth=5, rays=64)},
             0,
-            [
-                "depth=5 has no effect: target_error_db chooses it",
-                "rays=64 has no effect: target_error_db chooses it",
-            ],
+            [f"{setting} has no effect: target_error_db chooses it" for setting in ("depth=5", "rays=64")],
         ),
         ({"settings": TracingSettings(depth=5)}, 0, []),
     ],
@@ -93,31 +90,26 @@ def test_settings_of_paths_without_a_scene_are_named(flat_folder: Path, caplog: 
 
 
 def test_other_commands_refuse_or_name_options_without_effect(
-    flat_folder: Path, room: Path, tmp_path: Path, capsys: Any, caplog: Any
+    flat_folder: Path, room: Path, tmp_path: Path, command: Command, caplog: Any
 ) -> None:
     run = train(flat_folder, tmp_path / "run", "kriging", settings=("generic=true",)).folder
-    positions = tmp_path / "positions.csv"
-    positions.write_text("x,y,z\n1,1,1\n")
+    positions = positions_file(tmp_path / "positions.csv", [[1, 1, 1]])
     predict = ["predict", run, "--tx", positions, "--out", tmp_path / "new.csv"]
-    refused([*predict, "--no-operator"], "--no-operator belongs to learned fields of spectra, not to kriging", capsys)
-    refused(["evaluate", run, "--no-operator"], "--no-operator belongs to learned fields", capsys)
+    command.refused([*predict, "--no-operator"], "--no-operator belongs to learned fields of spectra, not to kriging")
+    command.refused(["evaluate", run, "--no-operator"], "--no-operator belongs to learned fields")
     correct = ["correct", room, flat_folder, "--out", tmp_path / "corrected", "--shift-sd", "0.1"]
-    refused(correct, "--shift-sd: of planes and frame, which --fit materials,gain leaves", capsys)
-    refused(["edit", room, "--replace"], "--out", capsys)
+    command.refused(correct, "--shift-sd: of planes and frame, which --fit materials,gain leaves")
+    command.refused(["edit", room, "--replace"], "--out")
     view = ["view", run, "--material", "concrete", "--out", tmp_path / "view.html"]
-    refused(view, "material concrete: of a bare mesh, and no source is one", capsys)
+    command.refused(view, "material concrete: of a bare mesh, and no source is one")
     paths = ["export", room, "--format", "paths", "--tx", "1,1,1", "--rx", "2,1,1", "--frequency", "1e9"]
     paths += ["--out", tmp_path / "paths.csv"]
-    for more, option in (
-        (["line-of-sight", "--depth", "2"], "--depth"),
-        (["line-of-sight,scattering", "--depth", "0"], "--paths scattering"),
-    ):
+    for more, option in (("", "--depth"), (",scattering", "--paths scattering")):
         caplog.clear()
-        assert call([*paths, "--paths", *more], capsys)[0] == 0
+        depth = ["--depth", 0 if more else 2]
+        command.done([*paths, "--paths", f"line-of-sight{more}", *depth])
         assert f"{option} has no effect: " in caplog.text
-    status, _, err = call(
-        ["map", run, "--step", "2", "--threshold", "-60", "--json", "--out", tmp_path / "m.nc"], capsys
-    )
+    status, _, err = command(["map", run, "--step", "2", "--threshold", "-60", "--json", "--out", tmp_path / "m.nc"])
     assert status == 0
     assert "no coverage: the model states no standard deviation" in err
     assert not (tmp_path / "corrected").exists()

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import call, refused
+from commands import Command, arrays_in, rows_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
@@ -141,13 +140,8 @@ def test_probability_of_silence_is_one_half_in_the_middle() -> None:
     assert np.exp(silence.log_probability(np.array(-80.0), True)) == pytest.approx(0.5)
     total = sum(np.exp(silence.log_probability(np.array([-90.0, -70]), received)) for received in (True, False))
     np.testing.assert_allclose(total, 1, atol=ROUNDING)
-    assert (
-        fit_silence(
-            record_of(np.ones((2, 3)), np.full((3, 2), -50.0), 1),
-            [Located(law(room(), 3.0), np.arange(3), np.arange(2), np.arange(2))],
-        )
-        is None
-    )
+    parts = [Located(law(room(), 3.0), np.arange(3), np.arange(2), np.arange(2))]
+    assert fit_silence(record_of(np.ones((2, 3)), np.full((3, 2), -50.0), 1), parts) is None
 
 
 @given(st.lists(st.floats(0.01, 1), min_size=1, max_size=30), st.floats(0.05, 0.95))
@@ -184,44 +178,33 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
     return train(data, folder / "run", "kriging").folder, record
 
 
-def observations(
-    path: Path, record: Record, names: tuple[str, ...] = ("anchor0_dbm", "rssi_1", "rssi_anchor2")
-) -> Path:
-    rows = zip(*record.observation[:, 40:], record.tx_pos_m[40:, 0], record.tx_pos_m[40:, 1], strict=True)
-    lines = [",".join(f"{value:.6f}" for value in row) for row in rows]
-    path.write_text("\n".join([",".join([*names, "x", "y"]), *lines]) + "\n")
+def observations(path: Path, record: Record) -> Path:
+    rows = np.column_stack([record.observation[:, 40:].T, record.tx_pos_m[40:, :2]])
+    np.savetxt(path, rows, "%.6f", ",", header="anchor0_dbm,rssi_1,rssi_anchor2,x,y", comments="")
     return path
 
 
-def test_command_writes_positions_and_picture(
-    fitted: tuple[Path, Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_positions_and_picture(fitted: tuple[Path, Record], tmp_path: Path, command: Command) -> None:
     run, record = fitted
     file, out = observations(tmp_path / "in.csv", record), tmp_path / "out.csv"
-    given = ["locate", run, "--input", file, "--out", out, "--posterior", tmp_path / "p.npz", "--json"]
-    status, printed, error = call(given, capsys)
-    assert status == 0, error
-    figures = json.loads(printed)
+    located = ["locate", run, "--step", "0.5", "--out"]
+    figures = command.json([*located, out, "--input", file, "--posterior", tmp_path / "p.npz"])
     assert figures["n"] == 20
     assert figures["error_m"]["median"] < 1.0
     assert 0.5 < figures["held_out"]["inside"] <= 1
-    header, *lines = out.read_text().splitlines()
-    assert len(lines) == 20
-    row = dict(zip(header.split(","), map(float, lines[0].split(",")), strict=True))
+    rows = rows_of(out)
+    assert len(rows) == 20
+    row = {name: float(value) for name, value in rows[0].items()}
     assert np.hypot(row["x"] - row["true_x"], row["y"] - row["true_y"]) == pytest.approx(row["error_m"], abs=2e-4)
     assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
-    with np.load(tmp_path / "p.npz") as stored:
-        shape = (20, len(stored["y_m"]), len(stored["x_m"]))
-        assert stored["probability"].shape == shape
-        np.testing.assert_allclose(stored["probability"].sum(axis=(1, 2)), 1, atol=SINGLE)
+    stored = arrays_in(tmp_path / "p.npz")
+    assert stored["probability"].shape == (20, len(stored["y_m"]), len(stored["x_m"]))
+    np.testing.assert_allclose(stored["probability"].sum(axis=(1, 2)), 1, atol=SINGLE)
     # The choice is kept, and the test rows of the run are the default.
-    before = (run / FILE).stat().st_mtime_ns
-    status, printed, error = call(["locate", run, "--out", tmp_path / "again.csv", "--json"], capsys)
-    assert status == 0, error
+    before, again = (run / FILE).stat().st_mtime_ns, [*located, tmp_path / "again.csv"]
+    assert command.json(again)["error_m"]["median"] == pytest.approx(figures["error_m"]["median"], abs=1e-6)
     assert (run / FILE).stat().st_mtime_ns == before
-    assert json.loads(printed)["error_m"]["median"] == pytest.approx(figures["error_m"]["median"], abs=1e-6)
-    _, printed, _ = call(["locate", run, "--out", tmp_path / "again.csv"], capsys)
-    assert "nearest neighbours (m)" in printed
+    assert "nearest neighbours (m)" in command.done(again)
 
 
 def test_offset_of_the_power_widens_regions(fitted: tuple[Path, Record]) -> None:
@@ -246,12 +229,12 @@ def test_offset_of_the_power_widens_regions(fitted: tuple[Path, Record]) -> None
     ],
 )
 def test_bad_observations_are_refused_in_one_line(
-    fitted: tuple[Path, Record], tmp_path: Path, text: str, words: str, capsys: pytest.CaptureFixture[str]
+    fitted: tuple[Path, Record], tmp_path: Path, text: str, words: str, command: Command
 ) -> None:
     file = tmp_path / "in.csv"
     file.write_text(text)
     message = f"{re.escape(str(file))}.*{re.escape(words)}"
-    refused(["locate", fitted[0], "--input", file, "--out", tmp_path / "out.csv"], message, capsys)
+    command.refused(["locate", fitted[0], "--input", file, "--out", tmp_path / "out.csv"], message)
     assert not (tmp_path / "out.csv").exists()
 
 
@@ -263,29 +246,21 @@ def test_empty_fields_are_receivers_without_a_value(fitted: tuple[Path, Record],
     assert true_m is None
 
 
-def test_bad_arguments_are_refused(
-    fitted: tuple[Path, Record], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_arguments_are_refused(fitted: tuple[Path, Record], tmp_path: Path, command: Command) -> None:
     run, record = fitted
     value = record.observation[:, :2]
-    with pytest.raises(InputError, match=r"give strengths \[3, m\]"):
-        locate(run, value[:2])
-    with pytest.raises(InputError, match="no receiver received transmitter 0"):
-        locate(run, np.full((3, 1), np.nan))
-    with pytest.raises(InputError, match="probability between 0 and 1"):
-        locate(run, value, level=90)
-    with pytest.raises(InputError, match="positive number of metres"):
-        locate(run, value, step_m=-1)
-    with pytest.raises(InputError, match="standard deviation of 0 or more"):
-        locate(run, value, offset_db=-1)
-    refused(["locate", run, "--out", tmp_path / "out.txt"], "written as .csv", capsys)
-
-
-def test_model_without_standard_deviations_is_refused(fitted: tuple[Path, Record], tmp_path: Path) -> None:
-    record = fitted[1]
-    run = train(write_ble_folder(tmp_path / "data", record), tmp_path / "run", "idw")
-    with pytest.raises(InputError, match="train it with --intervals"):
-        locate(run.folder, record.observation[:, :2])
+    without_std = train(write_ble_folder(tmp_path / "data", record), tmp_path / "run", "idw").folder
+    for folder, strengths_dbm, options, message in (
+        (run, value[:2], {}, r"give strengths \[3, m\]"),
+        (run, np.full((3, 1), np.nan), {}, "no receiver received transmitter 0"),
+        (run, value, {"level": 90}, "probability between 0 and 1"),
+        (run, value, {"step_m": -1}, "positive number of metres"),
+        (run, value, {"offset_db": -1}, "standard deviation of 0 or more"),
+        (without_std, value, {}, "train it with --intervals"),
+    ):
+        with pytest.raises(InputError, match=message):
+            locate(folder, strengths_dbm, **options)
+    command.refused(["locate", run, "--out", tmp_path / "out.txt"], "written as .csv")
 
 
 def test_widest_form_within_a_standard_error_is_chosen() -> None:
@@ -297,13 +272,11 @@ def test_widest_form_within_a_standard_error_is_chosen() -> None:
 
 
 def test_candidates_do_not_depend_on_test_rows(tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
-    at = np.column_stack([rng.uniform(0.5, 5.5, (40, 2)), np.ones(40)])
-    moved = at.copy()
-    moved[30:] = [50.0, -50.0, 9.0]
+    at = np.column_stack([np.random.default_rng(5).uniform(0.5, 5.5, (40, 2)), np.ones(40)])
+    moved = np.concatenate([at[:30], np.full((10, 3), [50.0, -50.0, 9.0])])
     first, second = (
-        candidates_of(train(record_of(known, strengths(known), 30), tmp_path / name, "kriging"))
-        for known, name in ((at, "first"), (moved, "second"))
+        candidates_of(train(record_of(places, strengths(places), 30), tmp_path / name, "kriging"))
+        for name, places in (("first", at), ("second", moved))
     )
     np.testing.assert_array_equal(first.positions_m, second.positions_m)
     assert first.grid.height_m == 1.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 import xarray as xr
-from calling import call
+from commands import Command
 from made_channels import channels
 from made_waves import wave_record
 from matplotlib.collections import PathCollection
@@ -25,11 +25,11 @@ from wrf_mi.maps.picture import map_figure
 BANDS_HZ = (9e8, 2.4e9)
 
 
-def mapped(data: Any, folder: Path, capsys: Any, *more: Any) -> tuple[xr.Dataset, Figure, wrf_mi.Run]:
+def mapped(data: Any, folder: Path, command: Command, *more: Any) -> tuple[xr.Dataset, Figure, wrf_mi.Run]:
     """Map by the command of a run of kriging with intervals, and its picture drawn anew."""
     run = wrf_mi.train(data, folder / "run", "kriging", intervals=True)
     out = folder / "map.nc"
-    status, _, err = call(["map", run.folder, "--step", "0.5", "--out", out, *more], capsys)
+    status, _, err = command(["map", run.folder, "--step", "0.5", "--out", out, *more])
     assert (status, err) == (0, "mapping\n")
     assert out.with_suffix(".png").stat().st_size > 1000
     with xr.open_dataset(out) as dataset:
@@ -47,36 +47,27 @@ def heading(figure: Figure) -> str:
     return " ".join(figure.get_suptitle().split())
 
 
-def test_picture_of_spectra_states_a_relative_level(tmp_path: Path, capsys: Any) -> None:
+def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = write_spectrum_folder(tmp_path / "data", wave_record(receivers=1))
-    dataset, figure, run = mapped(data, tmp_path, capsys, "--threshold", "-10")
+    dataset, figure, run = mapped(data, tmp_path, command, "--threshold", "-10")
     assert dataset["power_dbm"].attrs["units"] == "dB"
     assert dataset.attrs["threshold_db"] == -10
     assert not {"threshold_dbm", "transmit_power_dbm"} & set(dataset.attrs)
     assert "no signal strengths" in heading(figure)
     assert "full scale (dB)" in " ".join(figure.axes[-1].get_ylabel().split())
     split = make_splits(run.problem.record, "official")[0]
-    assert {name: len(values) for name, values in dots(figure, 0).items()} == {
-        "trained": len(split.all_train),
-        "other": len(split.test),
-    }
-
-
-def test_training_rows_are_thinned_apart_from_other_rows(
-    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(picture, "MOST_POINTS", 12)
-    data = write_spectrum_folder(tmp_path / "data", wave_record(receivers=1))
-    _, figure, run = mapped(data, tmp_path, capsys, "--threshold", "-10")
-    split = make_splits(run.problem.record, "official")[0]
     assert len(split.test) <= 12 < len(split.all_train)
-    shown = {name: len(values) for name, values in dots(figure, 0).items()}
-    assert shown == {"trained": -(-len(split.all_train) // 3), "other": len(split.test)}
+    for most, trained in ((picture.MOST_POINTS, len(split.all_train)), (12, -(-len(split.all_train) // 3))):
+        monkeypatch.setattr(picture, "MOST_POINTS", most)
+        shown = {name: len(values) for name, values in dots(map_figure(dataset, run), 0).items()}
+        assert shown == {"trained": trained, "other": len(split.test)}
 
 
-def test_picture_of_channels_has_levels_at_the_transmit_power(tmp_path: Path, capsys: Any) -> None:
+def test_picture_of_channels_has_levels_at_the_transmit_power(tmp_path: Path, command: Command) -> None:
     record = channels()
-    dataset, figure, _ = mapped(write_nerf2_csi(tmp_path / "data", record), tmp_path, capsys, "--transmit-power", "20")
+    dataset, figure, _ = mapped(write_nerf2_csi(tmp_path / "data", record), tmp_path, command, "--transmit-power", "20")
     level = 20 + 10 * np.log10(np.mean(np.abs(record.observation[0]) ** 2, axis=(1, 2)))
     shown = np.sort(np.concatenate(list(dots(figure, 0).values())))
     np.testing.assert_allclose(shown, np.sort(level), rtol=1e-5)
@@ -97,25 +88,23 @@ def two_bands() -> Record:
     return Record("bands", "rssi", positions, (receiver,), observed[None].astype(np.float32), **known)
 
 
-def test_picture_of_a_carrier_has_the_rows_of_that_carrier(two_bands: Record, tmp_path: Path, capsys: Any) -> None:
+def test_picture_of_a_carrier_has_the_rows_of_that_carrier(two_bands: Record, tmp_path: Path, command: Command) -> None:
     data = write_ble_folder(tmp_path / "data", two_bands)
-    dataset, figure, run = mapped(data, tmp_path, capsys, "--frequency", BANDS_HZ[1])
+    dataset, figure, run = mapped(data, tmp_path, command, "--frequency", BANDS_HZ[1])
     assert dataset.attrs["frequency_hz"] == BANDS_HZ[1]
     assert "2400 MHz" in heading(figure)
     found = dots(figure, 0)
     assert (len(found["trained"]), len(found["other"])) == (15, 5)
     assert np.concatenate(list(found.values())).max() < -50
-    status, _, err = call(["map", run.folder, "--out", tmp_path / "none.nc"], capsys)
-    assert status == 2
-    assert "900000000, 2400000000 Hz" in err
+    command.refused(["map", run.folder, "--out", tmp_path / "none.nc"], "900000000, 2400000000 Hz")
     between = map_figure(wrf_mi.radio_map(run, step_m=1.0, frequency_hz=1.5e9), run)
     assert "no measured row at this carrier" in heading(between)
 
 
-def test_picture_of_a_surface_shows_the_mesh(flat_folder: Path, tmp_path: Path, capsys: Any) -> None:
+def test_picture_of_a_surface_shows_the_mesh(flat_folder: Path, tmp_path: Path, command: Command) -> None:
     trimesh.creation.box((2.0, 1.0, 0.5)).export(tmp_path / "table.ply")
     more = ("--surface", tmp_path / "table.ply", "--receiver", "anchor1")
-    dataset, figure, _ = mapped(flat_folder, tmp_path, capsys, *more)
+    dataset, figure, _ = mapped(flat_folder, tmp_path, command, *more)
     faces = figure.axes[0].collections[0]
     colours = np.unique(faces.get_facecolor()[:, :3], axis=0)
     assert len(faces.get_facecolor()) == dataset.sizes["point"]

@@ -1,4 +1,4 @@
-"""Radio maps: closed forms, files that other readers open, chunks, sides and paths, what is refused."""
+"""Radio maps: closed forms, files that other readers open, chunks, sides and paths, coverage, what is refused."""
 
 from __future__ import annotations
 
@@ -11,18 +11,23 @@ import pandas as pd
 import pytest
 import trimesh
 import xarray as xr
-from calling import SMALL, call, refused
+from calling import SMALL
+from commands import Command, arrays_in
 from PIL import Image
 from scipy.constants import speed_of_light
-from traced_rooms import SHOEBOX, THICKNESS_M, write_xml
+from scipy.stats import norm
+from traced_rooms import SHOEBOX, write_xml
 
 import wrf_mi
 from wrf_mi.core import InputError, Record
+from wrf_mi.datasets import write_ble_folder
 from wrf_mi.maps import api
 from wrf_mi.maps.api import radio_map
+from wrf_mi.maps.coverage import coverage_probability, reliability, reliability_figure, run_reliability
 from wrf_mi.maps.dataset import write_map
 from wrf_mi.models import Inputs
 from wrf_mi.models.hybrid.model import FittedHybrid
+from wrf_mi.runs.api import train
 from wrf_mi.runs.run import Run
 from wrf_mi.training.by_distance import Mixture
 from wrf_mi.training.selection import RowDistance
@@ -86,11 +91,9 @@ def test_best_receiver_is_the_nearest_in_free_space(mapped: xr.Dataset, strength
 
 
 def test_variables_have_units_and_dimensions(mapped: xr.Dataset) -> None:
-    assert mapped["power_dbm"].dims == ("receiver", "y", "x")
-    assert mapped["best_receiver"].dims == ("y", "x")
+    assert (mapped["power_dbm"].dims, mapped["best_receiver"].dims) == (("receiver", "y", "x"), ("y", "x"))
     assert all("long_name" in mapped[name].attrs for name in (*mapped.data_vars, *mapped.coords))
-    assert mapped["power_std_db"].attrs["units"] == "dB"
-    assert mapped["x"].attrs["units"] == "m"
+    assert (mapped["power_std_db"].attrs["units"], mapped["x"].attrs["units"]) == ("dB", "m")
     assert mapped.attrs["Conventions"].startswith("CF-")
     assert mapped.attrs["threshold_dbm"] == -32.0
 
@@ -125,10 +128,12 @@ def test_chunks_and_choices_of_receivers_do_not_change_values(
     xr.testing.assert_allclose(radio_map(law, **given), mapped, rtol=FLOAT32)
 
 
+def box(size_m: tuple[float, ...], at_m: tuple[float, ...]) -> trimesh.Trimesh:
+    return trimesh.creation.box(size_m, transform=trimesh.transformations.translation_matrix(at_m))
+
+
 def test_surface_has_the_values_of_its_points(law: Run, tmp_path: Path) -> None:
-    trimesh.creation.box((2.0, 1.0, 0.5), transform=trimesh.transformations.translation_matrix([3, 2, 1])).export(
-        tmp_path / "box.ply"
-    )
+    box((2.0, 1.0, 0.5), (3, 2, 1)).export(tmp_path / "box.ply")
     parts = radio_map(law, surface=tmp_path / "box.ply", step_m=0.4)
     assert parts["power_dbm"].dims == ("receiver", "point")
     points = np.stack([parts[axis] for axis in "xyz"], axis=-1)
@@ -141,21 +146,19 @@ def test_headings_are_averaged_by_the_law_of_total_variance(flat_folder: Path, t
     parts = radio_map(run, step_m=1.5)
     positions = grid_positions(parts).reshape(-1, 3)
     each = [run.predict(positions, 0, np.full(len(positions), turn)) for turn in np.arange(8) * np.pi / 4]
-    mean = np.mean([one.mean for one in each], axis=0)
-    std = np.sqrt(np.mean([one.stated_std**2 for one in each], axis=0) + np.var([one.mean for one in each], axis=0))
-    np.testing.assert_allclose(parts["power_dbm"][0].values.ravel(), mean, rtol=FLOAT32)
+    means, stds = np.array([found.mean for found in each]), np.array([found.stated_std for found in each])
+    std = np.sqrt((stds**2).mean(axis=0) + means.var(axis=0))
+    np.testing.assert_allclose(parts["power_dbm"][0].values.ravel(), means.mean(axis=0), rtol=FLOAT32)
     np.testing.assert_allclose(parts["power_std_db"][0].values.ravel(), std, rtol=FLOAT32)
     turned = radio_map(run, step_m=1.5, heading_deg=45.0)
-    np.testing.assert_allclose(turned["power_dbm"][0].values.ravel(), each[1].mean, rtol=FLOAT32)
+    np.testing.assert_allclose(turned["power_dbm"][0].values.ravel(), means[1], rtol=FLOAT32)
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
     """A room with a solid cabinet in it, and strengths measured there."""
     folder = tmp_path_factory.mktemp("room")
-    cabinet = trimesh.creation.box((0.4, 0.4, 2.0), transform=trimesh.transformations.translation_matrix([3, 2, 1]))
-    parts = SHOEBOX | {"cabinet": ("itu_concrete", cabinet)}
-    assert set(THICKNESS_M) >= {material for material, _ in SHOEBOX.values()}
+    parts = SHOEBOX | {"cabinet": ("itu_concrete", box((0.4, 0.4, 2.0), (3, 2, 1)))}
     rng = np.random.default_rng(3)
     positions = rng.uniform([0.5, 0.5, 1.3], [2.5, 4.5, 1.3], (30, 3))
     receiver = wrf_mi.Receiver("rx", np.array([5.0, 4.0, 2.0]), np.array([0.0, 0, 0, 1]))
@@ -164,10 +167,15 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
     return write_xml(folder, parts), Record("room", "rssi", positions, (receiver,), observed, **known)
 
 
-def test_traced_paths_have_statistics_and_solids_are_left_out(room: tuple[Path, Record], tmp_path: Path) -> None:
-    scene, record = room
-    given: dict[str, Any] = {"scene": scene, "settings": ["depth=0", "rays=1024"]}
-    parts = radio_map(wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given), step_m=0.4, height_m=1.3)
+@pytest.fixture(scope="module")
+def traced(room: tuple[Path, Record], tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Lines of sight in the room."""
+    out, known = tmp_path_factory.mktemp("runs") / "traced", {"scene": room[0], "settings": ["depth=0"]}
+    return wrf_mi.train(room[1], out, "ray-tracing", **known)
+
+
+def test_traced_paths_have_statistics_and_solids_are_left_out(traced: Run) -> None:
+    parts = radio_map(traced, step_m=0.4, height_m=1.3)
     reached = ~np.isnan(parts["k_factor_db"][0].values)
     # The line of sight alone: no spread, an infinite K-factor.
     assert reached.sum() > 20
@@ -180,28 +188,20 @@ def test_traced_paths_have_statistics_and_solids_are_left_out(room: tuple[Path, 
 
 
 def test_map_outside_of_a_closed_room_is_refused_and_outside_of_the_data_told(
-    room: tuple[Path, Record], law: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    traced: Run, law: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    scene, record = room
-    given: dict[str, Any] = {"scene": scene, "settings": ["depth=0"]}
-    run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given)
-    low, high = (
-        float(end.z)
-        for end in (run.problem.opened_scene.mi_scene.bbox().min, run.problem.opened_scene.mi_scene.bbox().max)
-    )
+    bounds = traced.problem.opened_scene.mi_scene.bbox()
+    low, high = float(bounds.min.z), float(bounds.max.z)
     for height in (high + 2, low - 0.5, high + 0.01):
         with pytest.raises(InputError, match=rf"height {height:g} m: outside of the scene, which spans z = 0.00 to"):
-            radio_map(run, step_m=1.0, height_m=height)
-    inside = radio_map(run, step_m=0.7, height_m=high - 0.1)
-    box = run.problem.opened_scene.mi_scene.bbox()
+            radio_map(traced, step_m=1.0, height_m=height)
+    inside = radio_map(traced, step_m=0.7, height_m=high - 0.1)
     for axis in "xy":
-        assert float(getattr(box.min, axis)) < inside[axis].min()
-        assert inside[axis].max() < float(getattr(box.max, axis))
-    trimesh.creation.box((1.0, 1.0, 1.0), transform=trimesh.transformations.translation_matrix([1, 1, high])).export(
-        tmp_path / "box.ply"
-    )
+        assert float(getattr(bounds.min, axis)) < inside[axis].min()
+        assert inside[axis].max() < float(getattr(bounds.max, axis))
+    box((1.0, 1.0, 1.0), (1, 1, high)).export(tmp_path / "box.ply")
     caplog.clear()
-    radio_map(run, surface=tmp_path / "box.ply")
+    radio_map(traced, surface=tmp_path / "box.ply")
     assert "of the surface lie outside of the scene" in caplog.text
     caplog.clear()
     radio_map(law, step_m=1.0, height_m=1.5)
@@ -215,10 +215,8 @@ def test_map_above_a_scene_without_a_ceiling_is_told(
 ) -> None:
     _, record = room
     parts = {name: part for name, part in SHOEBOX.items() if name != "ceiling"}
-    assert len(parts) < len(SHOEBOX)
-    (tmp_path / "open").mkdir()
-    given: dict[str, Any] = {"scene": write_xml(tmp_path / "open", parts), "settings": ["depth=0"]}
-    run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", **given)
+    known: dict[str, Any] = {"scene": write_xml(tmp_path / "open", parts), "settings": ["depth=0"]}
+    run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", **known)
     radio_map(run, step_m=2.0, height_m=20.0)
     assert "height 20 m: outside of the scene" in caplog.text
 
@@ -239,9 +237,8 @@ def test_sides_of_a_hybrid_add_up_by_their_weights(room: tuple[Path, Record], tm
     np.testing.assert_array_equal(np.isnan(parts.learned), [True, True, False, False])
     np.testing.assert_array_equal(parts.traced[:2], parts.prediction.mean[:2])
     share = hybrid.mixture(RowDistance.of_rows(record, np.arange(22))(positions, 0))[2:]
-    np.testing.assert_allclose(
-        share[:, 0] * parts.traced[2:] + share[:, 1] * parts.learned[2:], parts.prediction.mean[2:]
-    )
+    expected = share[:, 0] * parts.traced[2:] + share[:, 1] * parts.learned[2:]
+    np.testing.assert_allclose(expected, parts.prediction.mean[2:])
     assert parts.paths is not None
 
 
@@ -264,30 +261,28 @@ def test_sides_of_a_joint_model_add_up_as_amplitudes(room: tuple[Path, Record], 
     assert np.median(np.abs(parts.paths.path_gain_db - line_of_sight)) < REFLECTED_DB
 
 
-def test_command_writes_map_and_picture(law: Run, strengths: Record, tmp_path: Path, capsys: Any) -> None:
-    from wrf_mi.datasets import write_ble_folder
-
-    data = write_ble_folder(tmp_path / "data", strengths)
-    wrf_mi.train(data, tmp_path / "run", "mri", intervals=True)
-    status, out, err = call(["map", tmp_path / "run", "--step", "0.5", "--out", tmp_path / "map.nc"], capsys)
+def test_command_writes_map_and_picture(strengths: Record, tmp_path: Path, command: Command) -> None:
+    run, out = tmp_path / "run", tmp_path / "map.nc"
+    wrf_mi.train(write_ble_folder(tmp_path / "data", strengths), run, "mri", intervals=True)
+    status, printed, err = command(["map", run, "--step", "0.5", "--out", out])
     assert (status, err) == (0, "mapping\n")
-    assert "map.nc" in out
-    assert "map.png" in out
+    assert "map.nc" in printed
+    assert "map.png" in printed
     with Image.open(tmp_path / "map.png") as picture:
         assert picture.size[0] > 300
-    assert call(["evaluate", tmp_path / "run", "--reliability", tmp_path / "r.png"], capsys)[0] == 0
+    command.done(["evaluate", run, "--reliability", tmp_path / "r.png"])
     assert (tmp_path / "r.png").stat().st_size > 1000
 
 
-def test_bad_input_is_one_line(law: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(law: Run, tmp_path: Path, command: Command) -> None:
     out = tmp_path / "map.nc"
-    for more, message in (
-        (["--out", tmp_path / "map.txt"], "maps are written as NetCDF"),
-        (["--out", tmp_path], "maps are written as|is a folder"),
-        (["--out", out, "--step", "one"], "invalid float"),
+    for words, message in (
+        ([law.folder, "--out", tmp_path / "map.txt"], "maps are written as NetCDF"),
+        ([law.folder, "--out", tmp_path], "maps are written as|is a folder"),
+        ([law.folder, "--out", out, "--step", "one"], "invalid float"),
+        ([tmp_path / "none", "--out", out], "none"),
     ):
-        refused(["map", law.folder, *more], message, capsys)
-    refused(["map", tmp_path / "none", "--out", out], "none", capsys)
+        command.refused(["map", *words], message)
     for given, message in (
         ({"step_m": 0.0}, "positive number"),
         ({"height_m": float("nan")}, "height nan"),
@@ -312,3 +307,42 @@ def test_missing_package_is_named(
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(InputError, match=rf"need {package}: pip install 'wrf-mi\[maps\]'"):
         write_map(mapped, tmp_path / f"map{suffix}")
+
+
+EXACT = 1e-12
+CHANCE = 0.01
+"""Of an observed share in 20,000 draws: three standard errors."""
+
+
+def test_coverage_is_the_normal_distribution_beyond_the_threshold() -> None:
+    mean, std = np.linspace(-100, -80, 7), np.linspace(1, 8, 7)
+    np.testing.assert_allclose(coverage_probability(mean, std, -90), norm.sf(-90, mean, std), rtol=EXACT)
+    assert coverage_probability(-89.0, 0.0, -90.0) == 1
+    assert np.isnan(coverage_probability(np.nan, 1.0, -90.0))
+
+
+def test_levels_drawn_as_predicted_are_reliable_and_narrower_statements_are_not() -> None:
+    rng = np.random.default_rng(1)
+    mean, std = rng.uniform(-95, -60, 20_000), rng.uniform(2, 9, 20_000)
+    measured = rng.normal(mean, std)
+    measured[::7] = np.nan
+    found = reliability(mean, std, measured)
+    assert found.error < CHANCE
+    np.testing.assert_allclose(found.observed, found.predicted, atol=3 * CHANCE)
+    assert found.count.sum() == 9 * np.isfinite(measured).sum()
+    narrow = reliability(mean, std / 4, measured)
+    assert narrow.error > 5 * CHANCE
+    assert narrow.brier > found.brier
+    assert len(reliability_figure({"drawn": found}).axes[0].lines) == 2
+
+
+def test_reliability_of_a_run_is_that_of_its_test_rows(plain_flat_folder: Path, tmp_path: Path) -> None:
+    run = train(plain_flat_folder, tmp_path / "run", "kriging", intervals=True)
+    found = run_reliability(run.folder, np.array([-55.0]))
+    stored = arrays_in(run.folder / "predictions.npz")
+    p, above = norm.sf(-55, stored["prediction"], stored["std"]), stored["truth"] > -55
+    assert found.brier == pytest.approx(np.square(p - above).mean(), rel=1e-5)
+    assert found.count.sum() == above.size
+    without = train(plain_flat_folder, tmp_path / "without", "mri")
+    with pytest.raises(InputError, match="states no standard deviation; train with --intervals"):
+        run_reliability(without.folder)

@@ -10,10 +10,11 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import worker_tasks
-from calling import refused
+from commands import Command, positions_file
 from worker_tasks import Lossy
 
 from wrf_mi.backend import init
@@ -106,21 +107,20 @@ def test_other_versions_and_folders_are_refused(
 
 
 def test_invalid_scheduler_ends_with_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scheduler, "CONNECT_S", 0.2)
-    positions = tmp_path / "tx.csv"
-    positions.write_text("x,y,z\n1,1,1\n")
-    call = ["predict", tmp_path, "--tx", positions, "--out", tmp_path / "p.npz", "--scheduler"]
+    positions = positions_file(tmp_path / "tx.csv", [[1, 1, 1]])
+    words = ["predict", tmp_path, "--tx", positions, "--out", tmp_path / "p.npz", "--scheduler"]
     for wrong, message in (
         ("locals", "expected local, local:N or the address"),
         ("local:0", "give the number of workers, 1 or more"),
         ("tcp://127.0.0.1:1", "no Dask scheduler answers there"),
         ("nonsense://127.0.0.1:1", "no Dask scheduler answers there"),
     ):
-        refused([*call, wrong], message, capsys)
+        command.refused([*words, wrong], message)
     monkeypatch.setitem(sys.modules, "distributed", None)
-    refused([*call, "local:2"], r"pip install 'wrf-mi\[cluster\]'", capsys)
+    command.refused([*words, "local:2"], r"pip install 'wrf-mi\[cluster\]'")
     assert not (tmp_path / "p.npz").exists()
 
 
@@ -135,34 +135,37 @@ def test_waiting_for_a_worker_is_printed_once(capsys: pytest.CaptureFixture[str]
     ]
 
 
-def test_child_that_is_stopped_while_it_imports_prints_no_traceback(tmp_path: Path) -> None:
-    (tmp_path / "slow.py").write_text("import pathlib, time\npathlib.Path('begun').touch()\ntime.sleep(600)\n")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-    call = [sys.executable, "-m", "wrf_mi.parallel.child", "0", "slow"]
-    pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(call, cwd=tmp_path, env=environment, **pipes) as child:
-        until = time.monotonic() + SECONDS
-        while not (tmp_path / "begun").exists() and time.monotonic() < until:
-            time.sleep(0.05)
+def awaited(file: Path) -> str:
+    """Content of a file that another process writes."""
+    until = time.monotonic() + SECONDS
+    while not (file.exists() and file.read_text()) and time.monotonic() < until:
+        time.sleep(0.05)
+    return file.read_text()
+
+
+@pytest.fixture
+def sleeper(tmp_path: Path) -> dict[str, Any]:
+    """Folder and environment of a module that writes its process's number and then sleeps while it is imported."""
+    code = "import os, pathlib, time\npathlib.Path('pid').write_text(str(os.getpid()))\ntime.sleep(600)\n"
+    (tmp_path / "sleeper.py").write_text(code)
+    return {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}}
+
+
+def test_child_that_is_stopped_while_it_imports_prints_no_traceback(tmp_path: Path, sleeper: dict[str, Any]) -> None:
+    words = [sys.executable, "-m", "wrf_mi.parallel.child", "0", "sleeper"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stderr=subprocess.PIPE, **sleeper) as child:
+        assert awaited(tmp_path / "pid")
         child.send_signal(signal.SIGINT)
         assert child.wait(SECONDS) == 130
         assert child.stderr is not None
         assert child.stderr.read() == b""
 
 
-def test_child_ends_with_its_parent(tmp_path: Path) -> None:
+def test_child_ends_with_its_parent(tmp_path: Path, sleeper: dict[str, Any]) -> None:
     """Even a parent that is killed."""
-    (tmp_path / "sleeper.py").write_text(
-        "import os, pathlib, time\npathlib.Path('pid').write_text(str(os.getpid()))\ntime.sleep(600)\n"
-    )
     code = "from wrf_mi.parallel import run_module; run_module('sleeper', [])"
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-    parent = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, env=environment)
-    until = time.monotonic() + SECONDS
-    pid = tmp_path / "pid"
-    while not (pid.exists() and pid.read_text()) and time.monotonic() < until:
-        time.sleep(0.05)
-    child = int(pid.read_text())
+    parent = subprocess.Popen([sys.executable, "-c", code], **sleeper)
+    child, until = int(awaited(tmp_path / "pid")), time.monotonic() + SECONDS
     os.kill(child, 0)
     parent.kill()
     parent.wait()

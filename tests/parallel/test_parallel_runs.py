@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from calling import call, refused
+from commands import Command, arrays_in
 from made_flat import write_flat
 from made_waves import wave_record
 from small_fits import official, settings
@@ -21,7 +22,6 @@ from wrf_mi.datasets import load, write_spectrum_folder
 from wrf_mi.models import ray_tracing
 from wrf_mi.parallel import Scheduler
 from wrf_mi.runs.api import predict_to_file, train
-from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import TraceOptions
 
 PRODUCTS = 1e-5
@@ -42,43 +42,34 @@ def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray_tracing, "TRACED_AT_LEAST", 2)
 
 
-@pytest.fixture(scope="module")
-def room(flat: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_scene(flat / "layout.csv", tmp_path_factory.mktemp("scenes") / "room", height_m=2.7).folder
-
-
 def positions(record: Record, rows: int = POSITIONS) -> np.ndarray:
     """New places among those of a record."""
     low, high = record.tx_pos_m.min(axis=0), record.tx_pos_m.max(axis=0)
     return np.random.default_rng(6).uniform(low, high, (rows, 3))
 
 
-def stored(file: Path) -> dict[str, np.ndarray]:
-    with np.load(file, allow_pickle=False) as arrays:
-        return dict(arrays)
+Arrays = dict[str, np.ndarray]
 
 
-def both(
-    run: Path, tx_pos_m: np.ndarray, two: Scheduler, folder: Path, heading: np.ndarray | None = None
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def both(run: Path, tx_pos_m: np.ndarray, two: Any, folder: Path, heading: Any = None) -> tuple[Arrays, Arrays]:
     """Predictions of one process, and of two workers."""
     predict_to_file(run, tx_pos_m, folder / "serial.npz", heading)
     predict_to_file(run, tx_pos_m, folder / "parallel.npz", heading, two)
-    serial, parallel = stored(folder / "serial.npz"), stored(folder / "parallel.npz")
+    serial, parallel = arrays_in(folder / "serial.npz"), arrays_in(folder / "parallel.npz")
     assert serial.keys() == parallel.keys()
     np.testing.assert_array_equal(parallel["row"], np.arange(len(tx_pos_m)))
     np.testing.assert_array_equal(parallel["tx_pos"], tx_pos_m)
     return serial, parallel
 
 
-def assert_same_bits(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+def assert_same_bits(one: Arrays, other: Arrays) -> None:
     assert one.keys() == other.keys()
     for key in one:
         assert one[key].dtype == other[key].dtype, key
         np.testing.assert_array_equal(one[key], other[key], err_msg=key)
 
 
-def assert_close(one: dict[str, np.ndarray], other: dict[str, np.ndarray], *keys: str) -> None:
+def assert_close(one: Arrays, other: Arrays, *keys: str) -> None:
     for key in keys:
         np.testing.assert_allclose(other[key], one[key], rtol=0, atol=PRODUCTS * np.abs(one[key]).max(), err_msg=key)
 
@@ -89,10 +80,8 @@ def test_parallel_prediction_of_a_field_equals_serial(
 ) -> None:
     """One is splatted; the other is a product of matrices."""
     folder = write_spectrum_folder(tmp_path / "made-here", two_gateways, bits=16)
-    record = load(folder)
-    run = train(
-        record, tmp_path / "run", model, settings=settings("steps=4", model=model), split=official(record)
-    ).folder
+    record, fit = load(folder), settings("steps=4", model=model)
+    run = train(record, tmp_path / "run", model, settings=fit, split=official(record)).folder
     lossy = Lossy(two, tmp_path)
     serial, parallel = both(run, positions(record), lossy, tmp_path)
     lossy.assert_one_was_lost()
@@ -106,13 +95,12 @@ def test_parallel_prediction_of_a_field_equals_serial(
 
 def test_parallel_trace_and_its_prediction_equal_serial(flat: Path, room: Path, two: Scheduler, tmp_path: Path) -> None:
     """The number of rays is chosen by the search, which uses all positions."""
-    options = TraceOptions(depth=1, rays="auto")
-    serial = train(flat, tmp_path / "serial", "ray-tracing", scene=room, settings=options).folder
-    lossy = Lossy(two, tmp_path)
-    parallel = train(flat, tmp_path / "parallel", "ray-tracing", scene=room, settings=options, scheduler=lossy).folder
+    known: dict[str, Any] = {"scene": room, "settings": TraceOptions(depth=1, rays="auto")}
+    serial, lossy = train(flat, tmp_path / "serial", "ray-tracing", **known).folder, Lossy(two, tmp_path)
+    parallel = train(flat, tmp_path / "parallel", "ray-tracing", scheduler=lossy, **known).folder
     lossy.assert_one_was_lost()
     for file in ("paths.npz", "predictions.npz", "split.npz"):
-        assert_same_bits(stored(serial / file), stored(parallel / file))
+        assert_same_bits(arrays_in(serial / file), arrays_in(parallel / file))
     assert_same_bits(*both(serial, positions(load(flat)), two, tmp_path))
 
 
@@ -122,16 +110,13 @@ def test_parallel_trace_of_random_paths_equals_serial(
 ) -> None:
     """Diffuse reflections are searched from receivers, diffraction from transmitters."""
     monkeypatch.setattr(ray_tracing, "TRACED_AT_LEAST", 4)  # one part for each worker
-    for kind in ({"scattering": True}, {"diffraction": True}):
-        options = TraceOptions(depth=1, rays=1 << 8, **kind)
-        name = next(iter(kind))
-        serial = train(flat, tmp_path / f"{name}-serial", "ray-tracing", scene=room, settings=options).folder
-        parallel = train(
-            flat, tmp_path / f"{name}-parallel", "ray-tracing", scene=room, settings=options, scheduler=two
-        ).folder
-        arrays = stored(serial / "paths.npz")
-        assert (arrays["interactions"] == {"scattering": 2, "diffraction": 8}[name]).any()
-        assert_same_bits(arrays, stored(parallel / "paths.npz"))
+    for kind, code in (("scattering", 2), ("diffraction", 8)):
+        known: dict[str, Any] = {"scene": room, "settings": TraceOptions(depth=1, rays=1 << 8, **{kind: True})}
+        serial = train(flat, tmp_path / f"{kind}-serial", "ray-tracing", **known).folder
+        parallel = train(flat, tmp_path / f"{kind}-parallel", "ray-tracing", scheduler=two, **known).folder
+        arrays = arrays_in(serial / "paths.npz")
+        assert (arrays["interactions"] == code).any()
+        assert_same_bits(arrays, arrays_in(parallel / "paths.npz"))
 
 
 def test_parallel_prediction_of_kriging_equals_serial(flat: Path, two: Scheduler, tmp_path: Path) -> None:
@@ -146,16 +131,15 @@ def test_parallel_prediction_of_kriging_equals_serial(flat: Path, two: Scheduler
 
 
 def test_errors_of_parts_name_the_row_of_the_whole_input(
-    flat: Path, two: Scheduler, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    flat: Path, two: Scheduler, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A cabinet stands where the last transmitter is."""
     box = trimesh.creation.box((0.3, 0.3, 0.3))
     box.apply_translation((50.0, 50.0, 1.0))
     box.export(tmp_path / "box.ply")
+    known: dict[str, Any] = {"scene": tmp_path / "box.ply", "material": "concrete"}
     direct = TraceOptions(reflection=False, depth=0)
-    run = train(
-        flat, tmp_path / "run", "ray-tracing", scene=tmp_path / "box.ply", settings=direct, material="concrete"
-    ).folder
+    run = train(flat, tmp_path / "run", "ray-tracing", settings=direct, **known).folder
     places = np.concatenate([positions(load(flat)), [[50.0, 50.0, 1.0]]])
     with pytest.raises(InputError, match=f"^transmitter {POSITIONS + 1} at .* is inside the solid 'box'"):
         predict_to_file(run, places, tmp_path / "p.npz", scheduler=two)
@@ -163,14 +147,14 @@ def test_errors_of_parts_name_the_row_of_the_whole_input(
     np.savez(tmp_path / "tx.npz", tx_pos=places[-1:])
     monkeypatch.setattr(parallel, "open_scheduler", lambda text: nullcontext(two))
     given = ["--input", tmp_path / "tx.npz", "--out", tmp_path / "p.npz", "--scheduler", "local"]
-    refused(["predict", run, *given], "transmitter 1 at .* is inside the solid 'box'; move one of them", capsys)
+    command.refused(["predict", run, *given], "transmitter 1 at .* is inside the solid 'box'; move one of them")
     np.savez(tmp_path / "tx.npz", tx_pos=places[:3])
-    status, out, err = call(["predict", run, *given], capsys)
+    status, out, err = command(["predict", run, *given])
     assert status == 0
     assert re.fullmatch("predicting: 3 of 3, [12] workers?", err.splitlines()[-1])
     assert out.startswith("3 predictions: ")
     traced_again = ["trace", tmp_path / "box.ply", flat, "--material", "concrete", "--paths", "line-of-sight"]
-    status, _, err = call([*traced_again, "--out", tmp_path / "again", "--scheduler", "local"], capsys)
+    status, _, err = command([*traced_again, "--out", tmp_path / "again", "--scheduler", "local"])
     assert status == 0
     assert re.fullmatch("tracing: 8 of 8, [12] workers?", err.splitlines()[-1])
-    assert_same_bits(stored(run / "predictions.npz"), stored(tmp_path / "again" / "predictions.npz"))
+    assert_same_bits(arrays_in(run / "predictions.npz"), arrays_in(tmp_path / "again" / "predictions.npz"))

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from calling import call, contents, copied, damaged_models_refused, refused, scored_again_as_before, stored
+from calling import contents, copied, damaged_models_refused, scored_again_as_before, stored
+from commands import Command, positions_file, rows_of
 from made_channels import channels
 
 from wrf_mi.core import InputError, Record
@@ -36,16 +35,12 @@ def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_run_folder_holds_the_model(flat_folder: Path, run: Path) -> None:
     assert contents(run) == FILES
     config = yaml.safe_load((run / "config.yaml").read_text())
-    known = {"model": "mri", "dataset": str(flat_folder), "split": "official", "n_train": None, "seed": 0}
-    assert known.items() <= config.items()
-    assert config["settings"] == {"shared": False}
+    assert (config["model"], config["dataset"], config["settings"]) == ("mri", str(flat_folder), {"shared": False})
     assert {"wrf-mi", "scipy", "scikit-learn"} <= set(config["versions"])
     with np.load(run / "model.npz", allow_pickle=False) as arrays:
         assert set(arrays) == {"run/format", "run/train_seconds", CHECKSUM, "heading", "0/law", "1/law"}
     metrics = json.loads((run / "metrics.json").read_text())
     assert (metrics["model"], metrics["task"], metrics["n_train"], metrics["n_test"]) == ("mri", "rssi", 24, 6)
-    assert metrics["train_seconds"] > 0
-    assert metrics["peak_memory_mb"] > 10
     assert set(metrics["receivers"]) == {"anchor1", "anchor2"}
     assert "inside_90" not in metrics
     assert set(metrics["reference"]) == {"idw100"}
@@ -74,69 +69,55 @@ def test_stored_models_reproduce_the_scored_predictions(name: str, flat_folder: 
         opened.predict(np.full((1, 3), np.nan), 0, heading[:1])
 
 
-def test_command_trains_as_the_function_does(
-    flat_folder: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "run"
-    status, table, err = call(["train", flat_folder, "--model", "mri", "--out", out], capsys)
+def test_command_trains_as_the_function_does(flat_folder: Path, run: Path, tmp_path: Path, command: Command) -> None:
+    out, few = tmp_path / "run", tmp_path / "few"
+    status, table, err = command(["train", flat_folder, "--model", "mri", "--out", out])
     assert status == 0, err
-    lines = table.splitlines()
-    assert [line.split()[0] for line in lines] == ["absolute", "mri", "IDW", "split", "results:"]
+    assert [line.split()[0] for line in table.splitlines()] == ["absolute", "mri", "IDW", "split", "results:"]
     assert err.splitlines() == ["mri: receivers"]
     np.testing.assert_array_equal(stored(out)["prediction"], stored(run)["prediction"])
     chosen = ["--set", "shared=true", "--n-train", "0.5", "--seed", 4, "--split", "random"]
-    given = ["train", flat_folder, "--model", "mri", "--out", tmp_path / "few", "--json", *chosen]
-    status, table, _ = call(given, capsys)
-    metrics = json.loads(table)
-    assert (status, metrics["seed"], metrics["split"], metrics["n_train"]) == (0, 4, "random", 12)
-    with np.load(tmp_path / "few" / "model.npz") as arrays:
+    metrics = command.json(["train", flat_folder, "--model", "mri", "--out", few, *chosen])
+    assert (metrics["seed"], metrics["split"], metrics["n_train"]) == (4, "random", 12)
+    with np.load(few / "model.npz") as arrays:
         np.testing.assert_array_equal(arrays["0/law"], arrays["1/law"])  # one law for all
 
 
-def test_evaluation_reproduces_the_scores(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluation_reproduces_the_scores(flat_folder: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     again = scored_again_as_before(run, capsys)
     other = evaluate_run(run, "random")
     assert other["split"] == "random (rows unseen by official)"
-    record = load(json.loads((run / "metrics.json").read_text())["dataset"])
-    (drawn,) = make_splits(record, "random")
+    (drawn,) = make_splits(load(flat_folder), "random")
     assert 0 < other["n_test"] == np.isin(drawn.test, stored(run)["row"]).sum() < len(drawn.test)
     assert json.loads((run / "metrics.json").read_text()) == again
 
 
 def test_every_block_is_held_out_in_turn_and_a_stopped_run_goes_on(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, command: Command
 ) -> None:
     out = train(folder, tmp_path / "run", "kriging", split="blocked").folder
     assert contents(out) == FILES - {"split.npz", "model.npz"} | {"fold0", "fold1", "fold2"}
     whole = read_run(out)
     assert sorted(whole.row) == list(range(24))
-    for name in ("model.npz", "metrics.json", "predictions.npz"):
-        (out / "fold1" / name).unlink()
-    (out / "metrics.json").unlink()
+    for name in ("fold1/model.npz", "fold1/metrics.json", "fold1/predictions.npz", "metrics.json"):
+        (out / name).unlink()
     kept = (out / "fold0" / "model.npz").stat().st_mtime_ns
-    refused(["evaluate", out], "model.npz: missing, the fit was stopped; finish it with train --resume", capsys)
-    status, _, err = call(["train", "--resume", out], capsys)
+    command.refused(["evaluate", out], "model.npz: missing, the fit was stopped; finish it with train --resume")
+    status, _, err = command(["train", "--resume", out])
     assert (status, err.splitlines()) == (0, ["fold1: kriging: receivers"])
     assert (out / "fold0" / "model.npz").stat().st_mtime_ns == kept
     np.testing.assert_array_equal(read_run(out).prediction, whole.prediction)
-    (tmp_path / "tx.csv").write_text("x,y,z\n0,0,0\n")
-    asked = ["--tx", tmp_path / "tx.csv", "--out", tmp_path / "out.npz"]
-    refused(["predict", out, *asked], "one model for each block; choose one", capsys)
-    status, _, err = call(["predict", out / "fold0", *asked], capsys)
-    assert status == 0, err
+    asked = ["--tx", positions_file(tmp_path / "tx.csv", [[0, 0, 0]]), "--out", tmp_path / "out.npz"]
+    command.refused(["predict", out, *asked], "one model for each block; choose one")
+    command.done(["predict", out / "fold0", *asked])
 
 
 def test_a_stopped_run_keeps_the_folds_that_are_fitted(folder: Path, tmp_path: Path) -> None:
     out, stages = tmp_path / "run", list[str]()
+    ends: dict[str, Any] = {"on_progress": lambda stage, share, _: stages.append(stage)}
+    ends["stop"] = lambda: stages[-1].startswith("fold1")
     with pytest.raises(Interrupted, match=rf"stopped in kriging: receivers; go on with: wrf-mi train --resume {out}"):
-        train(
-            folder,
-            out,
-            "kriging",
-            split="blocked",
-            on_progress=lambda stage, share, _: stages.append(stage),
-            stop=lambda: stages[-1].startswith("fold1"),
-        )
+        train(folder, out, "kriging", split="blocked", **ends)
     assert [(out / f"fold{k}" / "model.npz").exists() for k in range(3)] == [True, False, False]
     assert sorted(read_run(resume(out).folder).row) == list(range(24))
 
@@ -152,12 +133,12 @@ TRAINED: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 """Data, settings of a small version, and the networks that are trained in turn."""
 
 
-@pytest.mark.parametrize("name", list(TRAINED))
+@pytest.mark.parametrize("name", TRAINED)
 def test_resumed_network_is_bit_identical(name: str, two_gateways: Record, tmp_path: Path) -> None:
-    """The run is stopped between two checkpoints of the second network."""
-    data, own, networks = TRAINED[name]
+    """The run is stopped between two checkpoints of the last network."""
+    data, settings, networks = TRAINED[name]
     record = two_gateways if data == "spectra" else channels()
-    ends: dict[str, Any] = {"settings": (*SHORT, *own), "deterministic": True}
+    ends: dict[str, Any] = {"settings": (*SHORT, *settings), "deterministic": True}
     whole = train(record, tmp_path / "whole", name, **ends).folder
     told: list[tuple[str, int]] = []
 
@@ -174,18 +155,22 @@ def test_resumed_network_is_bit_identical(name: str, two_gateways: Record, tmp_p
     assert min(step for _, step in told) > 12, "no step is taken again"
     assert {stage for stage, _ in told} == {networks[-1]}
     assert not (out / "checkpoint.npz").exists()
-    with np.load(whole / "model.npz") as one, np.load(out / "model.npz") as other:
-        assert set(one) == set(other)
-        for key in set(one) - {"run/train_seconds", CHECKSUM}:
-            np.testing.assert_array_equal(other[key], one[key], err_msg=key)
+    assert_same_model(whole, out)
+
+
+def assert_same_model(whole: Path, resumed: Path) -> None:
+    with np.load(whole / "model.npz") as expected, np.load(resumed / "model.npz") as found:
+        assert set(expected) == set(found)
+        for key in set(expected) - {"run/train_seconds", CHECKSUM}:
+            np.testing.assert_array_equal(found[key], expected[key], err_msg=key)
 
 
 def test_a_killed_network_goes_on_from_its_last_checkpoint(two_gateways: Record, tmp_path: Path) -> None:
-    _, own, networks = TRAINED["vae"]
-    ends: dict[str, Any] = {"settings": (*SHORT, *own), "deterministic": True}
+    _, settings, networks = TRAINED["vae"]
+    ends: dict[str, Any] = {"settings": (*SHORT, *settings), "deterministic": True}
 
     def kill(stage: str, share: float, progress: Progress | None) -> None:
-        if progress is not None and stage == networks[0] and progress.step == 16:
+        if progress is not None and (stage, progress.step) == (networks[0], 16):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -193,103 +178,76 @@ def test_a_killed_network_goes_on_from_its_last_checkpoint(two_gateways: Record,
     assert int(read_checkpoint(tmp_path / "killed")["step"]) == 8
     resume(tmp_path / "killed", record=two_gateways)
     train(two_gateways, tmp_path / "whole", "vae", **ends)
-    np.testing.assert_array_equal(stored(tmp_path / "killed")["prediction"], stored(tmp_path / "whole")["prediction"])
+    assert_same_model(tmp_path / "whole", tmp_path / "killed")
 
 
-def test_predictions_at_new_positions(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("name", ["tx.csv", "tx.npz"])
+def test_predictions_at_new_positions(name: str, run: Path, tmp_path: Path, command: Command) -> None:
     held_out = stored(run)
-    rows = [",".join(repr(float(v)) for v in p) for p in held_out["tx_pos"]]
-    (tmp_path / "tx.csv").write_text("\n".join(["x,y,z", *rows]) + "\n")
-    np.savez(tmp_path / "tx.npz", tx_pos=held_out["tx_pos"], heading_rad=np.zeros(len(rows)))
-    for given in (["--tx", tmp_path / "tx.csv"], ["--input", tmp_path / "tx.npz"]):
-        status, printed, err = call(["predict", run, *given, "--out", tmp_path / "out.npz", "--json"], capsys)
-        assert (status, err) == (0, "")
-        assert set(json.loads(printed)["arrays"]) == {"row", "prediction", "tx_pos", "receiver_name"}
-        with np.load(tmp_path / "out.npz") as arrays:
-            np.testing.assert_allclose(arrays["prediction"], held_out["prediction"], atol=ROUNDING)
+    heading = np.zeros(len(held_out["tx_pos"])) if name == "tx.npz" else None
+    arrays = command.predicted(run, positions_file(tmp_path / name, held_out["tx_pos"], heading))
+    assert set(arrays) == {"row", "prediction", "tx_pos", "receiver_name"}
+    np.testing.assert_allclose(arrays["prediction"], held_out["prediction"], atol=ROUNDING)
 
 
-def test_comparison_shows_baselines_and_the_reference(run: Path, flat_folder: Path, tmp_path: Path) -> None:
-    other = train(flat_folder, tmp_path / "idw", "idw").folder
-    compare([run, other], tmp_path / "page")
-    with (tmp_path / "page" / "compare.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+def test_sweep_and_comparison_show_baselines_and_the_reference(
+    flat_folder: Path, run: Path, tmp_path: Path, command: Command
+) -> None:
+    """The sweep starts a process for its run."""
+    out = tmp_path / "sweep"
+    (row,) = command.json(["sweep", flat_folder, "--vary", "model=idw", "--out", out])
+    assert (row["model"], row["status"], row["median"]) == ("idw", "done", row["reference_median"])
+    compare([run, out / "model=idw"], tmp_path / "page")
+    rows = rows_of(tmp_path / "page" / "compare.csv")
     assert [row["model"] for row in rows] == ["mri", "idw", "idw100"]
     assert rows[1]["median"] == rows[2]["median"] != rows[0]["median"]
-
-
-def test_sweep_of_baselines(flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    given = ["sweep", flat_folder, "--vary", "model=mri,idw", "--out", tmp_path / "sweep"]
-    status, out, err = call([*given, "--json"], capsys)
-    assert status == 0, err
-    rows = json.loads(out)
-    assert [(row["model"], row["status"]) for row in rows] == [("mri", "done"), ("idw", "done")]
-    assert rows[1]["median"] == rows[1]["reference_median"]
-    refused(["sweep", flat_folder, "--vary", "model=idw,vae", "--out", tmp_path / "no"], "vae serves spectrum", capsys)
+    words = ["sweep", flat_folder, "--vary", "model=idw,vae", "--out", tmp_path / "no"]
+    command.refused(words, "vae serves spectrum")
     assert not (tmp_path / "no").exists()
 
 
-# What is refused
-
-
-def test_bad_calls_are_refused(
-    flat_folder: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    unplaced_folder = write_nerf2_csi(tmp_path / "unplaced", channels(positions=False))
-    out = ["--out", tmp_path / "out"]
-    train = ["train", flat_folder, "--model", "mri", *out]
-    for arguments, message in (
+def test_bad_calls_are_refused(flat_folder: Path, tmp_path: Path, command: Command) -> None:
+    unplaced = write_nerf2_csi(tmp_path / "unplaced", channels(positions=False))
+    for data, options, message in (
+        (unplaced, "mri", "unplaced: holds csi; mri serves rssi, so choose another model: "),
+        (unplaced, "idw", "positions are not known, from which idw predicts"),
+        (flat_folder, "fire", "flat: holds rssi; fire serves csi"),
+        (flat_folder, "mri --n-train 1", "anchor1: mri: 1 rows at one distance; an exponent shows at two or more"),
+        (flat_folder, "mri --set shared=maybe", "expected bool, got 'maybe'"),
+        (flat_folder, "idw --set neighbours=0", "k = 0: IDW needs at least one"),
+        (flat_folder, "kriging --set trend=cubic", "trend 'cubic'; choose constant"),
         (
-            ["train", unplaced_folder, "--model", "mri", *out],
-            "unplaced: holds csi; mri serves rssi, so choose another model: ",
-        ),
-        (["train", unplaced_folder, "--model", "idw", *out], "positions are not known, from which idw predicts"),
-        (["train", flat_folder, "--model", "fire", *out], "flat: holds rssi; fire serves csi"),
-        ([*train, "--n-train", 1], "anchor1: mri: 1 rows at one distance; an exponent shows at two or more"),
-        ([*train, "--set", "shared=maybe"], "expected bool, got 'maybe'"),
-        (
-            ["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=0"],
-            "k = 0: IDW needs at least one",
-        ),
-        (["train", flat_folder, "--model", "idw", *out, "--set", "neighbours=few"], "expected int, got 'few'"),
-        (["train", flat_folder, "--model", "kriging", *out, "--set", "trend=cubic"], "trend 'cubic'; choose constant"),
-        (
-            ["train", flat_folder, "--model", "kriging", *out, "--n-train", 1, "--set", "generic=true"],
+            flat_folder,
+            "kriging --n-train 1 --set generic=true",
             "training rows received: 1; its trend needs 2, so give",
         ),
-        ([*train, "--scene", "x"], "mri on .*flat: takes no scene; omit --scene"),
+        (flat_folder, "mri --scene x", "mri on .*flat: takes no scene; omit --scene"),
         (
-            [*train, "--preset", "quick"],
-            "mri on .*flat: takes no preset, which belongs to fields of spectra; use --set",
+            flat_folder,
+            "mri --preset quick",
+            "mri on .*no preset, which belongs to fields of spectra; use --set",
         ),
     ):
-        refused(arguments, message, capsys)
-        assert not (tmp_path / "out").exists(), arguments
+        command.refused(["train", data, "--out", tmp_path / "out", "--model", *options.split()], message)
+        assert not (tmp_path / "out").exists(), options
 
 
-def test_refused_fit_writes_nothing(flat_folder: Path, tmp_path: Path) -> None:
-    record = load(flat_folder)
-    still = replace(record, tx_pos_m=np.ones_like(record.tx_pos_m))
-    with pytest.raises(InputError, match="rows at one distance"):
-        train(still, tmp_path / "run", "mri")
-    assert not (tmp_path / "run").exists()
-
-
-def test_damaged_runs_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_runs_are_refused(
+    run: Path, tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
     damaged = copied(run, tmp_path / "run")
-    asked = ["evaluate", damaged]
     damaged_models_refused(damaged, "1/law", capsys)
     (damaged / "model.npz").unlink()
     split = (damaged / "split.npz").read_bytes()
     (damaged / "split.npz").write_bytes(b"")
-    refused(["train", "--resume", damaged], "split.npz: not readable", capsys)
-    assert (damaged / "config.yaml").exists()  # a run that was there is never taken away
+    command.refused(["train", "--resume", damaged], "split.npz: not readable")
+    config = damaged / "config.yaml"  # a run that was there is never taken away
     (damaged / "split.npz").write_bytes(split)
-    config = damaged / "config.yaml"
     content = yaml.safe_load(config.read_text())
-    config.write_text(yaml.safe_dump(content | {"settings": {"shared": 3}}))
-    refused(asked, "setting shared: expected bool, got 3", capsys)
-    config.write_text(yaml.safe_dump({k: v for k, v in content.items() if k != "settings"}))
-    refused(asked, "config.yaml: not readable .*settings.*; restore it", capsys)
-    config.write_text(yaml.safe_dump(content | {"model": "no-such"}))
-    refused(asked, "model 'no-such': no such model; choose from", capsys)
+    for changed, message in (
+        (content | {"settings": {"shared": 3}}, "setting shared: expected bool, got 3"),
+        ({k: v for k, v in content.items() if k != "settings"}, "config.yaml: not readable .*settings.*; restore it"),
+        (content | {"model": "no-such"}, "model 'no-such': no such model; choose from"),
+    ):
+        config.write_text(yaml.safe_dump(changed))
+        command.refused(["evaluate", damaged], message)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import base64
-import csv
 import json
 import re
 
 import numpy as np
 import pytest
 from changed_folders import refusal, remove, write
+from commands import arrays_in, rows_of
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -36,26 +36,15 @@ def make_run(
     prediction, blend = (np.clip(truth + s * rng.standard_normal(truth.shape), 0, 1) for s in (noise, 0.3))
     np.savez(
         path / "predictions.npz",
-        row=np.array(rows),
-        prediction=prediction.astype(np.float32),
-        truth=truth,
-        tx_pos=np.zeros((len(rows), 3)),
-        reference_idw4=blend.astype(np.float32),
+        **{"row": np.array(rows), "tx_pos": np.zeros((len(rows), 3)), "truth": truth},
+        **{"prediction": prediction.astype(np.float32), "reference_idw4": blend.astype(np.float32)},
         receiver_name=[f"gateway{r}" for r in range(receivers or 1)],
     )
+    score, reference = (summary(ssim(values, truth)) for values in (prediction, blend))
     metrics = {
-        "task": "spectrum",
-        "dataset": "made/room",
-        "model": model,
-        "split": split,
-        "seed": seed,
-        "n_train": 20,
-        "n_test": len(rows),
-        "ssim": summary(ssim(prediction, truth)),
-        "ms_per_sample": 3.25,
-        "train_seconds": 61.5 if trained else 0.0,
-        "peak_memory_mb": 512.0,
-        "reference": {"idw4": {"median": summary(ssim(blend, truth))["median"]}},
+        **{"task": "spectrum", "dataset": "made/room", "model": model, "split": split, "seed": seed},
+        **{"n_train": 20, "n_test": len(rows), "ssim": score, "reference": {"idw4": {"median": reference["median"]}}},
+        **{"ms_per_sample": 3.25, "train_seconds": 61.5 if trained else 0.0, "peak_memory_mb": 512.0},
     }
     (path / "metrics.json").write_text(json.dumps(metrics))
     if trained:
@@ -68,17 +57,11 @@ def write_log(path):
     with (path / "log.jsonl").open("w") as file:
         # The last score is of rows that are trained on by then: it belongs in no picture.
         for step in range(5):
-            score = 0.2 * step if step else None
-            entry = {"step": step, "seconds": 10.0 * step, "loss": 1.0, "validation_score": score, "gaussians": 5}
-            entry["held_out"] = step < 4
-            file.write(json.dumps(entry) + "\n")
+            entry = {"step": step, "seconds": 10.0 * step, "loss": 1.0, "gaussians": 5, "held_out": step < 4}
+            file.write(json.dumps(entry | {"validation_score": 0.2 * step if step else None}) + "\n")
 
 
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
+@pytest.mark.usefixtures("undrawn")
 def test_table_contains_the_metrics_of_the_runs(tmp_path):
     good, bad = make_run(tmp_path / "good", seed=3), make_run(tmp_path / "bad", model="idw", noise=0.5, trained=False)
     page = compare([good, bad], tmp_path / "out")
@@ -116,19 +99,14 @@ def test_page_shows_every_picture_that_was_written(tmp_path):
     )
 
 
-def test_untrained_runs_have_no_training_picture(tmp_path):
-    page = compare([make_run(tmp_path / "idw", trained=False)], tmp_path / "out").read_text()
-    assert "<h3>Training</h3>" not in page
-    assert not (tmp_path / "out" / "room-training.png").exists()
-
-
-def test_blocked_run_shows_the_curves_of_its_folds(tmp_path):
+def test_training_is_drawn_of_trained_runs_and_of_the_folds_of_a_blocked_one(tmp_path):
     run = make_run(tmp_path / "blocked", split="blocked", trained=False)
+    assert "<h3>Training</h3>" not in compare([run], tmp_path / "untrained").read_text()
+    assert not (tmp_path / "untrained" / "room-training.png").exists()
     write_log(run / "fold0")
     write_log(run / "fold1")
-    assert read_run(run).validation == {
-        f"fold{k}": [(10.0, 0.2), (20.0, 0.4), (30.0, pytest.approx(0.6))] for k in (0, 1)
-    }
+    curve = [(10.0, 0.2), (20.0, 0.4), (30.0, pytest.approx(0.6))]
+    assert read_run(run).validation == {"fold0": curve, "fold1": curve}
     assert "<h3>Training</h3>" in compare([run], tmp_path / "out").read_text()
 
 
@@ -169,6 +147,7 @@ def test_runs_without_common_rows_leave_plots_empty(tmp_path, monkeypatch):
         assert of_b is None
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_reference_is_drawn_once_for_equal_rows(tmp_path, monkeypatch):
     calls = captured(monkeypatch, "score_cdf")
     runs = [make_run(tmp_path / "a"), make_run(tmp_path / "b", noise=0.2), make_run(tmp_path / "c", rows=[3, 4])]
@@ -191,6 +170,7 @@ def test_several_receivers_are_pooled_and_named(tmp_path, monkeypatch):
     assert all(re.fullmatch(r"row \d, gateway[01]", name) for name, _ in pictures[-1][0])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_runs_of_equal_names_get_different_names(tmp_path):
     compare([make_run(tmp_path / "x" / "run"), make_run(tmp_path / "y" / "run")], tmp_path / "out")
     assert [row["run"] for row in rows_of(tmp_path / "out" / "compare.csv")][:2] == ["x/run", "y/run"]
@@ -199,25 +179,21 @@ def test_runs_of_equal_names_get_different_names(tmp_path):
 def edit_metrics(**changes):
     def edit(run):
         metrics = json.loads((run / "metrics.json").read_text()) | changes
-        kept = {key: value for key, value in metrics.items() if value is not ...}
-        (run / "metrics.json").write_text(json.dumps(kept))
+        (run / "metrics.json").write_text(json.dumps({k: value for k, value in metrics.items() if value is not ...}))
 
     return edit
 
 
-def drop_array(key):
+def edit_arrays(change):
     def edit(run):
-        with np.load(run / "predictions.npz") as stored:
-            arrays = {name: stored[name] for name in stored if name != key}
+        arrays = arrays_in(run / "predictions.npz")
+        change(arrays)
         np.savez(run / "predictions.npz", **arrays)
 
     return edit
 
 
-def cut_truth(run):
-    with np.load(run / "predictions.npz") as stored:
-        arrays = dict(stored)
-    np.savez(run / "predictions.npz", **arrays | {"truth": arrays["truth"][:-1]})
+UNFINISHED_LOG = '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": true}\n{"st'
 
 
 @pytest.mark.parametrize(
@@ -227,16 +203,13 @@ def cut_truth(run):
         (remove("predictions.npz"), "predictions.npz: missing"),
         (write("metrics.json", "{"), "not readable"),
         (write("predictions.npz", "not a zip"), "predictions.npz: not readable"),
-        (
-            write("log.jsonl", '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": true}\n{"st'),
-            "line 2 is no log entry",
-        ),
+        (write("log.jsonl", UNFINISHED_LOG), "line 2 is no log entry"),
         (write("config.yaml", "seed: 1"), "format not stated, this version reads 4; train it anew"),
         (edit_metrics(task="rssi"), "no abs_error_db or no reference idw100"),
         (edit_metrics(n_test=...), "no n_test"),
         (edit_metrics(reference={}), "no reference idw4"),
-        (drop_array("reference_idw4"), "reference_idw4"),
-        (cut_truth, "shapes do not fit"),
+        (edit_arrays(lambda arrays: arrays.pop("reference_idw4")), "reference_idw4"),
+        (edit_arrays(lambda arrays: arrays.update(truth=arrays["truth"][:-1])), "shapes do not fit"),
     ],
 )
 def test_damaged_run_is_named_in_one_line_and_nothing_is_written(tmp_path, damage, message):
@@ -246,15 +219,18 @@ def test_damaged_run_is_named_in_one_line_and_nothing_is_written(tmp_path, damag
     assert not (tmp_path / "out").exists()
 
 
-def test_missing_repeated_or_no_folder_is_refused(tmp_path):
+def test_missing_repeated_or_other_folders_are_refused(tmp_path):
     run = make_run(tmp_path / "run")
-    for runs, message in [
+    for runs, message in (
         ([], "nothing to compare"),
         ([run, tmp_path / "no"], "no such folder"),
         ([run, run], "twice"),
-    ]:
+    ):
         with pytest.raises(InputError, match=message):
             compare(runs, tmp_path / "out")
+    with pytest.raises(InputError, match="something else than a comparison"):
+        compare([run], run)
+    assert (run / "metrics.json").is_file()
 
 
 def test_polar_picture_puts_a_lobe_at_its_azimuth_and_elevation(tmp_path):
@@ -274,6 +250,7 @@ def test_polar_picture_puts_a_lobe_at_its_azimuth_and_elevation(tmp_path):
     assert row == pytest.approx(middle * (1 - 30 / 90), abs=2)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_comparison_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     run, out = make_run(tmp_path / "run"), tmp_path / "out"
     compare([run], out)
@@ -290,10 +267,3 @@ def test_comparison_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
             compare([run], folder)
     assert (out / "index.html").read_text() == page
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "run"]
-
-
-def test_folders_of_other_content_are_refused(tmp_path):
-    run = make_run(tmp_path / "run")
-    with pytest.raises(InputError, match="something else than a comparison"):
-        compare([run], run)
-    assert (run / "metrics.json").is_file()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import re
 import shlex
 import shutil
@@ -16,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 from calling import SMALL
-from test_compare import captured, make_run
+from commands import rows_of
+from test_compare import captured, edit_metrics, make_run
 
 from wrf_mi.cli.main import build_parser
 from wrf_mi.cli.train import training_request
@@ -37,32 +36,20 @@ def strengths(
     name: str,
     error_db: Any,
     rows: Any = range(40),
-    seed: int | None = 0,
-    reference_db: float = 3.0,
+    seed: int = 0,
+    idw_db: float = 3.0,
     receivers: int = 1,
-    path: Path = Path(),
+    path: Any = "",
 ) -> Results:
-    """Signal strengths with given absolute errors, [m] or [n_rx, m]."""
+    """Signal strengths with given absolute errors, [m] or [n_rx, m], and those of IDW."""
     rows = np.array(rows)
     truth = np.stack([-50.0 - rows - receiver for receiver in range(receivers)])
     prediction = truth + np.broadcast_to(error_db, truth.shape)
     block = {"median": 1.0, "mean": float(np.nanmean(np.abs(prediction - truth)))}
-    return Results(
-        path / name,
-        name,
-        "rssi",
-        "flat",
-        {"abs_error_db": block, "split": "official", "model": name},
-        seed,
-        tuple(f"anchor{k}" for k in range(receivers)),
-        rows,
-        np.zeros((len(rows), 3)),
-        prediction,
-        truth,
-        {"idw100": truth + reference_db},
-        None,
-        {},
-    )
+    metrics = {"abs_error_db": block, "split": "official", "model": name}
+    names, nowhere = tuple(f"anchor{k}" for k in range(receivers)), np.zeros((len(rows), 3))
+    stated = (Path(path) / name, name, "rssi", "flat", metrics, seed, names)
+    return Results(*stated, rows, nowhere, prediction, truth, {"idw100": truth + idw_db}, None, {})
 
 
 def verdicts(runs: list[Results]) -> dict[tuple[str, str], str]:
@@ -107,8 +94,8 @@ def test_only_rows_with_the_same_truth_and_both_predictions_are_compared() -> No
 def test_receivers_of_a_row_count_as_one_observation() -> None:
     """Their errors are not independent: two copies of a receiver leave the interval as it is."""
     error = np.random.default_rng(1).uniform(1, 3, 40)
-    single = differences([strengths("a", error, reference_db=2.0)])[0]
-    double = differences([strengths("a", np.stack([error, error]), reference_db=2.0, receivers=2)])[0]
+    single = differences([strengths("a", error, idw_db=2.0)])[0]
+    double = differences([strengths("a", np.stack([error, error]), idw_db=2.0, receivers=2)])[0]
     assert (single.rows, double.rows) == (40, 40)
     assert (single.low, single.high) == (double.low, double.high)
 
@@ -124,10 +111,9 @@ def seeds(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> list[P
 
 
 def test_all_seeds_must_agree(seeds: list[Path]) -> None:
-    errors = (1.0, 1.0, 3.5)
     runs = [
         strengths(path.name, error, seed=k, path=path.parent)
-        for k, (path, error) in enumerate(zip(seeds, errors, strict=True))
+        for k, (path, error) in enumerate(zip(seeds, (1.0, 1.0, 3.5), strict=True))
     ]
     runs.append(strengths("worst", 5.0))
     found = verdicts(runs)
@@ -140,22 +126,17 @@ def test_all_seeds_must_agree(seeds: list[Path]) -> None:
 
 def every_run(folder: Path, flat_folder: Path) -> list[tuple[Path, dict[str, Any]]]:
     """Data and arguments of `plan_run` that differ much from the defaults."""
-    antennas = AntennaOptions(rx_pattern="dipole", tx_polarization="H")
-    small = SMALL[:-1]
+    antennas, scene = AntennaOptions(rx_pattern="dipole", tx_polarization="H"), {"scene": flat_folder / "room"}
+    fitted = {"settings": [*SMALL[:-1], "steps=7"], "seed": 3, "split": "random", "n_train": 0.5}
+    pixel = {"settings": ["loss.ssim_weight=0.25"], "receiver": "pixel", "deterministic": True}
     return [
-        (folder, {"model": "wrf-gs+", "settings": [*small, "steps=7"], "seed": 3, "split": "random", "n_train": 0.5}),
-        (
-            folder,
-            {"model": "wrf-gs", "settings": ["loss.ssim_weight=0.25"], "receiver": "pixel", "deterministic": True},
-        ),
+        (folder, {"model": "wrf-gs+", **fitted}),
+        (folder, {"model": "wrf-gs", **pixel}),
         (folder, {"model": "factorised", "evaluation": "splatted", "split": "blocked:1"}),
         (flat_folder, {"model": "kriging", "intervals": True, "n_train": 20}),
-        (flat_folder, {"model": "hybrid", "scene": flat_folder / "room", "antennas": antennas}),
-        (
-            flat_folder,
-            {"model": "ray-tracing", "scene": flat_folder / "room", "settings": ["depth=1", "rays=4096"]},
-        ),
-        (flat_folder, {"model": "wrf-gs+", "scene": flat_folder / "room", "settings": ["traced.depth=1"]}),
+        (flat_folder, {"model": "hybrid", "antennas": antennas, **scene}),
+        (flat_folder, {"model": "ray-tracing", "settings": ["depth=1", "rays=4096"], **scene}),
+        (flat_folder, {"model": "wrf-gs+", "settings": ["traced.depth=1"], **scene}),
     ]
 
 
@@ -175,6 +156,7 @@ def test_commands_parse_and_give_the_same_configuration(folder: Path, flat_folde
         assert again == config, line
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_settings_of_a_run_are_those_that_differ(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
     steps = [*SMALL, "loss.ssim_weight=0.25"]
     run = train(folder, tmp_path / "run", "wrf-gs+", settings=steps, seed=2).folder
@@ -210,11 +192,11 @@ class Tags(HTMLParser):
             assert self.open.pop() == tag
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_page_is_one_well_formed_file_of_several_data_sets(tmp_path: Path) -> None:
     runs = [make_run(tmp_path / "a<b>&"), make_run(tmp_path / "second", noise=0.4, model="idw")]
     other = make_run(tmp_path / "other")
-    metrics = json.loads((other / "metrics.json").read_text()) | {"dataset": "another/<place>"}
-    (other / "metrics.json").write_text(json.dumps(metrics))
+    edit_metrics(dataset="another/<place>")(other)
     page = compare([*runs, other], tmp_path / "out").read_text()
     tags = Tags()
     tags.feed(page)
@@ -225,8 +207,7 @@ def test_page_is_one_well_formed_file_of_several_data_sets(tmp_path: Path) -> No
     assert page.count("<h2 ") == 2
     assert "6 test rows are common to all runs" in page
     assert "higher is better" in page
-    with (tmp_path / "out" / "differences.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = rows_of(tmp_path / "out" / "differences.csv")
     assert [(row["run"], row["against"], row["verdict"]) for row in rows] == [
         ("a<b>&", "IDW of 4 nearest", "better"),
         ("second", "a<b>&", "worse"),

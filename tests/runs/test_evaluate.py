@@ -1,4 +1,4 @@
-"""Scores of signal strengths and channel coefficients: blocks of metrics, predictions, run folders and pooling."""
+"""Scores of signal strengths and channels: metrics, predictions, pooling, and gains over a constant prediction."""
 
 from __future__ import annotations
 
@@ -8,13 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calling import SET
+from commands import Command, arrays_in
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_building import TESTED, TRAINED, building
+from made_channels import channels
 
-from wrf_mi.core import InputError, Receiver, Record
-from wrf_mi.datasets import make_splits
+from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.datasets import make_splits, write_ble_folder, write_nerf2_csi
 from wrf_mi.runs.evaluate import evaluate, pool, write_results
-from wrf_mi.runs.results import Results, read_run
+from wrf_mi.runs.results import CONSTANT, Results, against_constant, constant_scores, read_run, unbeaten
 from wrf_mi.tasks import TASKS
-from wrf_mi.tasks.scores import abs_error_db, cea_db
+from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim
 
 ROWS = 40
 FLOAT32 = 1e-5
@@ -33,15 +39,9 @@ def record(task: str, receivers: int, subcarriers: int = 3) -> Record:
     else:
         shape = (*shape, subcarriers)
         observation = (rng.normal(size=shape) + 1j * rng.normal(size=shape)).astype(np.complex64)
-    return Record(
-        name="made-up",
-        task=task,
-        tx_pos_m=rng.normal(size=(ROWS, 3)),
-        receivers=tuple(Receiver(f"anchor{r}", rng.normal(size=3), np.array([0.0, 0, 0, 1])) for r in range(receivers)),
-        observation=observation,
-        official=(np.arange(30), np.arange(30, ROWS)),
-        folds=np.arange(ROWS) % 4,
-    )
+    receiver = [Receiver(f"anchor{r}", rng.normal(size=3), np.array([0.0, 0, 0, 1])) for r in range(receivers)]
+    known = {"official": (np.arange(30), np.arange(30, ROWS)), "folds": np.arange(ROWS) % 4}
+    return Record("made-up", task, rng.normal(size=(ROWS, 3)), tuple(receiver), observation, **known)
 
 
 class Off:
@@ -79,9 +79,8 @@ def test_signal_strengths_of_one_receiver(tmp_path: Path):
     run = stored(tmp_path / "run", metrics, arrays)
     with np.load(tmp_path / "run" / "predictions.npz") as file:
         assert sorted(file) == ["prediction", "receiver_name", "reference_idw100", "row", "truth", "tx_pos"]
-        assert {key: file[key].dtype for key in ("prediction", "truth", "reference_idw100")} == dict.fromkeys(
-            ("prediction", "truth", "reference_idw100"), np.dtype(np.float32)
-        )
+        for key in ("prediction", "truth", "reference_idw100"):
+            assert file[key].dtype == np.float32
         assert file["prediction"].shape == (8,)
     assert (run.task, run.dataset, run.receivers) == ("rssi", "made-up", ("anchor0",))
     assert run.prediction.shape == run.truth.shape == run.reference.shape == (1, 8)
@@ -176,18 +175,14 @@ def test_rows_that_cannot_be_scored_are_refused():
 )
 def test_run_folders_of_another_task_are_named(tmp_path: Path, task: str, change: dict, message: str):
     _, [(metrics, arrays)] = scored(task, 1)
-    stored(tmp_path / "run", metrics, arrays)
-    path = tmp_path / "run" / "metrics.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(InputError, match=message):
-        read_run(tmp_path / "run")
+        stored(tmp_path / "run", metrics | change, arrays)
 
 
 def test_predictions_of_another_shape_are_named(tmp_path: Path):
     _, [(metrics, arrays)] = scored("rssi", 2)
     stored(tmp_path / "run", metrics, arrays)
-    with np.load(tmp_path / "run" / "predictions.npz") as file:
-        kept = dict(file)
+    kept = arrays_in(tmp_path / "run" / "predictions.npz")
     for wrong in (
         {"truth": kept["truth"][:, 1:]},
         {"prediction": kept["prediction"][..., None]},
@@ -197,3 +192,101 @@ def test_predictions_of_another_shape_are_named(tmp_path: Path):
         np.savez(tmp_path / "run" / "predictions.npz", **kept | wrong)
         with pytest.raises(InputError, match=r"shapes do not fit together .*; run evaluate to write it anew"):
             read_run(tmp_path / "run")
+
+
+LINE = r"is no better than predicting "
+
+
+def noise(record: Record) -> Record:
+    """The record with strengths that do not depend on the position."""
+    drawn = np.random.default_rng(1).normal(-60, 5, record.observation.shape)
+    return replace(record, observation=drawn.astype(np.float32))
+
+
+def test_strengths_are_predicted_by_the_mean_of_the_receiver() -> None:
+    record = building(attic=(1, 2, 3, 45))
+    (split,) = make_splits(record, "official")
+    truth = record.observation[:, split.test]
+    found = constant_scores(record, split, truth)
+    for receiver in range(4):
+        mean_dbm = np.nanmean(record.observation[receiver, :TRAINED])
+        np.testing.assert_allclose(found[receiver], np.abs(truth[receiver] - mean_dbm), atol=FLOAT32)
+    assert np.isfinite(found[3]).sum() == 1
+
+
+def test_receivers_that_are_held_out_take_the_mean_of_the_others() -> None:
+    record, tested = building(), np.arange(TRAINED, TRAINED + TESTED)
+    split = Split("mine", 0, np.arange(TRAINED), np.zeros(0, np.int64), tested, held_receivers=(0,))
+    truth = record.observation[:, split.test]
+    expected = np.abs(truth[0] - record.observation[1:, :TRAINED].mean())
+    np.testing.assert_allclose(constant_scores(record, split, truth)[0], expected, atol=FLOAT32)
+
+
+def test_spectra_are_predicted_by_the_mean_spectrum(one_gateway: Record) -> None:
+    split = Split("mine", 0, np.arange(16), np.zeros(0, np.int64), np.arange(16, 24))
+    truth = one_gateway.observation[:, split.test]
+    mean = one_gateway.observation[0, :16].mean(axis=0)
+    np.testing.assert_allclose(constant_scores(one_gateway, split, truth)[0], ssim([mean] * 8, truth[0]), atol=FLOAT32)
+
+
+def test_channels_are_predicted_by_zero() -> None:
+    record = channels()
+    (split,) = make_splits(record, "official")
+    np.testing.assert_array_equal(constant_scores(record, split, record.scored[:, split.test]), 0)
+
+
+@pytest.mark.parametrize("task", ["rssi", "csi"])
+@settings(deadline=None, max_examples=30)
+@given(st.floats(-3, 3), st.integers(0, 99))
+def test_a_gain_counts_beyond_its_standard_error(task: str, gain: float, seed: int) -> None:
+    scorer, rng = TASKS[task], np.random.default_rng(seed)
+    constant = rng.uniform(2, 6, (2, 30))
+    sign = 1 if scorer.higher_is_better else -1
+    scores = constant + sign * (gain + rng.normal(0, 1, (2, 30)))
+    block = against_constant(scorer, scores, constant)
+    assert block["gain"] == pytest.approx(gain, abs=1)  # seven standard errors
+    better = sign * np.median(scores) > sign * np.median(constant)
+    assert block["beaten"] == (block["gain"] > max(block["gain_error"], 0.01) and better)
+
+
+@pytest.mark.parametrize("task", ["rssi", "csi", "spectrum"])
+def test_a_prediction_as_good_as_the_constant_does_not_beat_it(task: str) -> None:
+    scores = np.random.default_rng(0).uniform(0, 1, (1, 20))
+    sign = 1 if TASKS[task].higher_is_better else -1
+    for gain in (0.0, 1e-4):
+        assert not against_constant(TASKS[task], scores + sign * gain, scores)["beaten"]
+
+
+def test_folds_are_scored_together() -> None:
+    record = building()
+    for split in make_splits(record, "blocked"):
+        metrics, _ = evaluate(record, split, lambda rows, receiver: record.observation[receiver, rows])
+        assert metrics[CONSTANT]["beaten"]
+
+
+@pytest.mark.parametrize("model", ["idw", "kriging", "mri", "trees"])
+@pytest.mark.parametrize("beaten", [True, False], ids=["office", "noise"])
+def test_a_model_of_strengths_without_place_says_so(beaten: bool, model: str, tmp_path: Path, command: Command) -> None:
+    record, run = building(), tmp_path / "run"
+    folder = write_ble_folder(tmp_path / "data", record if beaten else noise(record))
+    *_, line, last = command.done(["train", folder, "--model", model, "--out", run]).splitlines()
+    assert json.loads((run / "metrics.json").read_text())[CONSTANT]["beaten"] == beaten
+    assert last == f"results: {run}"
+    assert (f"{model} {LINE}the mean of each receiver's training rows" in line) != beaten
+    assert (LINE in command.done(["evaluate", run])) != beaten
+
+
+@pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+", "idw"])
+def test_a_model_of_channels_that_predicts_no_more_than_zero_says_so(
+    model: str, tmp_path: Path, command: Command
+) -> None:
+    record = channels()
+    turned = np.exp(2j * np.pi * np.random.default_rng(0).random(len(record)))  # a phase that no position tells
+    record = replace(record, observation=record.observation * turned[:, None, None].astype(np.complex64))
+    folder, few = write_nerf2_csi(tmp_path / "data", record), SET if model != "idw" else []
+    out = command.done(["train", folder, "--model", model, "--out", tmp_path / "run", *few])
+    assert f"{model} {LINE}zero: CEA (dB), median " in out.splitlines()[-2]
+
+
+def test_a_run_of_an_earlier_version_has_no_such_line() -> None:
+    assert unbeaten({"task": "rssi"}) is None

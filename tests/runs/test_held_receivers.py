@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import tempfile
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from calling import copied
+from commands import arrays_in
 from spectrum_records import make_record
 from test_compare import captured
 
@@ -20,6 +24,7 @@ from wrf_mi.models.model import Problem, Session, default_settings
 from wrf_mi.runs.api import evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
+from wrf_mi.runs.run import Run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing.tracer import fit_offsets
 from wrf_mi.training.selection import HeldOut, hold_out
@@ -29,7 +34,7 @@ ROUNDING_DB = 1e-4
 """Predictions are stored as float32."""
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def law() -> Record:
     """Signal strengths of four receivers that follow one path-loss law, but for an offset of each."""
     rng = np.random.default_rng(0)
@@ -40,6 +45,15 @@ def law() -> Record:
     observation = LAW_DBM - 10 * EXPONENT * np.log10(distance) + np.array([-3.0, 1, 2, 9])[:, None]
     known = {"frequencies_hz": np.array([2.44e9]), "official": (np.arange(40), np.arange(40, 60))}
     return Record("law", "rssi", positions_m, receivers, observation.astype(np.float32), **known)
+
+
+Fit = Callable[..., Run]
+
+
+@pytest.fixture(scope="module")
+def fitted(law: Record, tmp_path_factory: pytest.TempPathFactory) -> Fit:
+    """Fits a model to the law's record with a split, once for all tests."""
+    return cache(lambda model, split: train(law, tmp_path_factory.mktemp("runs") / "run", model, split=split))
 
 
 def test_a_held_out_receiver_takes_the_law_of_the_others(law: Record, tmp_path: Path) -> None:
@@ -55,39 +69,46 @@ def test_a_held_out_receiver_takes_the_law_of_the_others(law: Record, tmp_path: 
     # The mean offset of the three others, to which distances are not exactly alike, is 9 dB below.
     assert run.metrics["abs_error_db"]["median"] == pytest.approx(9, abs=1)
     assert evaluate_run(run.folder)["abs_error_db"] == run.metrics["abs_error_db"]
-    pooled = train(folder, tmp_path / "all", "mri", split="receiver").metrics
-    assert pooled["n_test"] == 80
+    assert train(folder, tmp_path / "all", "mri", split="receiver").metrics["n_test"] == 80
 
 
-@pytest.mark.parametrize("name", ["mri", "kriging"])
-def test_what_held_out_receivers_observed_changes_no_fit(name: str, law: Record, tmp_path: Path) -> None:
-    broken = law.observation.copy()
-    broken[3, :40] = 1e6 * np.arange(40)
-    runs = [
-        train(record, tmp_path / data, name, split="receiver:3")
-        for data, record in (("as-is", law), ("broken", replace(law, observation=broken)))
-    ]
-    first, second = (np.load(run.folder / "model.npz") for run in runs)
-    for key in first.files:
+@pytest.mark.parametrize(
+    ("name", "split"),
+    [("mri", "receiver:3"), ("kriging", "receiver:3")]
+    + [(name, "receiver+12:3") for name in ("kriging", "mri", "hybrid")],
+)
+def test_what_new_receivers_observed_changes_no_fit_but_in_rows_left(
+    name: str, split: str, law: Record, fitted: Fit, tmp_path: Path
+) -> None:
+    """The last receiver is held out, but for twelve rows in some cases."""
+    left = make_splits(law, split)[0].left[:, 1]
+    observation = law.observation.copy()
+    hidden = np.setdiff1d(np.arange(40), left)
+    observation[3, hidden] = 1e6 * (1 + hidden)
+    expected = fitted(name, split)
+    broken = train(replace(law, observation=observation), tmp_path / "broken", name, split=split)
+    arrays, found = (arrays_in(run.folder / "model.npz") for run in (expected, broken))
+    for key in arrays:
         if not key.startswith("run/") and key != CHECKSUM:
-            np.testing.assert_array_equal(first[key], second[key])
-    assert runs[0].metrics["reference"] == runs[1].metrics["reference"]
+            np.testing.assert_array_equal(found[key], arrays[key], err_msg=key)
+    np.testing.assert_array_equal(read_run(broken.folder).prediction, read_run(expected.folder).prediction)
+    assert broken.metrics["reference"] == expected.metrics["reference"]
 
 
-def test_a_common_law_with_offsets_is_stated_with_its_uncertainty(law: Record, tmp_path: Path) -> None:
+def test_a_common_law_with_offsets_is_stated_with_its_uncertainty(fitted: Fit) -> None:
     """The model's receivers share a law, and each has an offset of 4 dB a priori: 9 dB lie inside 90 % hardly."""
-    run = train(law, tmp_path / "run", "kriging", split="receiver:3")
-    inner, outer = (read_run(r.folder) for r in (train(law, tmp_path / "in", "kriging"), run))
-    stds = [np.load(one.path / "predictions.npz")["std"][3] for one in (inner, outer)]
-    assert stds[1].mean() > stds[0].mean() + 1
-    near = train(law, tmp_path / "near", "kriging", split="receiver:1").metrics
+    inner, outer = (
+        arrays_in(fitted("kriging", split).folder / "predictions.npz")["std"][3] for split in ("official", "receiver:3")
+    )
+    assert outer.mean() > inner.mean() + 1
+    near, far = (fitted("kriging", split).metrics for split in ("receiver:1", "receiver:3"))
     assert near["inside_90"] == 1
-    assert near["abs_error_db"]["median"] < run.metrics["abs_error_db"]["median"]
+    assert near["abs_error_db"]["median"] < far["abs_error_db"]["median"]
 
 
-def test_the_hybrid_chooses_on_receivers_that_are_held_out(law: Record, tmp_path: Path) -> None:
+def test_the_hybrid_chooses_on_receivers_that_are_held_out(law: Record, fitted: Fit) -> None:
     """Offsets of the receivers are unlike: a law with an offset of each is as good as one law at a new receiver."""
-    run = train(law, tmp_path / "run", "hybrid", split="receiver:1")
+    run = fitted("hybrid", "receiver:1")
     assert set(run.metrics["held_out"]) == {"kriging", "hybrid"}
     assert run.metrics["held_out"]["hybrid"] < 10  # an offset of 9 dB
     assert run.metrics["inside_90"] == 1
@@ -99,13 +120,12 @@ def test_the_hybrid_chooses_on_receivers_that_are_held_out(law: Record, tmp_path
     assert fold.held_receivers in ((1, 0), (1, 2), (1, 3))
 
 
-def test_few_rows_at_a_new_receiver_give_its_offset(law: Record, tmp_path: Path) -> None:
+def test_few_rows_at_a_new_receiver_give_its_offset(fitted: Fit) -> None:
     """Five rows: the offset of 9 dB is known; the distances, from the rows of the others."""
-    none, few = (train(law, tmp_path / name, "kriging", split=name).metrics for name in ("receiver:3", "receiver+5:3"))
-    assert few["abs_error_db"]["median"] < 1 < 5 < none["abs_error_db"]["median"]
-    assert few["receivers"]["anchor3"]["n_test"] == 20
-    hybrid = train(law, tmp_path / "hybrid", "hybrid", split="receiver+5:3").metrics
-    assert hybrid["abs_error_db"]["median"] < 1
+    few, error_db = fitted("kriging", "receiver+5:3"), lambda run: run.metrics["abs_error_db"]["median"]
+    assert error_db(few) < 1 < 5 < error_db(fitted("kriging", "receiver:3"))
+    assert few.metrics["receivers"]["anchor3"]["n_test"] == 20
+    assert error_db(fitted("hybrid", "receiver+5:3")) < 1
 
 
 def test_a_part_of_the_rows_left_to_new_receivers_is_held_out(law: Record) -> None:
@@ -123,20 +143,7 @@ def test_a_part_of_the_rows_left_to_new_receivers_is_held_out(law: Record) -> No
     assert set(own) < set(split.left[:, 1])  # the others train
 
 
-@pytest.mark.parametrize("name", ["kriging", "mri", "hybrid"])
-def test_rows_that_are_not_left_change_no_fit(name: str, law: Record, tmp_path: Path) -> None:
-    split = make_splits(law, "receiver+12:3")[0]
-    broken = law.observation.copy()
-    broken[3, np.setdiff1d(np.arange(40), split.left[:, 1])] = 1e6
-    runs = [
-        train(record, tmp_path / data, name, split=split)
-        for data, record in (("as-is", law), ("broken", replace(law, observation=broken)))
-    ]
-    found = [read_run(run.folder) for run in runs]
-    np.testing.assert_array_equal(found[0].prediction, found[1].prediction)
-
-
-def test_held_out_predictions_are_those_of_their_receivers(law: Record) -> None:
+def test_held_out_predictions_are_those_of_their_receivers(law: Record, tmp_path: Path) -> None:
     """Two receivers a fold, in an order of its own: a prediction stands beside what its receiver observed."""
     places = np.concatenate([[one.position_m for one in law.receivers], [[3.0, 0, 1], [0, 3, 1], [3, 6, 1]]])
     receivers = tuple(replace(law.receivers[0], name=f"anchor{k}", position_m=place) for k, place in enumerate(places))
@@ -150,9 +157,7 @@ def test_held_out_predictions_are_those_of_their_receivers(law: Record) -> None:
     assert len(fold.held_receivers) > 2
     fold = replace(fold, held_receivers=tuple(reversed(fold.held_receivers)))
     held = HeldOut.of(problem.record, fold, 0)
-    with tempfile.TemporaryDirectory() as folder:
-        session = Session(Path(folder), Path(folder))
-        found = held_out_predictions(entry, problem, fold, held, session, "mri").mean
+    found = held_out_predictions(entry, problem, fold, held, Session(tmp_path, tmp_path), "mri").mean
     np.testing.assert_allclose(found, held.observed(record), atol=0.05)  # one law without noise; dB
 
 
@@ -165,28 +170,27 @@ def test_intervals_of_any_model_at_new_receivers(law: Record, tmp_path: Path) ->
         train(law, tmp_path / "two", "mri", split=two, intervals=True)
 
 
-def test_a_stopped_run_goes_on_without_the_held_out_receivers(law: Record, tmp_path: Path) -> None:
-    run = train(law, tmp_path / "run", "mri", split="receiver:1")
-    before = run.metrics
-    (run.folder / "model.npz").unlink()
-    (run.folder / "metrics.json").unlink()
-    assert resume(run.folder, record=law).metrics["abs_error_db"] == before["abs_error_db"]
+def test_a_stopped_run_goes_on_without_the_held_out_receivers(law: Record, fitted: Fit, tmp_path: Path) -> None:
+    finished = fitted("mri", "receiver:1")
+    run = copied(finished.folder, tmp_path / "run")
+    (run / "model.npz").unlink()
+    (run / "metrics.json").unlink()
+    assert resume(run, record=law).metrics["abs_error_db"] == finished.metrics["abs_error_db"]
 
 
-@pytest.fixture
-def hall(tmp_path: Path) -> str:
-    """Scene of a hall around the receivers."""
-    layout = tmp_path / "layout.csv"
-    layout.write_text("x,y\n-3,-3\n9,-3\n9,9\n-3,9\n-3,-3\n", encoding="utf-8")
-    return str(make_scene(layout, tmp_path / "scene", height_m=8.0).folder)
-
-
-def test_calibrated_strengths_take_the_mean_gain(law: Record, hall: str, tmp_path: Path) -> None:
+def test_traced_strengths_take_the_mean_gain_or_offset(law: Record, tmp_path: Path) -> None:
+    """In a hall around the receivers, of which one is held out."""
+    (tmp_path / "layout.csv").write_text("x,y\n-3,-3\n9,-3\n9,9\n-3,9\n-3,-3\n")
+    hall = make_scene(tmp_path / "layout.csv", tmp_path / "scene", height_m=8.0).folder
+    traced: dict[str, Any] = {"model": "ray-tracing", "scene": hall, "split": "receiver:2"}
+    plain = train(law, tmp_path / "run", settings=["depth=1"], **traced).folder
+    offset_db = arrays_in(plain / "model.npz")["offset_db"]
+    assert offset_db[2] == pytest.approx(offset_db[[0, 1, 3]].mean())
     settings = ["depth=1", "calibration=gain", "steps=40", "validate_every=20"]
-    run = train(law, tmp_path / "run", "ray-tracing", scene=hall, split="receiver:2", settings=settings)
-    gain = {k: np.load(run.folder / "model.npz")[f"param/receiver.anchor{k}.gain"] for k in range(4)}
+    run = train(law, tmp_path / "calibrated", settings=settings, **traced).folder
+    gain = [arrays_in(run / "model.npz")[f"param/receiver.anchor{k}.gain"] for k in range(4)]
     np.testing.assert_allclose(gain[2], np.mean([gain[0], gain[1], gain[3]], axis=0), rtol=1e-6)
-    assert np.isfinite(read_run(run.folder).prediction[2]).all()
+    assert np.isfinite(read_run(run).prediction[2]).all()
     assert np.ptp([gain[k][0] for k in (0, 1, 3)]) > 0.3  # offsets of -3, 1 and 9 dB
 
 
@@ -196,22 +200,16 @@ def test_gaussians_are_seen_from_the_pose_of_a_new_receiver(name: str, law: Reco
     receivers = (*law.receivers, replace(law.receivers[1], name="copy"))
     record = replace(law, receivers=receivers, observation=np.concatenate([law.observation, law.observation[1:2]]))
     split = replace(make_splits(law, "official")[0], held_receivers=(4,))
-    settings = ["steps=60", "validate_every=30", "initial.gaussians=40"]
+    settings = ["steps=20", "validate_every=10", "initial.gaussians=40"]
     run = train(record, tmp_path / "run", name, split=split, settings=settings)
-    level = np.load(run.folder / "model.npz")["param/level"][0]
+    level = arrays_in(run.folder / "model.npz")["param/level"][0]
     assert level[4] == pytest.approx(level[:4].mean(), rel=1e-6)
     model = open_run(run.folder, record)
-    copied, known = (model.predict(law.tx_pos_m[40:], who).mean for who in ("copy", "anchor1"))
-    np.testing.assert_allclose(copied - known, 20 / np.log(10) * (level[4] - level[1]), atol=1e-2)
+    clone, known = (model.predict(law.tx_pos_m[40:], receiver).mean for receiver in ("copy", "anchor1"))
+    np.testing.assert_allclose(clone - known, 20 / np.log(10) * (level[4] - level[1]), atol=1e-2)
     broken = np.where(np.arange(5)[:, None] == 4, 1e6, record.observation).astype(np.float32)
     again = train(replace(record, observation=broken), tmp_path / "broken", name, split=split, settings=settings)
-    np.testing.assert_allclose(np.load(again.folder / "model.npz")["param/level"][0], level, rtol=1e-3)
-
-
-def test_traced_strengths_take_the_mean_offset(law: Record, hall: str, tmp_path: Path) -> None:
-    run = train(law, tmp_path / "run", "ray-tracing", scene=hall, split="receiver:2", settings=["depth=1"])
-    offset_db = np.load(run.folder / "model.npz")["offset_db"]
-    assert offset_db[2] == pytest.approx(offset_db[[0, 1, 3]].mean())
+    np.testing.assert_allclose(arrays_in(again.folder / "model.npz")["param/level"][0], level, rtol=1e-3)
 
 
 def test_offsets_of_receivers_that_heard_nothing() -> None:
@@ -254,11 +252,10 @@ def test_all_receivers_held_out_are_refused(law: Record, tmp_path: Path) -> None
 
 
 def test_pictures_of_a_comparison_show_the_receivers_that_were_held_out(
-    law: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fitted: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     maps = captured(monkeypatch, "position_table")
-    run = train(law, tmp_path / "run", "mri", split="receiver:3")
-    compare([run.folder], tmp_path / "compare")
+    compare([fitted("mri", "receiver:3").folder], tmp_path / "compare")
     shown = [[name for name, _ in rows] for rows, *_ in maps]
     assert ["anchor3"] in shown
     assert not any("anchor0" in names for names in shown)

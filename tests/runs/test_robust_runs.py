@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import threading
+import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import contents, copied, refused
+from calling import contents, copied
+from commands import Command, arrays_in
 from small_fits import settings, stop_after
 
 from wrf_mi.core import InputError
@@ -30,9 +31,16 @@ DEAD = 2**22 + 1
 
 @pytest.fixture(scope="module")
 def kriging(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(
-        flat_folder, tmp_path_factory.mktemp("runs") / "kriging", "kriging", settings=("heading=false", "generic=true")
-    ).folder
+    out = tmp_path_factory.mktemp("runs") / "kriging"
+    return train(flat_folder, out, "kriging", settings=("heading=false", "generic=true")).folder
+
+
+@pytest.fixture(scope="module")
+def stopped(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "stopped"
+    with pytest.raises(Interrupted):
+        train(folder, out, "wrf-gs+", settings=settings("steps=10"), stop=stop_after(4))
+    return out
 
 
 def test_a_folder_has_one_writer(tmp_path: Path) -> None:
@@ -71,19 +79,10 @@ def test_a_run_that_ctrl_c_ends_before_its_configuration_is_begun_again(
 
 
 def test_two_threads_do_not_fit_at_a_time(flat_folder: Path, tmp_path: Path) -> None:
-    found: list[str] = []
-
-    def other() -> None:
-        try:
-            train(flat_folder, tmp_path / "run", "idw")
-        except InputError as error:
-            found.append(str(error))
-
-    with alone_in_process():
-        thread = threading.Thread(target=other)
-        thread.start()
-        thread.join()
-    assert found[0].startswith("another thread of this process fits or scores a model; wait for its end")
+    with alone_in_process(), ThreadPoolExecutor(1) as other:
+        error = other.submit(train, flat_folder, tmp_path / "run", "idw").exception()
+    assert isinstance(error, InputError)
+    assert str(error).startswith("another thread of this process fits or scores a model; wait for its end")
     assert not (tmp_path / "run").exists()
 
 
@@ -105,17 +104,6 @@ def test_damaged_lines_of_the_log_are_dropped(tmp_path: Path) -> None:
     assert (tmp_path / "log.jsonl").read_bytes() == whole
 
 
-def test_changed_arrays_are_noticed(kriging: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = kriging / "model.npz"
-    whole = file.read_bytes()
-    with np.load(file) as held:
-        arrays = dict(held)
-    name = next(key for key in arrays if key.endswith("weights"))
-    np.savez(file, **arrays | {name: arrays[name] + 1})
-    refused(["evaluate", kriging], "model.npz: not readable .*another checksum.*; train the run anew", capsys)
-    file.write_bytes(whole)
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_arrays_that_are_not_finite_are_refused(name: str, tmp_path: Path) -> None:
     """Of every model, those excepted that it states."""
@@ -129,23 +117,29 @@ def test_arrays_that_are_not_finite_are_refused(name: str, tmp_path: Path) -> No
         assert len(read_fitted(tmp_path, entry)[0]) == len(set(entry.gaps))
 
 
-def test_a_run_whose_arrays_are_not_finite_is_not_opened(
-    kriging: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("factor", "checksum", "message"),
+    [
+        (2, False, "not readable .*another checksum.*; train the run anew"),
+        (np.nan, True, "array .*weights: .* values are not finite; train the run anew"),
+    ],
+    ids=["changed", "not finite"],
+)
+def test_a_run_whose_arrays_were_changed_is_not_opened(
+    factor: float, checksum: bool, message: str, kriging: Path, tmp_path: Path, command: Command
 ) -> None:
     file = copied(kriging, tmp_path / "run") / "model.npz"
-    arrays = stored_arrays(file)
+    arrays = stored_arrays(file) if checksum else arrays_in(file)
     name = next(key for key in arrays if key.endswith("weights"))
-    arrays[name] = arrays[name] * np.nan
-    write_arrays(file, arrays, checksum=True)
-    refused(["evaluate", file.parent], f"model.npz: array {name}: .* values are not finite; train the run anew", capsys)
+    arrays[name] = arrays[name] * factor
+    write_arrays(file, arrays, checksum=True) if checksum else np.savez(file, **arrays)
+    command.refused(["evaluate", file.parent], f"model.npz: {message}")
 
 
 @pytest.mark.parametrize("change", ["shape", "nan"])
-def test_a_checkpoint_of_other_arrays_is_refused(change: str, folder: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_of_other_arrays_is_refused(change: str, stopped: Path, tmp_path: Path) -> None:
     """They are refused before the backend, which ends the process on other shapes."""
-    with pytest.raises(Interrupted):
-        train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=10"), stop=stop_after(4))
-    file = tmp_path / "run" / "checkpoint.npz"
+    file = copied(stopped, tmp_path / "run") / "checkpoint.npz"
     arrays = stored_arrays(file)
     for group in ("param", "mean", "first", "second"):
         values = arrays[f"{group}/deform.0.bias"]
@@ -188,13 +182,7 @@ def test_chunks_give_the_predictions_of_all_at_once(
 
 
 @pytest.mark.parametrize("line", ["dataset: [1]", "seed: x", "task: 5", "n_train: {a: 1}", "model: [a]"])
-def test_odd_configurations_are_refused(
-    line: str, kriging: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = (kriging / "config.yaml").read_text().splitlines()
-    key = line.partition(":")[0]
-    run = tmp_path / "run"
-    run.mkdir()
-    (run / "config.yaml").write_text("\n".join(line if one.startswith(f"{key}:") else one for one in text))
-    refused(["evaluate", run], "config.yaml", capsys)
-    assert json.loads((kriging / "metrics.json").read_text())["model"] == "kriging"
+def test_odd_configurations_are_refused(line: str, kriging: Path, tmp_path: Path, command: Command) -> None:
+    text = (kriging / "config.yaml").read_text()
+    (tmp_path / "config.yaml").write_text(re.sub(rf"(?m)^{line.partition(':')[0]}:.*$", line, text))
+    command.refused(["evaluate", tmp_path], "config.yaml")

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from calling import call, refused, stored, strength_commands
+from calling import SMALL, scored_again_as_before, strength_commands
+from commands import Command
 from made_channels import channels
 
 from wrf_mi.core import InputError, Record
@@ -80,80 +81,62 @@ def test_it_is_the_default_of_data_without_a_split(table: Path, tmp_path: Path, 
         train(table, tmp_path / "official", "idw", split="official")
 
 
-@pytest.mark.parametrize("model", ["trees", "mri", "wrf-gs+", "hybrid"])
-def test_models_of_strengths(model: str, strengths: Record, tmp_path: Path):
-    few = {"wrf-gs+": ("steps=20", "initial.gaussians=50", "patience=0"), "trees": ("trees=10",)}.get(model, ())
-    if model == "hybrid":
-        few = ("stages=residual",)
-    made = train(strengths, tmp_path / "run", model, split="none", settings=few)
-    headings = [0.1, 0.2] if made.takes_heading else None
-    assert np.isfinite(made.predict([[1, 2, 1.3], [2, 2, 1.3]], 0, headings).mean).all()
-    assert made.metrics["n_test"] == len(strengths)
+GAUSSIANS = (*SMALL, "patience=0")
 
 
-@pytest.mark.parametrize("model", ["wrf-gs+", "idw"])
-def test_models_of_spectra(model: str, one_gateway: Record, tmp_path: Path):
-    few = ("steps=10", "initial.gaussians=40", "patience=0") if model == "wrf-gs+" else ()
-    made = train(one_gateway, tmp_path / "run", model, split="none", settings=few)
-    assert made.predict(one_gateway.tx_pos_m[:2]).mean.shape == (2, *one_gateway.observation.shape[2:])
-    assert made.metrics["cross_validated"]["folds"] >= 2
+@pytest.mark.parametrize(
+    ("model", "settings"),
+    [("trees", ("trees=10",)), ("mri", ()), ("wrf-gs+", GAUSSIANS), ("hybrid", ("stages=residual",))],
+)
+def test_models_of_strengths(model: str, settings: tuple[str, ...], strengths: Record, tmp_path: Path):
+    run = train(strengths, tmp_path / "run", model, split="none", settings=settings)
+    headings = [0.1, 0.2] if run.takes_heading else None
+    assert np.isfinite(run.predict([[1, 2, 1.3], [2, 2, 1.3]], 0, headings).mean).all()
+    assert run.metrics["n_test"] == len(strengths)
+
+
+@pytest.mark.parametrize(("model", "settings"), [("wrf-gs+", GAUSSIANS), ("idw", ())])
+def test_models_of_spectra(model: str, settings: tuple[str, ...], one_gateway: Record, tmp_path: Path):
+    run = train(one_gateway, tmp_path / "run", model, split="none", settings=settings)
+    assert run.predict(one_gateway.tx_pos_m[:2]).mean.shape == (2, *one_gateway.observation.shape[2:])
+    assert run.metrics["cross_validated"]["folds"] >= 2
 
 
 @pytest.mark.parametrize("model", ["linear", "kriging"])
 def test_models_of_channels(model: str, tmp_path: Path):
     record = channels()
-    made = train(record, tmp_path / "run", model, split="none")
-    assert made.predict(uplink=record.uplink[:2], tx_pos_m=record.tx_pos_m[:2]).mean.shape == (2, 3, 4)
+    run = train(record, tmp_path / "run", model, split="none")
+    assert run.predict(uplink=record.uplink[:2], tx_pos_m=record.tx_pos_m[:2]).mean.shape == (2, 3, 4)
 
 
 def test_ray_tracing_keeps_the_paths_of_each_part(room: Path, strengths: Record, tmp_path: Path):
-    made = train(strengths, tmp_path / "run", "ray-tracing", scene=room, split="none", settings=["depth=1"])
-    assert np.isfinite(made.predict([[1, 2, 1.3]]).mean).all()
-    scores = evaluate_run(made.folder)
-    assert scores["abs_error_db"] == made.metrics["abs_error_db"]
+    run = train(strengths, tmp_path / "run", "ray-tracing", scene=room, split="none", settings=["depth=1"])
+    assert np.isfinite(run.predict([[1, 2, 1.3]]).mean).all()
+    assert evaluate_run(run.folder)["abs_error_db"] == run.metrics["abs_error_db"]
 
 
-def test_commands_take_such_a_run(run: Path, table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_commands_take_such_a_run(run: Path, table: Path, tmp_path: Path, command: Command):
     tx = "x,y,z,heading_rad\n1,2,1.3,0\n"
-    for command in strength_commands(run, tmp_path, {"1": "-60", "2": "-70"}, tx):
-        status, out, err = call(command, capsys)
-        assert status == 0, (command, err)
-        assert ("scores are cross-validated: each row" in out) == (command[0] == "evaluate")
-    refused(["evaluate", run, "--split", "random"], "every row is held out in one of its folds; omit --split", capsys)
-    refused(
+    for words in strength_commands(run, tmp_path, {"1": "-60", "2": "-70"}, tx):
+        assert ("scores are cross-validated: each row" in command.done(words)) == (words[0] == "evaluate")
+    command.refused(["evaluate", run, "--split", "random"], "every row is held out in one of its folds; omit --split")
+    command.refused(
         ["locate", run, "--step", "1", "--out", tmp_path / "test.csv"],
         "its split holds no rows out, which could be located",
-        capsys,
     )
 
 
-def test_scored_again_as_before(run: Path):
-    before, arrays = json.loads((run / "metrics.json").read_text()), stored(run)
-    metrics = evaluate_run(run)
-    timed = {"ms_per_sample"}
-    assert {k: v for k, v in metrics.items() if k not in timed} == {k: v for k, v in before.items() if k not in timed}
-    for name, values in stored(run).items():
-        np.testing.assert_array_equal(values, arrays[name], name)
+def test_scored_again_as_before(run: Path, capsys: pytest.CaptureFixture[str]):
+    scored_again_as_before(run, capsys)
 
 
 def test_a_stopped_run_goes_on(strengths: Record, tmp_path: Path):
-    fractions = list[float]()
-
-    def stop() -> bool:
-        return len(fractions) > 4
-
-    settings = ("stages=residual",)
+    shares = list[float]()
+    known: dict[str, Any] = {"split": "none", "settings": ("stages=residual",)}
+    ends = {"stop": lambda: len(shares) > 4, "on_progress": lambda stage, share, progress=None: shares.append(share)}
     with pytest.raises(Interrupted):
-        train(
-            strengths,
-            tmp_path / "run",
-            "hybrid",
-            split="none",
-            settings=settings,
-            stop=stop,
-            on_progress=lambda stage, share, progress=None: fractions.append(share),
-        )
+        train(strengths, tmp_path / "run", "hybrid", **known, **ends)
     assert not (tmp_path / "run" / "metrics.json").exists()
     resumed = resume(tmp_path / "run", record=strengths)
-    plain = train(strengths, tmp_path / "plain", "hybrid", split="none", settings=settings)
+    plain = train(strengths, tmp_path / "plain", "hybrid", **known)
     assert resumed.metrics["abs_error_db"] == plain.metrics["abs_error_db"]

@@ -1,48 +1,48 @@
-"""A sweep: which runs, their names and table, going on, a lost worker, and what is refused before anything starts."""
+"""A sweep: which runs, their names and table, going on, a lost worker, what is refused, and digests of its data."""
 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import shutil
 import signal
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
 import pytest
-from calling import SET, call, refused
+from calling import SET
+from commands import Command, rows_of
 
 from wrf_mi.cli.main import build_parser, main
 from wrf_mi.cli.train import TRACING, training_names, training_request
 from wrf_mi.core import InputError
+from wrf_mi.core.digest import content_digest
 from wrf_mi.runs import sweep as module
 from wrf_mi.runs.folder import RunRequest
 from wrf_mi.runs.results import read_run
-from wrf_mi.runs.sweep import FLAGS, OPTIONS, Sweep, check_failures, plan_sweep, run_sweep, sweep_table
+from wrf_mi.runs.sweep import FLAGS, OPTIONS, Sweep, check_failures, plan_sweep, run_sweep, scene_files, sweep_table
 
 SECONDS = 60
 """For a worker to begin its part, on a busy machine."""
-NAMES = ["seed=0,loss.ssim_weight=0.1", "seed=0,loss.ssim_weight=0.2", "seed=1,loss.ssim_weight=0.1"]
-NAMES += ["seed=1,loss.ssim_weight=0.2"]
-VARY = ["--vary", "seed=0,1", "--vary", "loss.ssim_weight=0.1,0.2"]
+NAMES = [f"seed={seed},loss.ssim_weight=0.1" for seed in range(3)]
+VARY = ("seed=0,1,2", "loss.ssim_weight=0.1")
 
 
 def test_plan_has_every_combination_with_a_name_and_a_command(tmp_path: Path) -> None:
-    options = {"dataset": "rfid-lab", "model": "mri"}
-    plan = plan_sweep(
-        tmp_path, ["split=official,blocked:2", "steps=1;2"], options, ["holdout_steps_fraction=0"], ["--flag"]
-    )
+    options, settings = {"dataset": "rfid-lab", "model": "mri"}, ["holdout_steps_fraction=0"]
+    plan = plan_sweep(tmp_path, ["split=official,blocked:2", "steps=1;2"], options, settings, ["--flag"])
     assert plan.varied == ["split", "steps"]
     names = ["split=official,steps=1", "split=official,steps=2", "split=blocked-2,steps=1", "split=blocked-2,steps=2"]
     assert [run.folder for run in plan.runs] == [tmp_path / name for name in names]
-    command = "train rfid-lab --model mri --split blocked:2 --flag --set holdout_steps_fraction=0 --set steps=1"
-    assert " ".join(plan.runs[2].arguments) == command
+    words = "train rfid-lab --model mri --split blocked:2 --flag --set holdout_steps_fraction=0 --set steps=1"
+    assert " ".join(plan.runs[2].arguments) == words
     assert not any(tmp_path.iterdir())
 
 
@@ -80,7 +80,7 @@ def option_value(action: argparse.Action) -> list[str]:
     known |= {"phase_error": "0.5", "preset": "quick", "set": "stages=mean", "stages": "mean"}
     if action.nargs == 0:
         return []
-    return [known[action.dest] if action.dest in known else str(list(action.choices)[-1]) if action.choices else "9"]
+    return [known.get(action.dest) or (str(list(action.choices)[-1]) if action.choices else "9")]
 
 
 ACTIONS = [
@@ -123,68 +123,65 @@ def test_each_run_has_every_option_of_the_sweep(
 
 
 def test_bad_input_is_refused_before_anything_starts(
-    folder: Path, flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, flat_folder: Path, tmp_path: Path, command: Command
 ) -> None:
     out = tmp_path / "sweep"
-    for data, wrong, message in (
-        (folder, ["seed=0,x"], "--seed: invalid int value: 'x'"),
-        (folder, ["model=wrf-gs,other"], "--model: invalid choice: 'other'"),
-        (folder, ["no.such=1"], "unknown setting no.such"),
-        (folder, ["batch=1,0"], "batch: 0 is out of range"),
-        (folder, ["split=official,blocked:9"], "blocked"),
-        (folder, ["initial.points=nowhere.ply"], "nowhere.ply"),
-        (folder, ["scene=a,b"], "carrier frequency unknown"),
-        (folder, ["model=kriging", "steps=1"], "steps"),
-        (folder, ["model=kriging", "n-train=0,4"], "n_train 0; choose 1"),
-        (
-            flat_folder,
-            ["model=vae", "seed=0,1"],
-            "holds rssi; vae serves spectrum, so choose another model",
-        ),
-        (flat_folder, ["model=ray-tracing", "scene=nowhere"], "nowhere"),
-        (tmp_path / "none", ["seed=0,1"], "none"),
+    for data, varied, message in (
+        (folder, "seed=0,x", "--seed: invalid int value: 'x'"),
+        (folder, "model=wrf-gs,other", "--model: invalid choice: 'other'"),
+        (folder, "no.such=1", "unknown setting no.such"),
+        (folder, "batch=1,0", "batch: 0 is out of range"),
+        (folder, "split=official,blocked:9", "blocked"),
+        (folder, "initial.points=nowhere.ply", "nowhere.ply"),
+        (folder, "scene=a,b", "carrier frequency unknown"),
+        (folder, "model=kriging steps=1", "steps"),
+        (folder, "model=kriging n-train=0,4", "n_train 0; choose 1"),
+        (flat_folder, "model=vae seed=0,1", "holds rssi; vae serves spectrum, so choose another model"),
+        (flat_folder, "model=ray-tracing scene=nowhere", "nowhere"),
+        (tmp_path / "none", "seed=0,1", "none"),
     ):
-        vary = [part for one in wrong for part in ("--vary", one)]
-        model = [] if any(one.startswith("model") for one in wrong) else ["--model", "wrf-gs+"]
-        refused(["sweep", data, *model, *vary, "--out", out], message, capsys)
-        assert not out.exists(), wrong
+        vary = [part for option in varied.split() for part in ("--vary", option)]
+        model = [] if varied.startswith("model") else ["--model", "wrf-gs+"]
+        command.refused(["sweep", data, *model, *vary, "--out", out], message)
+        assert not out.exists(), varied
+
+
+@contextmanager
+def runs_in_this_process() -> Iterator[None]:
+    """Without a process for each run, which takes seconds to import; the sweep of baselines starts them."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(module, "run_module", lambda name, arguments: (main(list(arguments)), ""))
+        yield
 
 
 @pytest.fixture(scope="module")
 def swept(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four runs, one after the other."""
-    out = tmp_path_factory.mktemp("sweeps") / "serial"
-    vary = [VARY[1], VARY[3]]
-    settings = [part for part in SET if part != "--set"]
-    rows = run_sweep(plan_sweep(out, vary, {"dataset": str(folder), "model": "wrf-gs+"}, settings, ["--deterministic"]))
-    assert [row["status"] for row in rows] == ["done"] * 4
+    """Three runs, one after the other."""
+    out, settings = tmp_path_factory.mktemp("sweeps") / "serial", [part for part in SET if part != "--set"]
+    plan = plan_sweep(out, VARY, {"dataset": str(folder), "model": "wrf-gs+"}, settings, ["--deterministic"])
+    with runs_in_this_process():
+        assert [row["status"] for row in run_sweep(plan)] == ["done"] * 3
     return out
 
 
 def test_table_contains_the_scores_of_the_runs(swept: Path) -> None:
     assert sorted(path.name for path in swept.iterdir() if path.is_dir()) == NAMES
-    with (swept / "scores.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
-    assert [(row["seed"], row["loss.ssim_weight"]) for row in rows] == [
-        ("0", "0.1"),
-        ("0", "0.2"),
-        ("1", "0.1"),
-        ("1", "0.2"),
-    ]
+    rows = rows_of(swept / "scores.csv")
+    assert [(row["seed"], row["loss.ssim_weight"]) for row in rows] == [("0", "0.1"), ("1", "0.1"), ("2", "0.1")]
     for row, full in zip(rows, json.loads((swept / "scores.json").read_text()), strict=True):
         run = read_run(row["run"])
         assert full["metrics"] == run.metrics
         assert (row["score"], float(row["median"])) == ("SSIM", pytest.approx(np.median(run.score)))
         assert float(row["reference_median"]) == pytest.approx(np.median(run.reference_score))
     lines = (swept / "scores.md").read_text().splitlines()
-    assert len(lines) == 6
+    assert len(lines) == 5
     assert lines[0].startswith("| seed | loss.ssim_weight | score | median |")
     assert len({len(line.split("|")) for line in lines}) == 1
 
 
 @pytest.mark.slow
 def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
-    folder: Path, swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, swept: Path, tmp_path: Path, command: Command
 ) -> None:
     """The command on two workers, one of which is killed while it trains."""
     out, killed = tmp_path / "sweep", []
@@ -205,22 +202,8 @@ def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
 
     killer = threading.Thread(target=kill_one)
     killer.start()
-    varied = ["--set", "loss.ssim_weight=0.1", "--vary", "seed=0,1"]
-    command = [
-        "sweep",
-        folder,
-        "--model",
-        "wrf-gs+",
-        *SET,
-        "--deterministic",
-        *varied,
-        "--out",
-        out,
-        "--scheduler",
-        "local:2",
-        "--json",
-    ]
-    status, printed, err = call(command, capsys)
+    varied = ["--set", "loss.ssim_weight=0.1", "--vary", "seed=0,1", "--out", out, "--scheduler", "local:2", "--json"]
+    status, printed, err = command(["sweep", folder, "--model", "wrf-gs+", *SET, "--deterministic", *varied])
     killer.join()
     assert status == 0, err
     assert killed
@@ -237,24 +220,26 @@ def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
         assert steps == [2, 4]
 
 
-def test_finished_runs_are_kept_and_others_added_or_done_again(
-    folder: Path, swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_finished_runs_are_kept_and_others_done_again(
+    folder: Path, swept: Path, tmp_path: Path, command: Command
 ) -> None:
     out = shutil.copytree(swept, tmp_path / "sweep")
     for file in ("metrics.json", "predictions.npz"):  # as if stopped while it was scored
         (out / NAMES[0] / file).unlink()
     (out / NAMES[1] / "config.yaml").unlink()  # as if stopped before it began
     (out / NAMES[1] / "metrics.json").unlink()
-    dates = {name: (out / name / "metrics.json").stat().st_mtime_ns for name in NAMES[2:]}
-    command = ["sweep", folder, "--model", "wrf-gs+", *SET, "--deterministic", *VARY, "--out", out, "--json"]
-    status, printed, err = call(command, capsys)
-    assert status == 0, err
-    assert [row["status"] for row in json.loads(printed)] == ["done", "done", "kept", "kept"]
-    assert {name: (out / name / "metrics.json").stat().st_mtime_ns for name in NAMES[2:]} == dates
+    date = (out / NAMES[2] / "metrics.json").stat().st_mtime_ns
+    vary = [part for varied in VARY for part in ("--vary", varied)]
+    again = ["sweep", folder, "--model", "wrf-gs+", *SET, "--deterministic", *vary, "--out", out]
+    with runs_in_this_process():
+        command.done(again)
+    rows = json.loads((out / "scores.json").read_text())
+    assert [row["status"] for row in rows] == ["done", "done", "kept"]
+    assert (out / NAMES[2] / "metrics.json").stat().st_mtime_ns == date
     for name in NAMES:
         np.testing.assert_array_equal(read_run(out / name).prediction, read_run(swept / name).prediction)
-    refused([*command, "--set", "holdout_steps_fraction=0"], "holds a sweep with other settings", capsys)
-    refused([*command[:-2], folder], "holds no sweep", capsys)
+    command.refused([*again, "--set", "holdout_steps_fraction=0"], "holds a sweep with other settings")
+    command.refused([*again[:-1], folder], "holds no sweep")
 
 
 def test_sweep_refuses_other_data_and_versions(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,7 +268,7 @@ def test_sweep_refuses_other_data_and_versions(folder: Path, tmp_path: Path, mon
 
 
 def test_failed_run_is_reported_and_the_others_go_on(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
     plan = plan_sweep(tmp_path / "sweep", ["seed=0,1"], {"dataset": str(folder)})
     seen = []
@@ -299,6 +284,48 @@ def test_failed_run_is_reported_and_the_others_go_on(
     assert "| out of \\| memory |" in sweep_table(rows, plan.varied)
     with pytest.raises(module.SweepFailed, match=r"2 of 2 runs failed: seed=0: out of \| memory; seed=1: ended"):
         check_failures(rows)
-    status, _, err = call(["sweep", folder, "--vary", "seed=0,1", "--out", tmp_path / "other"], capsys)
+    status, _, err = command(["sweep", folder, "--vary", "seed=0,1", "--out", tmp_path / "other"])
     assert status == 1
     assert err.splitlines()[-1].startswith("wrf-mi: sweep: 2 of 2 runs failed: ")
+
+
+def test_digest_tells_values_apart() -> None:
+    values: list[Any] = [
+        "a", "b", 1, 1.0, True, None, (), ("a",), ("a", "b"), "a\n'b'", {"a": 1}, {"a": 2}, {"b": 1}, [("a", 1)],
+        np.zeros(2), np.zeros(2, np.float32), np.zeros((1, 2)), np.zeros((2, 1)), np.array([0, 1.0]),
+    ]  # fmt: skip
+    assert len({content_digest(value) for value in values}) == len(values)
+    assert content_digest({"a": 1, "b": 2}) == content_digest({"b": 2, "a": 1})
+    assert content_digest(np.arange(6).reshape(2, 3).T) == content_digest(np.arange(6).reshape(2, 3).T.copy())
+    with pytest.raises(TypeError, match="object has no digest"):
+        content_digest(object())
+
+
+def test_digest_of_a_folder_is_that_of_names_and_contents(tmp_path: Path) -> None:
+    scene, copy = tmp_path / "scene", tmp_path / "copy"
+    (scene / "meshes").mkdir(parents=True)
+    named = '<scene><shape type="ply"><string name="filename" value="{}"/></shape></scene>'
+    (scene / "scene.xml").write_text(named.format("meshes/wall.ply"))
+    (scene / "meshes" / "wall.ply").write_text("ply")
+    shutil.copytree(scene, copy)
+    assert content_digest(copy) == content_digest(scene)
+    (copy / "beside.xml").write_text(named.format("floor.ply"))
+    (copy / "floor.ply").write_text("ply")
+    for file, mesh in (("scene.xml", "meshes/wall.ply"), ("beside.xml", "floor.ply")):
+        before = content_digest(scene_files(copy / file))
+        (copy / mesh).write_text("ply2")
+        assert content_digest(scene_files(copy / file)) != before
+    for name in ("beside.xml", "floor.ply"):
+        (copy / name).unlink()
+    assert content_digest(copy) != content_digest(scene)
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "meshes").symlink_to(copy / "meshes")
+    before = content_digest(tmp_path / "linked")
+    (copy / "meshes" / "wall.ply").write_text("ply")
+    assert content_digest(tmp_path / "linked") != before
+    assert content_digest(copy) == content_digest(scene)
+    (copy / "meshes" / "wall.ply").rename(copy / "meshes" / "door.ply")
+    assert content_digest(copy) != content_digest(scene)
+    assert scene_files("laboratory") == []
+    with pytest.raises(InputError, match="no such file or folder"):
+        content_digest(tmp_path / "none")
