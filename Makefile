@@ -6,7 +6,7 @@ READY := .venv/.ready
 .PHONY: help setup demo lint test test-gpu test-slow docs docs-quick package-test bench bench-quick clean
 
 help:
-	@echo "make demo       train on real spectra, or on a traced room where there are none"
+	@echo "make demo       a scanned room and 40 measurements: hybrid, ray tracing and interpolation compared"
 	@echo "make test       lint, types, import order, tests, notebooks"
 	@echo "make test-gpu   the tests that need a CUDA device"
 	@echo "make test-slow  the tests that take minutes"

@@ -88,7 +88,7 @@ CASES: Mapping[str, Case] = {
         "WRF-GS+, L = 9 as the paper",
         ("train", RFID, *("--model", "wrf-gs+", "--preset", "paper"), "--set", "steps=15000"),
     ),
-    "demo": Case("the demo (WRF-GS+, short)", ("demo",), (RFID, FLAT)),
+    "wrf-gs+-fast": Case("WRF-GS+, fast preset", ("train", RFID, "--model", "wrf-gs+", "--preset", "fast")),
 }
 """Runs that are not rows of the tables (`wrf_mi_bench.table_plan`)."""
 

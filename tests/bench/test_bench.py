@@ -47,10 +47,10 @@ def result(case: str, median: float) -> dict[str, object]:
 
 
 def test_table_has_a_line_for_each_result_in_the_order_of_the_cases(tmp_path):
-    for case, median in (("demo", 0.97), ("wrf-gs+-paper", 0.91)):
+    for case, median in (("wrf-gs+-fast", 0.97), ("wrf-gs+-paper", 0.91)):
         (tmp_path / f"{case}.json").write_text(json.dumps(result(case, median)))
     trained = read_results(tmp_path)[0]
-    assert [r["case"] for r in trained] == ["wrf-gs+-paper", "demo"]
+    assert [r["case"] for r in trained] == ["wrf-gs+-paper", "wrf-gs+-fast"]
     lines = bench_module.table(trained).splitlines()
     assert len(lines) == 4
     cells = "WRF-GS+, L = 9 as the paper | **0.910** | 0.800 | 0.700 | 0.950 | 0.978 | 1,234 | 1.5 min | 8.5 | 346 MB"
@@ -94,10 +94,12 @@ def test_bench_on_workers_writes_figures_and_reports_failures(two, tmp_path, cap
     assert rows[0]["figures"] == FIGURES
     assert "| walls | **0.9** | 0.8 |" in (out / "README.md").read_text().replace("mesh of a flat: ", "")
     assert "cases that share a machine" in capsys.readouterr().err
-    case_folder(runs, "demo").mkdir()
-    (case_folder(runs, "demo") / "config.yaml").write_text("nonsense")
-    with pytest.raises(BenchFailed, match=r"^bench demo: .* ended with status 2 wrf-mi: .*config.yaml: not readable"):
-        bench(["flat-plan", "demo"], out, runs, two)
+    case_folder(runs, "wrf-gs+-fast").mkdir()
+    (case_folder(runs, "wrf-gs+-fast") / "config.yaml").write_text("nonsense")
+    with pytest.raises(
+        BenchFailed, match=r"^bench wrf-gs\+-fast: .* ended with status 2 wrf-mi: .*config.yaml: not readable"
+    ):
+        bench(["flat-plan", "wrf-gs+-fast"], out, runs, two)
 
 
 @pytest.mark.parametrize("name", ["wrf-gs+-paper", "flat-plan"])

@@ -66,7 +66,7 @@ def test_ratios_are_compared_with_stored_ones(tmp_path, monkeypatch, capsys):
     assert line == "wrf-mi: bench --quick: splatting 2 (1.82 to 2.2) is above 2 times the stored 0.5"
 
 
-@pytest.mark.parametrize("arguments", [["--store"], ["--quick", "demo"]])
+@pytest.mark.parametrize("arguments", [["--store"], ["--quick", "wrf-gs+-paper"]])
 def test_options_outside_quick_are_refused(arguments, capsys):
     assert cli(["bench", *arguments]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

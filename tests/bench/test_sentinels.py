@@ -209,7 +209,7 @@ def test_results_of_changed_source_are_listed(tmp_path, capsys):
     assert lines[2].startswith(f"stages/part: {date}; rm {part}; wrf-mi bench stages; changed: wrf_mi")
     assert len(lines) == 3
     assert summary == "2 of 4 results are older than their source, 1 unknown"
-    assert cli(["bench", "demo", "--stale", "--out", str(tmp_path)]) == 2
+    assert cli(["bench", "flat-plan", "--stale", "--out", str(tmp_path)]) == 2
 
 
 def test_results_without_digest_are_compared_with_the_source_of_their_date(tmp_path):

@@ -150,7 +150,7 @@ def test_quick_stress_command_prints_rows_and_fails_beyond_a_bound(monkeypatch, 
     assert line.startswith("wrf-mi: bench stress --quick: image, ordinary, 2 cases: worst ")
 
 
-@pytest.mark.parametrize("names", [["operator"], ["stress", "demo"], ["nowhere"], ["stress", "--store"]])
+@pytest.mark.parametrize("names", [["operator"], ["stress", "wrf-gs+-paper"], ["nowhere"], ["stress", "--store"]])
 def test_names_without_a_quick_form_are_refused(names, capsys):
     assert cli(["bench", *names, "--quick"]) == 2
     (line,) = capsys.readouterr().err.splitlines()

@@ -18,7 +18,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
-from calling import SET, SMALL
+from calling import SET
 from commands import Command, rows_of
 from made_spectra import SIZE
 
@@ -30,7 +30,6 @@ from wrf_mi.cli.output import Watch
 from wrf_mi.core import InputError
 from wrf_mi.runs import api as runs
 from wrf_mi.runs.api import open_run
-from wrf_mi.training import config
 from wrf_mi.training.checkpoint import read_checkpoint
 from wrf_mi.training.loop import Progress
 
@@ -297,39 +296,30 @@ def test_demo_finds_or_fetches_real_data(
     assert capsys.readouterr().err == "no rfid-lab (no network)\n"
 
 
-def test_demo_on_real_data(
-    folder: Path, flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
+def test_demo_compares_models_in_a_held_out_region_and_in_a_measured_flat(
+    flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
-    """A field on spectra and a traced flat, with synthetic data in the layouts of the real data sets."""
-    monkeypatch.setattr(demo, "REAL", str(folder))
-    monkeypatch.setattr(demo, "FLAT", str(flat_folder))
-    monkeypatch.setattr(demo, "find_data", Path)
-    monkeypatch.setattr(config, "PRESETS", {"quick": tuple(SMALL)})
-    status, out, err = command(["demo", "--out", tmp_path / "run", "--json"])
-    assert status == 0, err
-    assert json.loads(out) == json.loads((tmp_path / "run" / "metrics.json").read_text())
-    assert f"pictures: {tmp_path / 'run' / 'compare' / 'index.html'}" in err
-    page = (tmp_path / "run" / "compare" / "index.html").read_text()
-    for row in ("wrf-gs+", "ray-tracing", "IDW of 4 nearest", "IDW of 100 nearest"):
-        assert row in page
-    assert json.loads((tmp_path / "run" / "traced" / "metrics.json").read_text())["task"] == "rssi"
-
-
-def test_demo_in_the_embedded_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
-    """Without real data the field and the ray tracer are scored on the same rows of the embedded room."""
-    room = synthetic.load_record("laboratory")
-    rows = np.arange(30)
+    """With fewer rows and without the hybrid, which other tests fit, and a synthetic flat in the layout of the real one."""
+    room, rows = synthetic.load_record("laboratory"), np.arange(30)
     few = replace(
         room, tx_pos_m=room.tx_pos_m[rows], observation=room.observation[:, rows], official=(rows[6:], rows[:6])
     )
     monkeypatch.setattr(synthetic, "laboratory_record", lambda progress: few)
-    monkeypatch.setattr(demo, "find_data", lambda name: None)
-    monkeypatch.setattr(config, "PRESETS", {"quick": tuple(SMALL)})
-    command.done(["demo", "--out", tmp_path / "run"])
-    table = rows_of(tmp_path / "run" / "compare" / "compare.csv")
-    assert [row["model"] for row in table] == ["wrf-gs+", "ray-tracing", "idw4"]
-    assert {row["dataset"] for row in table} == {"laboratory"}
-    assert (tmp_path / "run" / "scene" / "preview.png").is_file()
+    monkeypatch.setattr(demo, "MODELS", {"ray-tracing": True, "kriging": False})
+    monkeypatch.setattr(demo, "ROWS", 12)
+    monkeypatch.setattr(demo, "find_data", lambda name: flat_folder)
+    status, out, err = command(["demo", "--out", tmp_path / "demo"])
+    assert status == 0, err
+    for text in ("a scan of the room laboratory becomes a scene", "median SSIM on the test rows: ray-tracing"):
+        assert text in out + err
+    assert "median absolute error" in out
+    table = rows_of(tmp_path / "demo" / "compare" / "compare.csv")
+    assert [row["model"] for row in table] == ["ray-tracing", "kriging", "idw4", "ray-tracing", "kriging", "idw100"]
+    assert {row["dataset"] for row in table} == {"laboratory", str(flat_folder)}
+    assert (tmp_path / "demo" / "scene" / "preview.png").is_file()
+    assert "plotly" in (tmp_path / "demo" / "view.html").read_text()
+    held_out = json.loads((tmp_path / "demo" / "kriging" / "metrics.json").read_text())
+    assert (held_out["split"], held_out["n_train"]) == ("blocked:0", 12)
 
 
 def raising(error: type[BaseException]) -> Any:

@@ -101,7 +101,7 @@ def test_bad_data_and_folders_are_refused(
 def test_resume_takes_no_settings(run: Path, command: Command) -> None:
     for option in (
         *("--set steps=9", "--seed 0", "--split random", "--n-train 0", "--deterministic", "--model wrf-gs"),
-        *("--preset quick", "--out elsewhere", "data"),
+        *("--preset fast", "--out elsewhere", "data"),
     ):
         command.refused(["train", "--resume", run, *option.split()], "omit data set and settings")
 

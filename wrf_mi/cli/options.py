@@ -66,7 +66,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")
     text = "calibrate predicted standard deviations on training rows held out in space (one more fit)"
     add("--intervals", action="store_true", help=text)
-    add("--preset", choices=("default", "paper", "quick"), help="named set of settings")
+    add("--preset", choices=("fast", "default", "paper"), help="named set of settings")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="setting to change; repeatable")
 
 
