@@ -299,7 +299,7 @@ def test_demo_finds_or_fetches_real_data(
 def test_demo_compares_models_in_a_held_out_region_and_in_a_measured_flat(
     flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
-    """With fewer rows and without the hybrid, which other tests fit, and a synthetic flat in the layout of the real one."""
+    """With fewer rows and without the hybrid, which other tests fit; the flat is synthetic, in the layout of the real."""
     room, rows = synthetic.load_record("laboratory"), np.arange(30)
     few = replace(
         room, tx_pos_m=room.tx_pos_m[rows], observation=room.observation[:, rows], official=(rows[6:], rows[:6])
