@@ -13,7 +13,9 @@ WITHOUT = {
     "wrf_mi.core.errors",
     "wrf_mi.datasets.download",  # needs a network
     "wrf_mi.maps.dataset",  # in the example of wrf_mi.maps.api
+    "wrf_mi.maps.plan",  # in that of wrf_mi.maps.api
     "wrf_mi.runs.compare",  # in that of wrf_mi.runs.api
+    "wrf_mi.runs.other_models",  # in that of wrf_mi.runs.api
     "wrf_mi.runs.run",  # in that of wrf_mi.runs.api
     "wrf_mi.runs.scene_view",  # in notebooks
     "wrf_mi.scene.edit",  # in that of wrf_mi.scene.make

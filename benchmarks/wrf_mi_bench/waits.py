@@ -28,7 +28,7 @@ from wrf_mi.tasks import TASKS, instrument_of
 from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.tracer import RayTracer
 
-from .bench import RFID, BenchFailed
+from .bench import FLAT, RFID, BenchFailed
 from .comparison import Row, data_folder, kept_work, line
 from .sources import fit_key, source_files
 from .workloads import record
@@ -122,10 +122,10 @@ def memory(folder: Path) -> Figures:
 
 def strength_map(folder: Path) -> Figures:
     """A map of a hybrid of signal strengths in the walls of a flat's plan."""
-    flat = data_folder("flat-ble")
+    flat = data_folder(FLAT)
     command("mesh", flat / "layout.csv", "--height", "2.7", "--out", folder / "scene")
-    command("train", "flat-ble", "--scene", folder / "scene", "--n-train", "400", "--out", folder / "hybrid")
-    places = load_record("flat-ble").tx_pos_m
+    command("train", FLAT, "--scene", folder / "scene", "--n-train", "400", "--out", folder / "hybrid")
+    places = load_record(FLAT).tx_pos_m
     area = float(np.prod(np.ptp(places[:, :2], axis=0)))
     step = f"{np.sqrt(area / MAP_POSITIONS):.4f}"
     seconds = command("map", folder / "hybrid", "--step", step, "--receiver", "anchor1", "--out", folder / "map.nc")
@@ -176,6 +176,7 @@ def _field_row(preset: str, asked: str, of: Figures) -> Row:
 
 def main() -> dict[str, Any]:
     """Measure all rows; each states what is asked on two idle cores."""
+    data_folder(RFID), data_folder(FLAT)  # missing data are reported first
     place = RUNS / fit_key(source_files())
 
     def of(name: str, measure: Measure) -> Figures:

@@ -36,7 +36,7 @@ from wrf_mi.training.loop import Progress
 SECONDS_TO_START = 120
 """Importing, compiling and a first step take some 3 s; a busy machine needs much longer."""
 COMMANDS = {"doctor", "check", "data", "mesh", "correct", "edit", "train", "trace", "sweep", "evaluate", "predict"}
-COMMANDS |= {"compare", "map", "locate", "view", "export", "import", "bench", "demo"}
+COMMANDS |= {"compare", "map", "locate", "view", "export", "import", "bench", "demo", "plan"}
 
 
 def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -299,7 +299,7 @@ def test_demo_finds_or_fetches_real_data(
 def test_demo_compares_models_in_a_held_out_region_and_in_a_measured_flat(
     flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
-    """With fewer rows and without the hybrid, which other tests fit; the flat is synthetic, in the layout of the real."""
+    """With fewer rows and without the hybrid, which other tests fit; the flat is synthetic, of the same layout."""
     room, rows = synthetic.load_record("laboratory"), np.arange(30)
     few = replace(
         room, tx_pos_m=room.tx_pos_m[rows], observation=room.observation[:, rows], official=(rows[6:], rows[:6])
@@ -307,6 +307,7 @@ def test_demo_compares_models_in_a_held_out_region_and_in_a_measured_flat(
     monkeypatch.setattr(synthetic, "laboratory_record", lambda progress: few)
     monkeypatch.setattr(demo, "MODELS", {"ray-tracing": True, "kriging": False})
     monkeypatch.setattr(demo, "ROWS", 12)
+    monkeypatch.setattr(demo, "REAL_ROWS", 12)
     monkeypatch.setattr(demo, "find_data", lambda name: flat_folder)
     status, out, err = command(["demo", "--out", tmp_path / "demo"])
     assert status == 0, err
@@ -315,7 +316,7 @@ def test_demo_compares_models_in_a_held_out_region_and_in_a_measured_flat(
     assert "median absolute error" in out
     table = rows_of(tmp_path / "demo" / "compare" / "compare.csv")
     assert [row["model"] for row in table] == ["ray-tracing", "kriging", "idw4", "ray-tracing", "kriging", "idw100"]
-    assert {row["dataset"] for row in table} == {"laboratory", str(flat_folder)}
+    assert {row["dataset"] for row in table} == {"laboratory", "flat"}
     assert (tmp_path / "demo" / "scene" / "preview.png").is_file()
     assert "plotly" in (tmp_path / "demo" / "view.html").read_text()
     held_out = json.loads((tmp_path / "demo" / "kriging" / "metrics.json").read_text())

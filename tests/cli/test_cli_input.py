@@ -23,7 +23,7 @@ def test_bad_arguments_are_refused(command: Command) -> None:
         ("data", "wrf-mi data: the following arguments are required: COMMAND"),
         ("predict run", "wrf-mi predict: .*required"),
         ("predict run --tx a --input b --out c", "not allowed with argument"),
-        ("evaluate", "required: RUN"),
+        ("evaluate", "nothing to score; give a run folder"),
         ("compare run", "required: --out"),
         ("train x --model nerf3 --out y", "invalid choice: 'nerf3'"),
         ("train x --seed one --out y", "invalid int value: 'one'"),

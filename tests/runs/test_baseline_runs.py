@@ -224,7 +224,7 @@ def test_bad_calls_are_refused(flat_folder: Path, tmp_path: Path, command: Comma
         (flat_folder, "mri --scene x", "mri on .*flat: takes no scene; omit --scene"),
         (
             flat_folder,
-            "mri --preset quick",
+            "mri --preset fast",
             "mri on .*no preset, which belongs to fields of spectra; use --set",
         ),
     ):

@@ -77,7 +77,7 @@ def test_every_option_of_train_may_vary(tmp_path: Path) -> None:
 def option_value(action: argparse.Action) -> list[str]:
     """A value of an option that is not its default, in words."""
     known = {"model": "ray-tracing", "calibrate": "gain", "n_train": "7", "rays": "64", "paths": "line-of-sight"}
-    known |= {"phase_error": "0.5", "preset": "quick", "set": "stages=mean", "stages": "mean"}
+    known |= {"phase_error": "0.5", "preset": "fast", "set": "stages=mean", "stages": "mean"}
     if action.nargs == 0:
         return []
     return [known.get(action.dest) or (str(list(action.choices)[-1]) if action.choices else "9")]

@@ -23,6 +23,9 @@ Powers of a made-up receiver with noise of 2 dB, mapped by kriging with interval
     90
     >>> wrf_mi.write_map(dataset, folder / "map.nc").name
     'map.nc'
+    >>> planned = wrf_mi.plan(run, count=2)
+    >>> planned.tx_pos_m.shape, bool(planned.expected_error[2] < planned.expected_error[0])
+    ((2, 3), True)
     >>> shutil.rmtree(folder)
 """
 

@@ -28,7 +28,12 @@ Signal strengths of a made-up receiver, in the layout of flat-ble:
     >>> (run.folder / "model.npz").unlink()  # as if stopped
     >>> wrf_mi.resume(run.folder).metrics["n_test"]
     10
-    >>> wrf_mi.compare([run.folder], folder / "compare").name
+    >>> other = folder / "other.npz"
+    >>> np.savez(other, prediction=rssi_dbm + 1, row=np.arange(40))
+    >>> scored = wrf_mi.score_predictions(data, other, folder / "other", "one decibel off")
+    >>> round(scored.metrics["abs_error_db"]["median"], 3)
+    1.0
+    >>> wrf_mi.compare([run.folder, scored.folder], folder / "compare").name
     'index.html'
     >>> shutil.rmtree(folder)
 """
