@@ -25,6 +25,8 @@ SPLIT, ROWS = "blocked:0", 40
 REAL_ROWS = 64  # measurements of the real flat
 MODELS = {"hybrid": True, "ray-tracing": True, "kriging": False}
 """Models that are compared, and whether each is given the scene; the first takes a minute, the others seconds."""
+HYBRID = ("stages=mean,calibration,correction,surfaces,residual",)  # as of ``train --fast``: without the longest stage
+IN_A_FLAT = ("depth=6", "reflections=2")  # transmission through walls of two surfaces each
 
 
 def add_parser(commands: Any) -> None:
@@ -98,7 +100,7 @@ class Demo:
         self._say(f"a scan of the room {NAME} becomes a scene: {self.folder / 'scene'}")
         scene = make_scene(Path(load_record(NAME).source) / SCAN, self.folder / "scene")
         self._say(f"{ROWS} measured spectra, and a region without any: split {SPLIT}")
-        return self._fitted(NAME, scene.folder, SPLIT, ROWS, "")
+        return self._fitted(NAME, scene.folder, "", split=SPLIT, n_train=ROWS)
 
     def measured_flat(self) -> list[Run]:
         """Signal strengths that were measured in a flat, in the walls of its plan, where the data can be had."""
@@ -109,16 +111,18 @@ class Demo:
             return []
         self._say(f"measured signal strengths: {REAL_ROWS} rows of {REAL}, in the walls of its plan")
         scene = make_scene(data / REAL_PLAN, self.folder / "flat", height_m=REAL_HEIGHT_M)
-        return self._fitted(str(data), scene.folder, None, REAL_ROWS, f"{REAL}-")
+        return self._fitted(str(data), scene.folder, f"{REAL}-", IN_A_FLAT, n_train=REAL_ROWS)
 
-    def _fitted(self, dataset: str, scene: Path, split: str | None, rows: int, prefix: str) -> list[Run]:
+    def _fitted(
+        self, dataset: str, scene: Path, prefix: str, tracing: tuple[str, ...] = (), **options: Any
+    ) -> list[Run]:
         from ..runs.api import train
 
         runs = []
         for model, in_scene in MODELS.items():
-            options: dict[str, Any] = {"scene": scene if in_scene else None, "split": split, "n_train": rows}
-            out = self.folder / f"{prefix}{model}"
-            runs.append(train(dataset, out, model, on_progress=self.on_progress, stop=self.stop, **options))
+            how: dict[str, Any] = {"settings": {"hybrid": HYBRID, "ray-tracing": tracing}.get(model, ()), **options}
+            how |= {"scene": scene if in_scene else None, "on_progress": self.on_progress, "stop": self.stop}
+            runs.append(train(dataset, self.folder / f"{prefix}{model}", model, **how))
             self._say(summary(runs[-1:]))
         return runs
 

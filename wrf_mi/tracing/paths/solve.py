@@ -204,7 +204,8 @@ def _warn_of_silence(paths: Paths, tx_pos_m: FloatArray, receivers: Sequence[Rec
     sides += [("receivers", paths.rx, receiver_names, np.stack([rx.position_m for rx in receivers]))]
     for what, reached, names, positions in sides:
         silent = np.setdiff1d(np.arange(len(names)), reached)
-        if len(silent):
+        # A single transmitter need not reach every receiver, and predictions of one after another would repeat it.
+        if len(silent) and (len(tx_pos_m) > 1 or len(silent) == len(names)):
             at = ", ".join(f"{x:.2f}" for x in positions[silent[0]])
             text = "%d of %d %s have no path (first: %s at (%s) m): check that they are inside, and the kinds of path"
             logger.warning(text, len(silent), len(names), what, names[silent[0]], at)
