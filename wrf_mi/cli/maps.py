@@ -84,6 +84,7 @@ def _add_plan(commands: Any) -> None:
     add("--threshold", type=float, metavar="DBM", help="threshold of coverage (default: -90 dBm)")
     text = "distance that is worth half of a reduction, for plans that are short to walk (default: distances are free)"
     add("--walk", type=float, metavar="M", help=text)
+    add("--start", type=float, nargs=3, metavar=("X", "Y", "Z"), help="where the walk begins (default: nowhere)")
     text = "name of a receiver whose errors count, repeatable (default: all)"
     add("--receiver", action="append", metavar="NAME", help=text)
     add("--step", type=float, metavar="M", help="spacing of the map (default: 0.25 m, more for large areas)")
@@ -103,8 +104,8 @@ def plan_command(a: Arguments) -> int:
         raise InputError(f"{out}: positions are written as .csv; give such a name")
     run = open_run(a.run)
     candidates_m = None if a.candidates is None else read_inputs(a.candidates, None).tx_pos_m
-    options = {"criterion": a.criterion, "threshold_dbm": a.threshold, "walk_m": a.walk, "receivers": a.receiver}
-    options |= {"step_m": a.step, "height_m": a.height}
+    options = {"criterion": a.criterion, "threshold_dbm": a.threshold, "walk_m": a.walk, "start_m": a.start}
+    options |= {"receivers": a.receiver, "step_m": a.step, "height_m": a.height}
     options["area_m"] = None if a.area is None else (a.area[:2], a.area[2:])
     with Watch() as watch:
         planned = plan(run, a.count, candidates_m=candidates_m, **options, on_progress=watch.on_progress)

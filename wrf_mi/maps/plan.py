@@ -126,11 +126,9 @@ def plan(
     numbers = range(len(known)) if receivers is None else [receiver_index(known, name) for name in receivers]
     map_m = candidates_of(opened, step_m, height_m, _area(opened, area_m)).positions_m
     targets_m, choices_m = _thinned(map_m, MOST_TARGETS), _candidates(candidates_m, map_m)
-    if not 0 < count <= len(choices_m):
-        raise InputError(f"count {count}: give a number from 1 to {len(choices_m)}, that of the candidates")
-    if walk_m is not None and not walk_m > 0:
-        raise InputError(f"walk {walk_m:g} m: give a distance above 0")
-    positions_m, is_target = _joined(targets_m, choices_m)
+    _check(count, len(choices_m), criterion, threshold_dbm, walk_m)
+    positions_m = np.concatenate([targets_m, choices_m])
+    is_target = np.arange(len(positions_m)) < len(targets_m)
     on_progress("planning: the process of the errors", 0.0)
     priors = error_priors(opened, numbers, positions_m)
     covariances = []
@@ -139,23 +137,26 @@ def plan(
         on_progress("planning: the process of the errors", done / len(priors))
     weights = np.ones((len(numbers), len(positions_m))) * is_target
     if criterion == "coverage":
-        threshold = THRESHOLD_DBM if threshold_dbm is None else threshold_dbm
-        weights *= _about(opened, numbers, positions_m, threshold)
-    elif criterion != "error" or threshold_dbm is not None:
-        raise InputError(f"criterion {criterion}: choose error, or coverage with or without a threshold")
-    allowed = np.zeros(len(positions_m), bool)
-    allowed[len(targets_m) :] = True
-    worth = _walking(positions_m, walk_m)
+        weights *= _about(opened, numbers, positions_m, THRESHOLD_DBM if threshold_dbm is None else threshold_dbm)
     start = None if start_m is None else np.asarray(start_m, float)
-    chosen, before, after = greedy(
-        covariances, [prior.new_noise for prior in priors], weights, allowed, count, worth, start, on_progress
-    )
-    errors = [before, *after]
-    walked = np.linalg.norm(np.diff(positions_m[chosen], axis=0), axis=1)
-    first = np.nan if start is None else float(np.linalg.norm(positions_m[chosen[0]] - start))
-    error = np.array([np.sqrt(variance[:, is_target].mean()) for variance in errors])
-    std = np.sqrt([variance[:, is_target].mean(axis=0) for variance in (errors[0], errors[-1])])
-    return Plan(positions_m[chosen], error, np.append(first, walked), choices_m, positions_m[is_target], std)
+    worth, noise = _walking(positions_m, walk_m), [prior.new_noise for prior in priors]
+    chosen, before, after = greedy(covariances, noise, weights, ~is_target, count, worth, start, on_progress)
+    variances = np.stack([before, *after])[:, :, is_target]
+    way_m = np.concatenate([[[np.nan] * 3 if start is None else start], positions_m[chosen]])
+    walked_m = np.linalg.norm(np.diff(way_m, axis=0), axis=1)
+    error, std = np.sqrt(variances.mean(axis=(1, 2))), np.sqrt(variances[[0, -1]].mean(axis=1))
+    return Plan(positions_m[chosen], error, walked_m, choices_m, targets_m, std)
+
+
+def _check(
+    count: int, candidates: int, criterion: Criterion, threshold_dbm: float | None, walk_m: float | None
+) -> None:
+    if not 0 < count <= candidates:
+        raise InputError(f"count {count}: give a number from 1 to {candidates}, that of the candidates")
+    if walk_m is not None and not walk_m > 0:
+        raise InputError(f"walk {walk_m:g} m: give a distance above 0")
+    if criterion not in ("error", "coverage") or (criterion == "error" and threshold_dbm is not None):
+        raise InputError(f"criterion {criterion}: choose error, or coverage with or without a threshold")
 
 
 def greedy(
@@ -305,9 +306,3 @@ def farthest_points(positions_m: FloatArray, count: int, known_m: FloatArray | N
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(positions_m - positions_m[chosen[-1]], axis=1))
     return np.asarray(chosen)
-
-
-def _joined(targets_m: FloatArray, choices_m: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Positions of targets and then of candidates, and the mask of the targets."""
-    positions_m = np.concatenate([targets_m, choices_m])
-    return positions_m, np.arange(len(positions_m)) < len(targets_m)
