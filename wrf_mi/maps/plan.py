@@ -288,10 +288,13 @@ def _candidates(candidates_m: FloatArray | None, map_m: FloatArray) -> FloatArra
 
 
 def _thinned(positions_m: FloatArray, most: int) -> FloatArray:
-    """At most so many positions, spread evenly: each is the farthest from those before."""
+    """At most so many positions, a seeded draw."""
     if len(positions_m) <= most:
         return positions_m
-    return positions_m[np.sort(farthest_points(positions_m, most))]
+    # Drawn at random: the farthest points of a lattice are those of a coarser lattice in a part of it, and of this one
+    # in the rest, so that errors would count more there.
+    chosen = np.random.default_rng(0).choice(len(positions_m), most, replace=False)
+    return positions_m[np.sort(chosen)]
 
 
 def farthest_points(positions_m: FloatArray, count: int, known_m: FloatArray | None = None) -> IntArray:
