@@ -18,7 +18,7 @@ status=0
 # Benchmarks first, as they are the figures that only such a machine gives; each part stops at its share of the time.
 timeout --signal=INT 300 "$python" -m wrf_mi.cli bench gpu --out "$out" --runs "$out/gpu-runs" 2>&1 | tee "$out/gpu.log" || status=1
 timeout --signal=INT 60 "$python" -m pytest -q -m gpu tests 2>&1 | tee "$out/gpu-tests.log" || status=1
-WRF_MI_TEST_BACKEND="${WRF_MI_GPU:-cuda}" timeout --signal=INT 110 "$python" -m pytest -q -x --maxfail=20 \
+WRF_MI_TEST_BACKEND="${WRF_MI_GPU:-cuda}" timeout --signal=INT 110 "$python" -m pytest -q --maxfail=20 \
     -m "not gpu and not slow" tests/gaussians tests/graph tests/tracing tests/training tests/models 2>&1 |
     tee "$out/gpu-suites.log" || status=1
 echo "results: $out"

@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 import wrf_mi
 from wrf_mi.core import Record, Split
+from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets import make_splits
-from wrf_mi.maps.plan import error_priors, farthest_points, plan
+from wrf_mi.maps.plan import error_priors, plan
 from wrf_mi.runs.api import Run
 from wrf_mi.scene.make import make_scene
 from wrf_mi.synthetic.stored import SCAN
@@ -70,6 +72,18 @@ PLACES: Mapping[str, Any] = {
     "traced-room": partial(_scanned, "traced-room", False),
     **{f"random room {seed}": partial(_room, seed) for seed in (201, 202, 203, 204)},
 }
+
+
+def farthest_points(positions_m: FloatArray, count: int, known_m: FloatArray) -> IntArray:
+    """Indices of positions [n, 3] each of which is the farthest from those before and from known ones [k, 3].
+
+    Source: Gonzalez, "Clustering to minimize the maximum intercluster distance" (1985), Theor. Computer Science 38.
+    """
+    distance, chosen = cdist(positions_m, known_m).min(axis=1), []
+    for _ in range(count):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(positions_m - positions_m[chosen[-1]], axis=1))
+    return np.asarray(chosen)
 
 
 def next_rows(rule: str, run: Run, record: Record, rows: IntArray, able: IntArray, count: int, seed: int) -> IntArray:

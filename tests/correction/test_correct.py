@@ -197,10 +197,8 @@ def test_a_cabinet_of_one_material_is_found_from_few_channels(tmp_path, monkeypa
     assert mean_scores(found)[1] > 19
 
 
-def test_walls_in_wrong_minima_hold_each_other_until_they_are_doubted(tmp_path, monkeypatch):
-    """At 3.5 GHz and 25 dB two walls are first taken to be a wavelength from where they are, and each fits only there
-    as long as the other does not move.
-    """
+def test_walls_in_wrong_minima_are_found(tmp_path, monkeypatch):
+    """At 3.5 GHz and 25 dB, where a wall a wavelength from its place fits as long as another does not move either."""
     monkeypatch.setattr(correction_rooms, "CARRIER_HZ", 3.5e9)
     true, shift, _ = true_scene(tmp_path, seed=3)
     record, stated = channels(true, 100, snr_db=25, seed=3), stated_scene(tmp_path / "stated")

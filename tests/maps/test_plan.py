@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wrf_mi_bench.planning import farthest_points
 
 import wrf_mi
 from wrf_mi import InputError, plan, train
 from wrf_mi.cli.main import main
-from wrf_mi.maps.plan import error_priors, farthest_points, greedy
+from wrf_mi.maps.plan import error_priors, greedy
 from wrf_mi.models.error_prior import ErrorPrior, with_columns
 from wrf_mi.models.interpolation.kriging import Kriging, UncertainKriged
 from wrf_mi.models.interpolation.kriging_equations import KrigingSystem, correlation

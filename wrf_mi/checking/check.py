@@ -208,7 +208,7 @@ def _path(dataset: str | Path) -> Path | None:
 
 
 def _of_building(record: Record) -> Found:
-    # Meshes and plans need packages that take as long to import as a short fit.
+    # Most fits have no building, and need none of the packages that read meshes and plans.
     from .building import at_vertices, building_file, inside_solids, plan_against_walls, read_building
 
     file = building_file(record.source) if record.source else None

@@ -25,7 +25,6 @@ SPLIT, ROWS = "blocked:0", 40
 REAL_ROWS = 64  # measurements of the real flat
 MODELS = {"hybrid": True, "ray-tracing": True, "kriging": False}
 """Models that are compared, and whether each is given the scene; the first takes a minute, the others seconds."""
-HYBRID = ("stages=mean,calibration,correction,surfaces,residual",)  # as of ``train --fast``: without the longest stage
 IN_A_FLAT = ("depth=6", "reflections=2")  # transmission through walls of two surfaces each
 
 
@@ -116,11 +115,13 @@ class Demo:
     def _fitted(
         self, dataset: str, scene: Path, prefix: str, tracing: tuple[str, ...] = (), **options: Any
     ) -> list[Run]:
+        from ..models.hybrid.scene_side import FAST
         from ..runs.api import train
 
+        settings = {"hybrid": (f"stages={','.join(FAST)}",), "ray-tracing": tracing}
         runs = []
         for model, in_scene in MODELS.items():
-            how: dict[str, Any] = {"settings": {"hybrid": HYBRID, "ray-tracing": tracing}.get(model, ()), **options}
+            how: dict[str, Any] = {"settings": settings.get(model, ()), **options}
             how |= {"scene": scene if in_scene else None, "on_progress": self.on_progress, "stop": self.stop}
             runs.append(train(dataset, self.folder / f"{prefix}{model}", model, **how))
             self._say(summary(runs[-1:]))
