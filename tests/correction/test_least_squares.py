@@ -6,7 +6,15 @@ from correction_rooms import CARRIER_HZ, stated_scene
 from scipy.spatial.transform import Rotation
 from scipy.stats import t
 
-from wrf_mi.correction.least_squares import FREEDOM, Noise, Prior, left_out_residuals, minimised, posterior_covariance
+from wrf_mi.correction.least_squares import (
+    FREEDOM,
+    Jacobian,
+    Noise,
+    Prior,
+    left_out_residuals,
+    minimised,
+    posterior_covariance,
+)
 from wrf_mi.correction.state import rigid_motion, rigid_motions
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.search.surfaces import scene_surfaces
@@ -28,9 +36,9 @@ def fitted(observed: np.ndarray, prior: Prior) -> np.ndarray:
     return solve(MATRIX, observed, prior)[0]
 
 
-def first(matrix: np.ndarray) -> np.ndarray:
-    """Derivatives [p, rows, values] of a product with a matrix [rows, values, p]."""
-    return np.moveaxis(matrix, -1, 0)
+def first(matrix: np.ndarray) -> Jacobian:
+    """Derivatives of a product with a matrix [rows, values, p]."""
+    return Jacobian(np.moveaxis(matrix, -1, 0))
 
 
 def weak(deviation: float = 100.0) -> Prior:

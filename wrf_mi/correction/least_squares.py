@@ -97,30 +97,59 @@ class Prior:
         return float(away @ self.precision @ away) / 2
 
 
+@dataclass(frozen=True)
+class Jacobian:
+    """Derivatives of residuals [rows, values] by k parameters, 0 without observation.
+
+    A report of few signals has few independent derivatives: those of a row may be stated by their coefficients in an
+    orthonormal basis, so that sums over values are over coefficients.
+    """
+
+    columns: NDArray[np.floating]  # derivatives [k, rows, values], or coefficients [k, rows, m]
+    basis: NDArray[np.floating] | None = None  # orthonormal vectors [rows, values, m]
+
+    def at(self, row: int) -> FloatArray:
+        """Derivatives of a row's values [k, values]."""
+        columns = self.columns[:, row]
+        return (columns if self.basis is None else columns @ self.basis[row].T).astype(float)
+
+    def normal(self, residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
+        """Fisher information [k, k] and gradient [k] at residuals [rows, values]."""
+        # J W J^T and J W r with W split between both factors: one product in the precision of the derivatives.
+        root = np.sqrt(noise.weights(residual))[:, None]
+        kind = self.columns.dtype
+        scaled = (self.columns * root.astype(kind)).reshape(len(self.columns), -1)
+        values = (np.where(root > 0, residual, 0) * root).astype(kind)
+        if self.basis is not None:
+            values = np.matmul(values[:, None], self.basis)
+        return (scaled @ scaled.T).astype(float), (scaled @ values.ravel()).astype(float)
+
+
 def minimised(
     residual: Callable[[FloatArray], FloatArray],
-    jacobian: Callable[[FloatArray], NDArray[np.floating]],
+    jacobian: Callable[[FloatArray], Jacobian],
     start: FloatArray,
     free: IntArray,
     prior: Prior,
     steps: int,
     on_step: Callable[[int], None] = lambda step: None,
+    noise: Noise | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Levenberg-Marquardt steps from ``start``; each decreases the cost, as the noise of its beginning has it.
+    """Levenberg-Marquardt steps from ``start``; each decreases the cost, as the noise has it.
 
     ``residual`` gives residuals [rows, values] of parameters [p], model minus observation, NaN without observation;
-    ``jacobian`` their derivatives [k, rows, values] by the entries ``free`` [k], whose prior is ``prior``, or 0 without
-    observation. ``on_step`` is called with the number of a step, from 0, before it. Returns the most probable
-    parameters [p] and their residuals.
+    ``jacobian`` their derivatives by the entries ``free`` [k], whose prior is ``prior``. ``on_step`` is called with the
+    number of a step, from 0, before it. ``noise`` is that of all steps; None: of the residuals before each. Returns the
+    most probable parameters [p] and their residuals.
     """
-    vector, damping = np.array(start, float), FIRST_DAMPING
+    vector, damping, stated = np.array(start, float), FIRST_DAMPING, noise
     present = residual(vector)
     # Iterated weights: the noise, and by it the weight of each row, is that of the residuals before a step.
     for step in range(steps):
         on_step(step)
-        noise = Noise.of(present)
+        noise = stated or Noise.of(present)
         before = noise.cost(present) + prior.cost(vector[free])
-        information, slope = _normal(jacobian(vector), present, noise)
+        information, slope = jacobian(vector).normal(present, noise)
         matrix = information + prior.precision
         # Gauss-Newton equations of likelihood and prior, damped by their diagonal (Marquardt).
         downhill = -slope - prior.precision @ (vector[free] - prior.mean)
@@ -140,35 +169,22 @@ def minimised(
     return vector, present
 
 
-def posterior_covariance(
-    derivative: NDArray[np.floating], residual: FloatArray, prior: Prior, noise: Noise
-) -> FloatArray:
-    """Covariance [p, p] at a solution of derivatives [p, rows, values], residuals [rows, values], prior and noise."""
-    return np.asarray(np.linalg.inv(_normal(derivative, residual, noise)[0] + prior.precision), float)
+def posterior_covariance(derivative: Jacobian, residual: FloatArray, prior: Prior, noise: Noise) -> FloatArray:
+    """Covariance [p, p] at a solution of derivatives by p parameters, residuals [rows, values], prior and noise."""
+    return np.asarray(np.linalg.inv(derivative.normal(residual, noise)[0] + prior.precision), float)
 
 
-def left_out_residuals(
-    derivative: NDArray[np.floating], residual: FloatArray, covariance: FloatArray, noise: Noise
-) -> FloatArray:
+def left_out_residuals(derivative: Jacobian, residual: FloatArray, covariance: FloatArray, noise: Noise) -> FloatArray:
     """Residuals [rows, values] of each row by a fit to the others, to first order; NaN without observation.
 
-    Derivatives [p, rows, values], residuals [rows, values], covariance [p, p] and noise are those of the solution.
+    Derivatives by p parameters, residuals [rows, values], covariance [p, p] and noise are those of the solution.
     Source: the residual of a row over one minus its leverage, Cook and Weisberg, "Residuals and Influence in
     Regression" (1982), section 2.2; here of all values of a row.
     """
     left_out = np.full(residual.shape, np.nan)
-    for row in np.flatnonzero(np.isfinite(residual).all(axis=1)):
+    for row in np.flatnonzero(np.isfinite(residual).all(axis=1)).tolist():
         # Leverage of all values of a row: w J^T C J.
-        slope = derivative[:, row].astype(float)
+        slope = derivative.at(row)
         leverage = noise.weights(residual[row : row + 1])[0] * slope.T @ covariance @ slope
         left_out[row] = np.linalg.solve(np.eye(len(leverage)) - leverage, residual[row])
     return left_out
-
-
-def _normal(derivative: NDArray[np.floating], residual: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
-    """Fisher information [p, p] and gradient [p]."""
-    # J W J^T and J W r with W split between both factors: one product in the precision of the derivatives.
-    root = np.sqrt(noise.weights(residual))[:, None]
-    scaled = (derivative * root.astype(derivative.dtype)).reshape(len(derivative), -1)
-    values = (np.where(root > 0, residual, 0) * root).ravel()
-    return (scaled @ scaled.T).astype(float), (scaled @ values.astype(derivative.dtype)).astype(float)

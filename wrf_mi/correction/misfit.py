@@ -7,7 +7,7 @@ score is relative, and of a median row's, as rows in deep fades have errors too.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from ..backend.device import Recorded, to_tensor, to_uint
 from ..core import Record
@@ -30,6 +31,7 @@ from ..tracing.paths.instrument_parameters import instrument_parameters
 from ..tracing.paths.scene_parameters import PREFIX, QUANTITIES, SHIFT, TILT
 from ..tracing.paths.solve import Prepared
 from ..tracing.paths.traced_field import TracedField, traced_fields
+from .least_squares import Jacobian
 from .options import CorrectionOptions
 
 LATTICE = (12, 40)  # most elevations and azimuths of the lattice of directions
@@ -259,6 +261,22 @@ class Misfit:
         number = np.repeat(np.arange(len(entries)), [len(places) for places in entries])
         return PathTable(np.concatenate(entries), number, np.concatenate(row), *map(np.concatenate, met))
 
+    @cached_property
+    def apart(self) -> list[IntArray]:
+        """Groups of places in `slabs`, no two of which are met by the same path."""
+        met = [(np.flatnonzero(at >= 0), at[at >= 0]) for at in self.paths.slab.T]
+        path, slab = (np.concatenate(each) for each in zip(*met, strict=True))
+        meets = coo_array((np.ones(len(path)), (path, slab)), (len(self.paths.row), len(self.slabs))).tocsr()
+        together, groups = (meets.T @ meets).astype(bool), list[list[int]]()
+        # Greedy colouring, those that share paths with most others first (Welsh and Powell, 1967).
+        for place in np.argsort(-together.sum(axis=1), kind="stable").tolist():
+            others = set(together.indices[together.indptr[place] : together.indptr[place + 1]].tolist())
+            free = next((group for group in groups if others.isdisjoint(group)), None)
+            if free is None:
+                groups.append(free := [])
+            free.append(place)
+        return [np.array(group) for group in groups]
+
     def gains(self, vector: FloatArray, which: IntArray) -> NDArray[np.complex128]:
         """Gains of a vector [p], without exp(-j k length), of the paths ``which`` of `paths`, ascending."""
         params, result, paths = self._device(vector), np.zeros(len(which), complex), self.paths
@@ -284,8 +302,14 @@ class Misfit:
             signals.append((np.asarray(real) + 1j * np.asarray(imaginary)).reshape(len(entry), -1))
         return np.concatenate(signals)
 
-    def jacobian(self, vector: FloatArray, columns: IntArray) -> NDArray[np.float32]:
-        """Derivatives [columns, n_rx * rows, values] of `residual`, 0 where nothing was received."""
+    def within(
+        self, start: FloatArray, places: IntArray
+    ) -> tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], Jacobian]]:
+        """`residual`, and `jacobian` by the entries ``places``, as of `PathSum.within`: of all rows."""
+        return self.residual, lambda vector: self.jacobian(vector, places)
+
+    def jacobian(self, vector: FloatArray, columns: IntArray) -> Jacobian:
+        """Derivatives of `residual` by some entries."""
         slopes = np.zeros((len(columns), *self.observed.shape), np.float32)
         params = self._device(vector)
         for place, column in enumerate(columns):
@@ -294,7 +318,7 @@ class Misfit:
                 slopes[place, port.places] = port.tangent(params, direction).numpy().reshape(len(port.places), -1)
         slopes /= self.unit[:, None].astype(np.float32)
         slopes[:, ~np.isfinite(self.observed).all(axis=1)] = 0
-        return slopes
+        return Jacobian(slopes)
 
     def scores(self, vector: FloatArray) -> FloatArray:
         """Scores of the task of complete reports, [n_rx * rows]; NaN where nothing was received."""

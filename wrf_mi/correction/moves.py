@@ -238,7 +238,7 @@ class Moves:
         # A plane that is tilted, too, fits at the right shift only once its tilts do.
         starts = _starts(choice, tried, vector, of_materials)
         places = choice.places if trials is self.posterior.misfit else choice.plane
-        work, vectors_of = partial(self.posterior.refined, trials, places=places), [start.vector for start in starts]
+        work, vectors_of = partial(self.posterior.refined, trials, noise, places), [start.vector for start in starts]
         # Recordings of Dr.Jit, by which a misfit is evaluated, serve one thread at a time.
         refined = on_threads(work, vectors_of) if isinstance(trials, PathSum) else [work(start) for start in vectors_of]
         costs = self.posterior.trial_costs(trials, noise, np.stack(refined))

@@ -11,7 +11,7 @@ a factor of its sums.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from threading import Lock
@@ -20,22 +20,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
 from ..core.types import FloatArray, IntArray
-from ..parallel.threads import on_threads
+from ..parallel.threads import on_threads, processors
 from ..receivers.receiver_models import ArrayReceiver, PowerReceiver, Slopes
 from ..receivers.receiver_models import ComplexArray as Complex
 from ..tasks import task_of
 from ..tracing.paths.scene_parameters import PREFIX, SHIFT, TILT
-from ..tracing.search.images import mirrored
+from .least_squares import Jacobian
+from .path_lengths import lengths_and_slopes
 
 if TYPE_CHECKING:
     from .misfit import Misfit
 
+Residuals = Callable[[FloatArray], FloatArray]  # residuals [rows, values] of a vector [p]
+Derivatives = Callable[[FloatArray], Jacobian]
 MOST_WAVES = 1 << 24  # most element signals of paths, of 16 bytes each, that are kept for spectra
 TOGETHER = 512  # rows, over all vectors, of which trials are computed at once: their spectra fit into a cache
-MOST_KEPT = 64  # sets of paths that are kept for trials: each takes up to a megabyte, and a Jacobian has hundreds
+MOST_KEPT = 256  # sets of paths that are kept for trials: each takes up to a megabyte
 STEP = 1e-4
 """Difference of a logarithm of permittivity, conductivity or thickness over which gains are compared: walls of tens of
 centimetres resonate within a few per cent of their thickness."""
@@ -96,7 +99,7 @@ class PathSum:
         self._mirrors = np.where(self._paths.reflects, self._paths.plane, -1)
         self._slope, length = csr_array((len(self._paths.row), 0)), np.zeros(0)
         if len(self._plane_places):
-            length, self._slope = _geometry(misfit, self._mirrors, vector)
+            length, self._slope = lengths_and_slopes(misfit, self._mirrors, vector)
         if self._coherent:
             self._k, self._unit = _unit_waves(misfit, vector, length)
         self._gains: dict[tuple[bytes, bytes], Complex] = {}
@@ -142,9 +145,22 @@ class PathSum:
         on_threads(fill, parts)
         return means
 
-    def _trials(self, vectors: FloatArray) -> tuple[IntArray, FloatArray]:
+    def within(self, start: FloatArray, places: IntArray) -> tuple[Residuals, Derivatives]:
+        """`residual` and `jacobian` of some rows: those of paths that entries of planes or materials ``places`` change,
+        or that differ between the present vector and ``start``.
+        """
+        beside = start.copy()
+        beside[places] += STEP
+        touched = self._touched_by(self._differs(np.stack([start, beside]), self.at))
+
+        def residual(vector: FloatArray) -> FloatArray:
+            return self._trials(vector[None], touched)[1][:, 0]
+
+        return residual, lambda vector: self._derivatives(vector, places, touched.rows)
+
+    def _trials(self, vectors: FloatArray, touched: _Touched | None = None) -> tuple[IntArray, FloatArray]:
         """Rows [k] with a path or gain that a vector of [v, p] changes, and their residuals [k, v, values]."""
-        touched, waves = self._changed(vectors)
+        touched, waves = self._changed(vectors, touched)
         # The sums of all paths less those that change, plus these as they are now: other paths are not evaluated.
         total = (self._total[touched.rows] - touched.sums(self._waves[touched.paths]))[:, None] + touched.sums(waves)
         factor, rows = np.stack([self._factor(vector) for vector in vectors], axis=1), touched.rows
@@ -185,49 +201,88 @@ class PathSum:
     def _keep(self, residual: FloatArray) -> None:
         self._residual, self._mean_squares = residual, np.square(residual).mean(axis=1)
 
-    def jacobian(self, vector: FloatArray, columns: IntArray) -> NDArray[np.float32]:
-        """Derivatives of `residual` [columns, rows, values], 0 where nothing was received; by materials over `STEP`."""
+    def jacobian(self, vector: FloatArray, columns: IntArray) -> Jacobian:
+        """Derivatives of `residual` by some entries; by materials over `STEP`."""
+        return self._derivatives(vector, columns, np.arange(len(self.misfit.observed)))
+
+    def _derivatives(self, vector: FloatArray, columns: IntArray, rows: IntArray) -> Jacobian:
+        """`jacobian` of rows ``rows``, ascending, outside of which no column changes any."""
         touched, waves = self._changed(vector[None])
         present, total = self._waves.copy(), self._total.copy()
         present[touched.paths] = waves[:, 0]
         total[touched.rows] += touched.sums(waves[:, 0] - self._waves[touched.paths])
-        gain_columns = {part.start + k: (k == 1, rows) for part, rows in self._factors for k in range(2)}
-        changes = list[tuple[IntArray, Complex]]()  # rows that each column changes, and derivatives of their sums
-        for column in columns:
-            if column in gain_columns:
-                of_phase, rows = gain_columns[column]
-                # Of exp(x + j y) for fields, and of exp(2 x) for powers.
-                slope = (1j if of_phase else 1) if self._coherent else 2 * (not of_phase)
-                changes.append((rows, slope * total[rows]))
-            else:
-                moved, change = self._change_by(int(column), vector, present)
-                changes.append((moved.rows, moved.sums(change)))
-        every = np.unique(np.concatenate([np.zeros(0, np.int64), *(rows for rows, _ in changes)]))
-        factor = self._factor(vector)
-        slopes = self._slopes((total * factor)[every], every)
-        result = np.zeros((len(columns), *self.misfit.observed.shape), np.float32)
+        # Rows that each column changes, and derivatives of their sums.
+        changes = self._gain_changes(total) | self._material_changes(columns, vector, present)
+        for column in np.intersect1d(columns, self._plane_places).tolist():
+            changes[column] = self._plane_change(column, present)
+        factor, observed = self._factor(vector), np.isfinite(self.misfit.observed).all(axis=1)
+        scale = np.where(observed, 1 / self.misfit.unit, 0).astype(np.float32)[:, None]
+        slopes = self._slopes((total * factor)[rows], rows)
+        basis, coefficients = None, None
+        width, values = 2 * total.shape[1], self.misfit.observed.shape[1]
+        if len(columns) > width and values > width:
+            # A report changes by the real and imaginary parts of few signals: by far less than by values.
+            units = [*np.eye(width // 2), *(1j * np.eye(width // 2))]
+            parts = on_threads(lambda unit: slopes(np.tile(unit, (len(rows), 1)), np.arange(len(rows))), units)
+            of_row = np.stack(parts, axis=-1).astype(np.float32)
+            factors = on_threads(np.linalg.qr, np.array_split(of_row, processors()))
+            basis, coefficients = (np.concatenate(each) for each in zip(*factors, strict=True))
+        result = np.zeros((len(columns), len(rows), values if basis is None else width), np.float32)
 
         def fill(number: int) -> None:
-            rows, change = changes[number]
-            of_signal = slopes(change * factor[rows], np.searchsorted(every, rows))
-            result[number][rows] = of_signal / self.misfit.unit[rows, None]
+            # Gains of receivers without any observation change nothing.
+            changed, change = changes.get(int(columns[number]), (rows[:0], total[:0]))
+            which, signal = np.searchsorted(rows, changed), change * factor[changed]
+            if coefficients is None:
+                derivative = slopes(signal, which)
+            else:
+                pairs = np.concatenate([signal.real, signal.imag], axis=1).astype(np.float32)
+                derivative = np.matmul(coefficients[which], pairs[:, :, None])[:, :, 0]
+            result[number][which] = derivative * scale[changed]
 
         on_threads(fill, range(len(columns)))
-        result[:, ~np.isfinite(self.misfit.observed).all(axis=1)] = 0
-        return result
+        return Jacobian(result, basis)
 
-    def _change_by(self, column: int, vector: FloatArray, present: Complex) -> tuple[_Touched, Complex]:
-        """Paths that an entry of a plane or material changes, and derivatives of their waves, ``present`` for all."""
-        beside = vector.copy()
-        beside[column] += STEP
-        if column in self._plane_places:
-            moved = self._touched_by(self._differs(beside[None], vector))
-            slope = moved.slope[:, [np.flatnonzero(self._plane_places == column)[0]]].toarray()
-            return moved, present[moved.paths] * (-1j * slope * self._wavenumber(moved.paths))
-        moved, waves = self._changed(beside[None])
-        # Parameters are rounded to single precision, gains are not.
-        step = float(np.float32(beside[column])) - float(np.float32(vector[column]))
-        return moved, (waves[:, 0] - present[moved.paths]) / step
+    def _gain_changes(self, total: Complex) -> dict[int, tuple[IntArray, Complex]]:
+        """Derivatives of the sums ``total`` by the gains of receivers."""
+        # Of exp(x + j y) for fields, and of exp(2 x) for powers.
+        slopes = (1, 1j) if self._coherent else (2, 0)
+        parts = [(part.start + k, rows, slope) for part, rows in self._factors for k, slope in enumerate(slopes)]
+        return {column: (rows, slope * total[rows]) for column, rows, slope in parts}
+
+    def _plane_change(self, column: int, present: Complex) -> tuple[IntArray, Complex]:
+        """Rows whose paths an entry of a plane changes, and derivatives of their sums, of waves ``present``."""
+        moved = self._touched_by(self._met_by(column))
+        slope = moved.slope[:, [np.flatnonzero(self._plane_places == column)[0]]].toarray()
+        return moved.rows, moved.sums(present[moved.paths] * (-1j * slope * self._wavenumber(moved.paths)))
+
+    def _material_changes(
+        self, columns: IntArray, vector: FloatArray, present: Complex
+    ) -> dict[int, tuple[IntArray, Complex]]:
+        """Rows whose paths each entry of a material among ``columns`` changes, and derivatives of their sums."""
+        changes = dict[int, tuple[IntArray, Complex]]()
+        # Surfaces that no path meets together change at once: a launch for each would take longer than all else.
+        for constants in self._material:
+            for group in self.misfit.apart:
+                together = np.intersect1d(constants[group], columns)
+                if not len(together):
+                    continue
+                beside = vector.copy()
+                beside[together] += STEP
+                moved, waves = self._changed(beside[None])
+                for column in together.tolist():
+                    own = self._touched_by(self._met_by(column))
+                    change = waves[np.searchsorted(moved.paths, own.paths), 0] - present[own.paths]
+                    # Parameters are rounded to single precision, gains are not.
+                    step = float(np.float32(beside[column])) - float(np.float32(vector[column]))
+                    changes[column] = own.rows, own.sums(change / step)
+        return changes
+
+    def _met_by(self, column: int) -> NDArray[np.bool_]:
+        """The plane or surface of an entry, as of `_differs`."""
+        beside = self.at.copy()
+        beside[column] += 1
+        return self._differs(beside[None], self.at)
 
     def accept(self, vector: FloatArray) -> None:
         """Take a vector as the present one."""
@@ -274,9 +329,12 @@ class PathSum:
             touched = self._touched[key] = self._of_paths(key, np.flatnonzero(met))
         return touched
 
-    def _changed(self, vectors: FloatArray) -> tuple[_Touched, Complex]:
-        """The n paths that meet a plane or surface that a vector of [v, p] changes, and waves as of `_waves_of`."""
-        touched = self._touched_by(self._differs(vectors, self.at))
+    def _changed(self, vectors: FloatArray, touched: _Touched | None = None) -> tuple[_Touched, Complex]:
+        """The n paths that meet a plane or surface that a vector of [v, p] changes, and waves as of `_waves_of`.
+
+        ``touched`` are more paths than those, if stated.
+        """
+        touched = touched or self._touched_by(self._differs(vectors, self.at))
         gain = np.stack([self._gain_at(vector, touched) for vector in vectors])
         return touched, self._waves_of(touched, gain, (vectors - self._start)[:, self._plane_places])
 
@@ -333,35 +391,3 @@ def _joined(parts: Sequence[FloatArray], misfit: Misfit) -> FloatArray:
 def near(misfit: Misfit, vector: FloatArray) -> Misfit | PathSum:
     """What gives residuals and derivatives near a vector fastest: a sum over paths where one serves."""
     return PathSum(misfit, vector) if PathSum.serves(misfit) else misfit
-
-
-def _geometry(misfit: Misfit, mirrors: IntArray, vector: FloatArray) -> tuple[FloatArray, csr_array]:
-    """Lengths [n] of paths that planes ``mirrors`` [n, depth] reflect (-1: none), and slopes by planes [n, 3 q]."""
-    surfaces, chosen, count = misfit.sides[0].surfaces, misfit.planes, len(misfit.planes)
-    axes, centre = surfaces.axes[chosen], surfaces.plane_centres_m[chosen]
-    shift, tilt = (vector[misfit.parts[name]] for name in (SHIFT, TILT))
-    normal, offset = surfaces.moved_planes(shift, tilt.reshape(count, 2), chosen)
-    sources = [np.stack([np.asarray(c) for c in side.chains.source_m], axis=-1) for side in misfit.sides]
-    first = np.cumsum([0, *map(len, sources[:-1])])
-    point = np.concatenate(sources)[first[misfit.paths.side] + misfit.paths.entry]
-    image = np.array([side.receiver.position_m for side in misfit.sides], float)[misfit.paths.side]
-    # Image method (Balanis 2012, section 7.4): the receiver mirrored in the planes, from its end of the chain.
-    for at in mirrors.T[::-1]:
-        row = np.flatnonzero(at >= 0)
-        image[row] = mirrored(image[row], normal[at[row]], offset[at[row]])
-    length = np.linalg.norm(image - point, axis=1)
-    # Along the path, point by point: a displacement e of the plane along its normal lengthens it by 2 e (u . n).
-    way, none = (image - point) / length[:, None], np.zeros(0, np.int64)
-    slopes = [(none, none, np.zeros(0))]  # sparse: a path meets few planes
-    for at in mirrors.T:
-        row = np.flatnonzero(at >= 0)
-        q, n = at[row], normal[at[row]]
-        along = (way[row] * n).sum(axis=1)
-        point[row] += way[row] * ((offset[q] - (point[row] * n).sum(axis=1)) / along)[:, None]
-        flat = np.einsum("nad,nd->na", axes[q], point[row] - centre[q])
-        slopes.append((row, q, 2 * along))
-        slopes += [(row, count + 2 * q + axis, -2 * along * flat[:, axis]) for axis in range(2)]
-        way[row] = mirrored(way[row], n)
-    rows, columns, values = (np.concatenate(each) for each in zip(*slopes, strict=True))
-    # Slopes of a plane that reflects a path twice are added.
-    return length, coo_array((values, (rows, columns)), (len(point), 3 * count)).tocsr()

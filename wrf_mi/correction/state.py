@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.types import FloatArray, IntArray
 from ..tracing.paths.scene_parameters import (
@@ -27,7 +26,7 @@ from ..tracing.paths.scene_parameters import (
     name_of,
 )
 from ..tracing.search.surfaces import Surfaces
-from .least_squares import Noise, Prior, left_out_residuals, minimised, posterior_covariance
+from .least_squares import Jacobian, Noise, Prior, left_out_residuals, minimised, posterior_covariance
 from .misfit import Misfit
 from .options import FRAME, FRAME_SD, MATERIALS, PLANES, CorrectionOptions, OnStage
 from .path_sum import PathSum, near
@@ -81,7 +80,7 @@ class State:
         steps = steps if most_steps is None else min(most_steps, steps)
 
         # Derivatives by a sum over paths near each vector, residuals exact: steps end where the exact cost is least.
-        def jacobian(vector: FloatArray) -> NDArray[np.float32]:
+        def jacobian(vector: FloatArray) -> Jacobian:
             return near(misfit, vector).jacobian(vector, free)
 
         def on_step(step: int) -> None:
@@ -248,14 +247,16 @@ class ScenePosterior:
         information = motions.T @ (weight[:, None] * motions) + np.diag(FRAME_SD**-2.0)
         return np.asarray(np.linalg.solve(information, motions.T @ (weight * vector[planes])), float)
 
-    def refined(self, trials: Misfit | PathSum, start: FloatArray, places: IntArray) -> FloatArray:
+    def refined(self, trials: Misfit | PathSum, noise: Noise, places: IntArray, start: FloatArray) -> FloatArray:
         """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""
         places = places[np.isin(places, self.free("+".join(self.options.parts)))]
         # Materials have their prior about the alternative, planes about the stated scene.
         mean, planes = start.copy(), self.misfit.plane_entries
         mean[planes] = self.stated[planes]
-        jacobian = lambda vector: trials.jacobian(vector, places)  # noqa: E731
-        return minimised(trials.residual, jacobian, start, places, self.prior(mean, places), REFINING_STEPS)[0]
+        # With the noise by which alternatives are compared, rows that the choice does not change need no evaluation.
+        residual, jacobian = trials.within(start, places)
+        prior = self.prior(mean, places)
+        return minimised(residual, jacobian, start, places, prior, REFINING_STEPS, noise=noise)[0]
 
 
 def material_places(misfit: Misfit, slab: int) -> IntArray:
