@@ -198,6 +198,10 @@ STORED, PICTURE = Path("benchmarks/results/tables"), Path("docs/images/pareto.pn
 COSTS = {"ms_per_sample": ("prediction of a sample", "ms"), "train_seconds": ("training", "s")}
 """Key, title and unit of each cost."""
 LEAST = 1e-3  # smallest cost on the logarithmic axes
+PUBLISHED = {"nerf2": (200, 0.78), "wrf-gs": (5, 0.82), "wrf-gs+": (8, 0.90)}
+"""Milliseconds of a prediction on an RTX 3090 and median SSIM of the authors' programs for the spectra of NeRF2's data
+(WRF-GS+, table I and figure 8), as hollow markers beside spectra of these data.
+"""
 
 Points = Mapping[str, Mapping[str, float]]  # score and costs of each method by name
 
@@ -251,6 +255,11 @@ def pareto_figure(by_part: Mapping[TablePart, Points]) -> Figure:
             for name, place in at.items():
                 number = names.index(name)
                 shown[name] = axes.scatter(*place, color=f"C{number}", marker="os^"[number // 10])
+            if part.task == "spectrum" and cost == "ms_per_sample":
+                for name, place in PUBLISHED.items():
+                    if name in at:
+                        number = names.index(name)
+                        axes.scatter(*place, facecolor="none", edgecolor=f"C{number}", marker="os^"[number // 10])
             steps = np.transpose([at[name] for name in front(points, cost, task.higher_is_better)])
             axes.step(*steps, where="post", color="0.7", zorder=0)
             axes.set(xscale="log", xlabel=f"{title} ({unit})")

@@ -188,7 +188,7 @@ def test_presets_are_settings():
     assert [name for name, config in configs.items() if config == TrainConfig()] == ["default"]
     paper = configs["paper"]
     assert (paper.encoding.position_octaves, paper.encoding.tx_octaves, paper.loss.ssim_weight) == (10, 10, 0.2)
-    assert configs["fast"].steps < TrainConfig().resolved(np.zeros((1, 3))).steps
+    assert configs["fast"].steps < TrainConfig().resolved(np.zeros((1, 3))).steps < configs["best"].steps
 
 
 def test_zero_steps_resolve_to_the_models_default():

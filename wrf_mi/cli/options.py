@@ -47,7 +47,6 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add("--model", choices=list(MODELS), help="model to fit (default: hybrid); baselines: docs/models.md")
     text = "stages of the hybrid that may be used, from mean,calibration,correction,surfaces,field,residual"
     add("--stages", metavar="LIST", help=f"{text} (default: all that the data allow)")
-    add("--fast", action="store_true", help="the hybrid without its field, whose training takes most of the time")
     text = "scene to trace: for hybrid, beside wrf-gs, wrf-gs+, factorised and r2f2, or alone for ray-tracing"
     add("--scene", metavar="SCENE", help=text)
     text = "receiver of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
@@ -66,7 +65,8 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     add("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")
     text = "calibrate predicted standard deviations on training rows held out in space (one more fit)"
     add("--intervals", action="store_true", help=text)
-    add("--preset", choices=("fast", "default", "paper"), help="named set of settings")
+    text = "settings for less time or a lower error, or the paper's of WRF-GS+ (default: default)"
+    add("--preset", choices=("fast", "default", "best", "paper"), help=text)
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="setting to change; repeatable")
 
 

@@ -89,17 +89,13 @@ def training_request(a: Arguments) -> RunRequest:
 
 
 def _stages(a: Arguments, model: str) -> list[str]:
-    """Setting of ``--stages`` or ``--fast``, neither of which trace has."""
-    stages, fast = getattr(a, "stages", None), getattr(a, "fast", False)
-    if stages is None and not fast:
+    """Setting of ``--stages``, which trace does not have."""
+    stages = getattr(a, "stages", None)
+    if stages is None:
         return []
     if model != HYBRID:
-        raise InputError(f"--stages and --fast belong to --model {HYBRID}, not to {model}")
-    if stages is not None and fast:
-        raise InputError("--fast limits the stages, too: give one of --stages and --fast")
-    from ..models.hybrid.scene_side import FAST
-
-    return [f"stages={stages or ','.join(FAST)}"]
+        raise InputError(f"--stages belongs to --model {HYBRID}, not to {model}")
+    return [f"stages={stages}"]
 
 
 def _preset(a: Arguments, model: str) -> tuple[str, ...]:
@@ -111,7 +107,8 @@ def _preset(a: Arguments, model: str) -> tuple[str, ...]:
     # A data set that is neither a path nor known is refused when it is read.
     presets = known_model(model).serving(stated_task(a.dataset) or "spectrum", a.scene is not None).presets
     if a.preset not in presets:
-        raise InputError(f"{model} on {a.dataset}: takes no preset, which belongs to fields of spectra; use --set")
+        known = f"has the presets {', '.join(presets)}" if presets else "has no presets; use --set"
+        raise InputError(f"--preset {a.preset}: {model} on {a.dataset} {known}")
     return presets[a.preset]
 
 

@@ -42,7 +42,7 @@ OPTIONS = (
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )
 """Options of ``wrf-mi train`` that may vary, besides settings."""
-FLAGS = ("deterministic", "intervals", "fast")  # options without a value that may vary: ``true`` gives them
+FLAGS = ("deterministic", "intervals")  # options without a value that may vary: ``true`` gives them
 FILES = ("scene", "initial.points", "initial.mesh", "initial.paths")
 """Options and settings that may name a file or folder, besides the data set."""
 SHARED = "sweep.json"

@@ -177,8 +177,9 @@ def test_correction_that_is_not_wanted_is_not_fitted(scenes: dict[str, Path], tm
 def test_unknown_stages_and_stages_of_other_models_are_refused(flat_folder: Path, tmp_path: Path, capsys) -> None:
     for words, message in (
         (["--stages", "mean,sixth"], "'sixth' is unknown"),
-        (["--fast", "--stages", "mean"], "one of --stages and --fast"),
-        (["--fast", "--model", "idw"], "belong to --model hybrid"),
+        (["--stages", "mean", "--model", "idw"], "belongs to --model hybrid"),
+        (["--preset", "fast", "--model", "idw"], "has no presets"),
+        (["--preset", "paper"], "has the presets fast, default"),
     ):
         refused(["train", flat_folder, *words, "--out", tmp_path / "run"], message, capsys)
     assert not contents(tmp_path)

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import numpy as np
@@ -35,7 +36,18 @@ from ..few_rows import with_few_rows
 from ..held_out import fit_model, held_out_predictions, labelled
 from ..model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions
 from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
-from .scene_side import FIELD, RESIDUAL, STAGES, InScene, SceneSide, StageReport, TracedStages, inside, stated_reports
+from .scene_side import (
+    FAST,
+    FIELD,
+    RESIDUAL,
+    STAGES,
+    InScene,
+    SceneSide,
+    StageReport,
+    TracedStages,
+    inside,
+    stated_reports,
+)
 from .strengths import StrengthsInScene, TracedStrengths
 
 logger = logging.getLogger(__name__)
@@ -274,6 +286,7 @@ class Hybrid(Model):
     scene, uplink, headings = "optional", "optional", True
     several_carriers, new_receivers = True, True
     train_arguments = ("deterministic",)
+    presets = MappingProxyType({"fast": (f"stages={','.join(FAST)}",), "default": ()})
 
     def __init__(self, gaps: tuple[str, ...] = ()) -> None:
         self.gaps = gaps
