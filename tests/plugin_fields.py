@@ -33,7 +33,7 @@ def weights_of(model: str, count: int = 6, seed: int = 0) -> dict[str, np.ndarra
 def write_run(folder: Path, record: Record, model: str, *own: str) -> Path:
     """A run folder after two steps of training, with settings of one's own."""
     config = settings("steps=2", "log_every=1", "validate_every=2", *own, model=model)
-    return train(record, folder, model, settings=config, split=official(record)).folder
+    return train(record, model, out=folder, settings=config, split=official(record)).folder
 
 
 def plain(array: Any) -> np.ndarray:

@@ -12,18 +12,14 @@ import wrf_mi
 WITHOUT = {
     "wrf_mi.core.errors",
     "wrf_mi.datasets.download",  # needs a network
-    "wrf_mi.maps.dataset",  # in the example of wrf_mi.maps.api
-    "wrf_mi.maps.plan",  # in that of wrf_mi.maps.api
     "wrf_mi.runs.compare",  # in that of wrf_mi.runs.api
     "wrf_mi.runs.other_models",  # in that of wrf_mi.runs.api
     "wrf_mi.runs.run",  # in that of wrf_mi.runs.api
-    "wrf_mi.runs.scene_view",  # in notebooks
     "wrf_mi.scene.edit",  # in that of wrf_mi.scene.make
-    "wrf_mi.training.config",  # in that of wrf_mi.core.settings
-    "wrf_mi.training.trainer",  # in notebooks
 }
 """Modules of public names without examples of their own."""
 NAMES = {getattr(wrf_mi, name).__module__ for name in wrf_mi.__all__}
+NAMES |= {f"wrf_mi.{name}" for name in ("core.settings", "maps.api", "maps.locate", "scene.make", "viewer.view")}
 
 
 @pytest.mark.parametrize("name", sorted(NAMES - WITHOUT))

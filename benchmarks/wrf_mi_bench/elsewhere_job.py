@@ -61,7 +61,7 @@ def main(file: str, backend: str, threads: str, small: str) -> None:
     if backend == "llvm":
         with tempfile.TemporaryDirectory() as folder:
             words = [*SETTINGS, f"initial.gaussians={gaussians}", f"steps={steps}"]
-            score = train(spectra, Path(folder) / "run", "wrf-gs+", settings=words).metrics["ssim"]
+            score = train(spectra, "wrf-gs+", out=Path(folder) / "run", settings=words).metrics["ssim"]
         arrays["metrics"] = np.array([score[name] for name in ("median", "mean", "p10", "p90")])
     versions = {"numpy": np.__version__, "llvm": known.llvm_version or "", "device": known.device}
     np.savez(file, versions=json.dumps(versions), **arrays)

@@ -65,8 +65,8 @@ def memory(folder: Path, predictions: int = PREDICTIONS, opened: int = OPENED) -
     prepare_data(folder)
     field = with_settings(default_config("spectrum", False), FIELD)
     runs = {
-        "kriging": train(folder / HOME / FLAT, folder / "kriging", "kriging").folder,
-        "wrf-gs+": train(folder / SPECTRA, folder / "field", "wrf-gs+", settings=field).folder,
+        "kriging": train(folder / HOME / FLAT, "kriging", out=folder / "kriging").folder,
+        "wrf-gs+": train(folder / SPECTRA, "wrf-gs+", out=folder / "field", settings=field).folder,
     }
     rng, rows, wrong = np.random.default_rng(0), [], []
     for name, run in runs.items():

@@ -91,7 +91,7 @@ def predictions() -> dict[str, dict[int, float]]:
         for model, sizes in PREDICTED.items():
             joint = model == "joint"
             name, where = ("wrf-gs+", scene) if joint else (model, None)
-            run = wrf_mi.train(record, Path(work) / model, name, scene=where, settings=[FEW_STEPS])
+            run = wrf_mi.train(record, name, out=Path(work) / model, scene=where, settings=[FEW_STEPS])
             per_second[model] = {}
             for size in sizes:
                 run.predict(transmitter_path(size))  # kernels and operator are made here

@@ -274,7 +274,7 @@ def _write_runs(folder: Path) -> None:
     from wrf_mi.training.session import Interrupted
 
     init("llvm", threads=1)
-    strengths = train(folder / "ble", folder / "runs" / "kriging", "kriging")
+    strengths = train(folder / "ble", "kriging", out=folder / "runs" / "kriging")
     where = ExportOptions(frequency_hz=CARRIER_HZ, tx_pos_m=np.array([[1.0, 2, 1]]), rx_pos_m=np.array([[3.0, 1, 2]]))
     export(folder / "scene", "paths", folder / "files" / "paths.csv", where)
     radio = radio_map(strengths, height_m=1.0, step_m=0.5)
@@ -282,9 +282,9 @@ def _write_runs(folder: Path) -> None:
     write_map(radio, folder / "runs" / "map.zarr")
     write_map(radio_map(strengths, surface=folder / "files" / "box.ply"), folder / "runs" / "surface.nc")
     settings = (*SMALL, "network.static_geometry=true")
-    run = train(folder / "spectra", folder / "runs" / "field", "wrf-gs+", settings=settings).folder
+    run = train(folder / "spectra", "wrf-gs+", out=folder / "runs" / "field", settings=settings).folder
     export(run, "field", folder / "runs" / "field.npz")
     open_run(run).predict([[2.0, 1.0, 1.0]])  # builds the operator
     asked, stopped = iter(range(1, 5)), folder / "runs" / "stopped"
     with suppress(Interrupted):
-        train(folder / "spectra", stopped, "wrf-gs+", settings=settings, stop=lambda: next(asked) >= 3)
+        train(folder / "spectra", "wrf-gs+", out=stopped, settings=settings, stop=lambda: next(asked) >= 3)

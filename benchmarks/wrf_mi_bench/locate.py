@@ -62,7 +62,7 @@ def measure(cell: Cell, scene: str | None, folder: Path) -> dict[str, Any]:
         shutil.rmtree(folder, ignore_errors=True)
         more: dict[str, Any] = {"scene": scene if cell.scene else None, "settings": cell.settings}
         options: dict[str, Any] = {"n_train": cell.n_train, "seed": cell.seed, "intervals": cell.intervals}
-        train(FLAT, folder, cell.model, **options, **more)
+        train(FLAT, cell.model, out=folder, **options, **more)
     run = open_run(folder)
     strengths_dbm, true_m = test_observations(run)
     located = locate(run, strengths_dbm, on_progress=_show(cell.name))

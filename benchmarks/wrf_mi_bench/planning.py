@@ -120,7 +120,7 @@ def measure(name: str, rule: str, start: int, folder: Path) -> list[float]:
     model, settings = ("kriging", ()) if place.scene is None else ("hybrid", IN_SCENE)
     for size in SIZES:
         split = Split("chosen", start, rows, rows[:0], official.test)
-        run = wrf_mi.train(record, folder / f"{size}", model, scene=place.scene, split=split, settings=settings)
+        run = wrf_mi.train(record, model, out=folder / f"{size}", scene=place.scene, split=split, settings=settings)
         scores.append(run.metrics[TASKS[record.task].block]["median"])
         if size < SIZES[-1]:
             count = SIZES[SIZES.index(size) + 1] - size

@@ -86,7 +86,7 @@ def measure_room(seed: int, folder: Path, survey: Survey = DEFAULT) -> dict[str,
         scores[name] = clipped_cea_db(tracer.observe(traced[name])[0], truth, record)
     scenes = {"": None, "scan": scan, "corrected": corrected}
     for column, (model, scene_name) in MODELS.items():
-        run = wrf_mi.train(record, folder / "runs" / column.replace(", ", "-"), model, scene=scenes[scene_name])
+        run = wrf_mi.train(record, model, out=folder / "runs" / column.replace(", ", "-"), scene=scenes[scene_name])
         predicted = wrf_mi.open_run(run.folder, record).predict(record.tx_pos_m[rows]).mean
         scores[column] = clipped_cea_db(np.asarray(predicted), truth, record)
     size = " x ".join(f"{side:.1f}" for side in room.size_m)

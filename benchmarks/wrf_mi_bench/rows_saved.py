@@ -47,7 +47,9 @@ def measure(cell: Cell, seed: int, folder: Path, steps: int = STEPS) -> dict[str
     ):
         place = folder / name.replace(" ", "-")
         shutil.rmtree(place, ignore_errors=True)
-        run = train(cell.dataset, place, model, scene=field_scene, n_train=cell.n_train, seed=seed, settings=settings)
+        run = train(
+            cell.dataset, model, out=place, scene=field_scene, n_train=cell.n_train, seed=seed, settings=settings
+        )
         task, reference = TASKS[run.metrics["task"]], run.metrics["reference"]
         idw = reference[task.reference]["median"]
         scores |= {name: run.metrics[task.block]["median"], IDW: idw, "task": task.name}

@@ -138,7 +138,7 @@ def run_of_cell(cell: Cell, data: str | Record, place: Path, model: str, **more:
     """Run of a model in a folder on the rows of a cell, seed 0: finished, continued or new."""
     if not (place / CONFIG).exists():
         shutil.rmtree(place, ignore_errors=True)  # stopped before its configuration was written
-        train(data, place, model, split=cell.split, n_train=cell.n_train, seed=0, **more)
+        train(data, model, out=place, split=cell.split, n_train=cell.n_train, seed=0, **more)
     elif not is_finished(place):
         resume(place, record=data if isinstance(data, Record) else None)
     return read_run(place)

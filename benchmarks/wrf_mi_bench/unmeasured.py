@@ -74,7 +74,7 @@ def _run(place: Path, record: str | Record, split: Split | str, seed: int, model
     """Run of a model, whose folder is removed once it is read."""
     shutil.rmtree(place, ignore_errors=True)
     try:
-        train(record, place, model, split=split, seed=seed, **more)
+        train(record, model, out=place, split=split, seed=seed, **more)
         return read_run(place)
     finally:
         shutil.rmtree(place, ignore_errors=True)

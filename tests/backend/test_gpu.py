@@ -50,7 +50,7 @@ def test_division_and_roots_are_exact():
 @pytest.mark.parametrize("model", [*FIELDS, "kriging"])
 def test_fits_score_alike(model, folder, tmp_path, monkeypatch):
     options = [*QUICK, "steps=60"] if model in FIELDS else []
-    on_gpu = train(folder, tmp_path / "gpu", model, settings=options).metrics["ssim"]["mean"]
+    on_gpu = train(folder, model, out=tmp_path / "gpu", settings=options).metrics["ssim"]["mean"]
     words = [word for setting in options for word in ("--set", setting)]
     on_cpu(["train", str(folder), "--model", model, *words, "--out", str(tmp_path / "cpu")], monkeypatch)
     cpu_score = json.loads((tmp_path / "cpu" / "metrics.json").read_text())["ssim"]["mean"]
@@ -59,7 +59,7 @@ def test_fits_score_alike(model, folder, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("model", ["wrf-gs+", "factorised"])
 def test_a_run_predicts_alike(model, folder, tmp_path, monkeypatch):
-    run = train(folder, tmp_path / "run", model, settings=[*QUICK, "steps=20"])
+    run = train(folder, model, out=tmp_path / "run", settings=[*QUICK, "steps=20"])
     tx = np.random.default_rng(0).uniform(-2, 2, (8, 3)).astype(np.float32)
     np.savez(tmp_path / "tx.npz", tx_pos=tx)
     expected = run.predict(tx).mean

@@ -218,11 +218,11 @@ def test_fits_warn_of_them(tmp_path, caplog, capsys):
     folder = write_ble_folder(tmp_path / "office", marked(0.3, -101, 0, 1, 2))
     (suspicion,) = check_data(folder).suspicions
     with caplog.at_level(logging.WARNING):
-        train(folder, tmp_path / "run", "idw")
+        train(folder, "idw", out=tmp_path / "run")
     messages = [record.getMessage() for record in caplog.records if "suspicion" in record.getMessage()]
     assert messages == [f"office: suspicion not-heard: {suspicion.text} (wrf-mi data check)"]
     assert call(["data", "check", folder, "--strict"], capsys)[0] == 1
     assert call(["data", "check", folder, "--strict", "--ignore", "not-heard"], capsys)[0] == 0
     caplog.clear()
-    train(strengths(), tmp_path / "clean", "idw")
+    train(strengths(), "idw", out=tmp_path / "clean")
     assert not [record for record in caplog.records if "suspicion" in record.getMessage()]

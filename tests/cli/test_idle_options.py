@@ -92,7 +92,7 @@ def test_settings_of_paths_without_a_scene_are_named(flat_folder: Path, caplog: 
 def test_other_commands_refuse_or_name_options_without_effect(
     flat_folder: Path, room: Path, tmp_path: Path, command: Command, caplog: Any
 ) -> None:
-    run = train(flat_folder, tmp_path / "run", "kriging", settings=("generic=true",)).folder
+    run = train(flat_folder, "kriging", out=tmp_path / "run", settings=("generic=true",)).folder
     positions = positions_file(tmp_path / "positions.csv", [[1, 1, 1]])
     predict = ["predict", run, "--tx", positions, "--out", tmp_path / "new.csv"]
     command.refused([*predict, "--no-operator"], "--no-operator belongs to learned fields of spectra, not to kriging")

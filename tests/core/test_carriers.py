@@ -86,12 +86,12 @@ def test_inconsistent_carriers_are_refused(flat: Record) -> None:
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_carriers_are_interpolated_separately(name: str, flat: Record, tmp_path: Path) -> None:
-    run = train(flat, tmp_path / "run", name, settings=SETTINGS[name])
+    run = train(flat, name, out=tmp_path / "run", settings=SETTINGS[name])
     read = read_run(run.folder)
     carriers = flat.carriers_hz[read.row]
     for carrier in (LOW, HIGH):
         record, split = of(flat, carrier)
-        alone = read_run(train(record, tmp_path / f"{carrier}", name, split=split, settings=SETTINGS[name]).folder)
+        alone = read_run(train(record, name, out=tmp_path / f"{carrier}", split=split, settings=SETTINGS[name]).folder)
         np.testing.assert_array_equal(read.prediction[:, carriers == carrier], alone.prediction)
         for key in alone.references:
             np.testing.assert_array_equal(read.references[key][:, carriers == carrier], alone.references[key])
@@ -102,7 +102,7 @@ def test_carriers_are_interpolated_separately(name: str, flat: Record, tmp_path:
 
 
 def test_predictions_of_several_carriers(flat: Record, flat_folder: Path, tmp_path: Path) -> None:
-    run, place = train(flat, tmp_path / "run", "idw"), flat.tx_pos_m[:2]
+    run, place = train(flat, "idw", out=tmp_path / "run"), flat.tx_pos_m[:2]
     refusal(run.predict, place, r"its data have rows at 2 carriers, .* Hz; give frequency_hz for each position")
     message = r"2 positions and carriers \(1,\); give one positive frequency_hz for each"
     refusal(run.predict, place, message, carriers_hz=LOW)
@@ -111,7 +111,7 @@ def test_predictions_of_several_carriers(flat: Record, flat_folder: Path, tmp_pa
     between = run.predict(place, carriers_hz=[np.sqrt(LOW * HIGH)] * 2).mean
     np.testing.assert_allclose(between, (low + high) / 2, rtol=1e-6)
     np.testing.assert_array_equal(run.predict(place, carriers_hz=[0.1 * LOW, 10 * HIGH]).mean, [low[0], high[1]])
-    one = train(flat_folder, tmp_path / "one", "idw")
+    one = train(flat_folder, "idw", out=tmp_path / "one")
     refusal(one.predict, place, "its data have one carrier; omit frequency_hz", carriers_hz=[LOW, LOW])
 
 
@@ -129,12 +129,14 @@ def test_a_carrier_is_predicted_from_the_others(name: str, flat: Record, tmp_pat
         observation=(np.tile(flat.observation, 3) - loss).astype(np.float32),
         official=None,
     )
-    found = read_run(train(three, tmp_path / "run", name, split="frequency-known:1", settings=SETTINGS[name]).folder)
+    found = read_run(
+        train(three, name, out=tmp_path / "run", split="frequency-known:1", settings=SETTINGS[name]).folder
+    )
     assert (carriers[found.row] == middle).all()
     step = found.references[TASKS["rssi"].reference] - found.references[CARRIER]
     np.testing.assert_allclose(step, -20 * np.log10(middle / LOW), atol=FLOAT32_DB)  # the lower of two as near
     lowest = Split("lowest", 0, np.arange(n), np.zeros(0, np.int64), np.arange(2 * n, 3 * n))
-    low = train(three, tmp_path / "low", name, split=lowest, settings=SETTINGS[name])
+    low = train(three, name, out=tmp_path / "low", split=lowest, settings=SETTINGS[name])
     turned = heading[found.row] if name in ("kriging", "trees") else None
     for receiver in range(len(flat.receivers)):
         known = low.predict(three.tx_pos_m[found.row], receiver, turned, carriers_hz=np.full(len(found.row), LOW)).mean
@@ -144,7 +146,7 @@ def test_a_carrier_is_predicted_from_the_others(name: str, flat: Record, tmp_pat
 
 def test_predictions_take_and_state_carriers(flat: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_ble_folder(tmp_path / "flat", flat)
-    run = train(folder, tmp_path / "run", "idw")
+    run = train(folder, "idw", out=tmp_path / "run")
     table = np.column_stack([flat.tx_pos_m[:4], [LOW, HIGH, HIGH, LOW]])
     np.savetxt(tmp_path / "tx.csv", table, "%.17g", ",", header="x,y,z,frequency_hz", comments="")
     np.savez(tmp_path / "tx.npz", tx_pos=table[:, :3], frequency_hz=table[:, 3])
@@ -164,7 +166,7 @@ def test_predictions_take_and_state_carriers(flat: Record, tmp_path: Path, capsy
 
 
 def test_direct_paths_have_the_free_space_loss_of_each_row(flat: Record, room: Path, tmp_path: Path) -> None:
-    run = train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=TraceOptions(reflection=False, depth=0))
+    run = train(flat, "ray-tracing", out=tmp_path / "run", scene=room, settings=TraceOptions(reflection=False, depth=0))
     rx = np.stack([receiver.position_m for receiver in flat.receivers])
     distance = np.linalg.norm(flat.tx_pos_m - rx[:, None], axis=-1)
     loss = 20 * np.log10(speed_of_light / flat.carriers_hz / (4 * np.pi * distance))
@@ -213,7 +215,7 @@ def test_cross_polarisation_is_judged_at_one_carrier(flat: Record, room: Path) -
 
 
 def test_stored_paths_keep_the_carriers(flat: Record, room: Path, tmp_path: Path) -> None:
-    run = train(flat, tmp_path / "run", "ray-tracing", scene=room, settings=["depth=1", "rays=20000"])
+    run = train(flat, "ray-tracing", out=tmp_path / "run", scene=room, settings=["depth=1", "rays=20000"])
     stored = load_trace(run.folder / "paths.npz")
     np.testing.assert_array_equal(stored.carriers_hz, flat.carriers_hz)
     read, again = read_run(run.folder), open_run(run.folder, flat)

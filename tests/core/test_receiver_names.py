@@ -53,7 +53,7 @@ def test_functions_say_that_they_take_names(function: Callable[..., Any]) -> Non
 
 @pytest.mark.parametrize("model", ["mri", "kriging"])
 def test_runs_predict_for_a_receiver_by_name(model: str, plain_flat_folder: Path, tmp_path: Path) -> None:
-    run = wrf_mi.open_run(wrf_mi.train(plain_flat_folder, tmp_path / model, model).folder)
+    run = wrf_mi.open_run(wrf_mi.train(plain_flat_folder, model, out=tmp_path / model).folder)
     by_name, by_number, other = (run.predict([[1.0, 2.0, 0.5]], name).mean for name in ("hall $_$", 1, "kitchen"))
     np.testing.assert_array_equal(by_name, by_number)
     assert by_name != other

@@ -103,7 +103,7 @@ def test_rows_are_told_to_models_of_the_corrected_scene(corrected, tmp_path, cap
     assert (data.rows.tolist(), data.error_ratio) == (split.all_train.tolist(), found.data.error_ratio)
     for rows, warned in ((split, False), (replace(split, train=split.test, test=split.train[:7]), True)):
         caplog.clear()
-        wrf_mi.train(record, tmp_path / str(warned), "ray-tracing", scene=str(tmp_path / "scene"), split=rows)
+        wrf_mi.train(record, "ray-tracing", out=tmp_path / str(warned), scene=str(tmp_path / "scene"), split=rows)
         assert ("corrected by 7 of the 7 test rows" in caplog.text) is warned
 
 

@@ -35,11 +35,11 @@ def changed(record: Record, *changes: tuple[Any, float]) -> Record:
 
 
 def train_field(record: Record, out: Path, split: str = "official") -> Path:
-    return train(record, out, "wrf-gs+", settings=settings("steps=2", "deterministic=true"), split=split).folder
+    return train(record, "wrf-gs+", out=out, settings=settings("steps=2", "deterministic=true"), split=split).folder
 
 
 def train_idw(record: Record, out: Path, split: str = "official") -> Path:
-    return train(record, out, "idw", split=split).folder
+    return train(record, "idw", out=out, split=split).folder
 
 
 BOTH = pytest.mark.parametrize("train", [train_field, train_idw])
@@ -73,7 +73,7 @@ def test_fields_need_every_receiver_in_every_row(two_gateways: Record, tmp_path:
 def test_rows_that_test_are_counted_and_not_scored(train: Any, two_gateways: Record, tmp_path: Path) -> None:
     a, b, c = (int(row) for row in official(two_gateways).test[:3])
     broken = changed(two_gateways, ((0, a, 4, 5), np.nan), ((1, b), np.inf), ((1, c), np.nan))
-    whole, found = train(two_gateways, tmp_path / "whole"), train(broken, tmp_path / "broken")
+    whole, found = train(two_gateways, out=tmp_path / "whole"), train(broken, out=tmp_path / "broken")
     metrics = json.loads((found / "metrics.json").read_text())
     assert metrics["n_not_scored"] == 2
     assert json.loads((whole / "metrics.json").read_text())["n_not_scored"] == 0
@@ -122,7 +122,7 @@ def test_a_gateway_without_training_rows_is_left_out_where_asked(
 ) -> None:
     settings, scene = (DIRECT, room) if model == "ray-tracing" else ((), None)
     left_out, alone = (
-        train(data, tmp_path / name, model, scene=scene, settings=settings, min_rows=2)
+        train(data, model, out=tmp_path / name, scene=scene, settings=settings, min_rows=2)
         for name, data in (("run", silent), ("alone", silent.at_receivers([0])))
     )
     assert left_out.metrics["receivers_left_out"] == {"anchor2": 0}
@@ -165,7 +165,7 @@ def test_a_stopped_trace_goes_on_with_its_paths(
     with monkeypatch.context() as patch:
         patch.setattr(module, stage, stopped)
         with pytest.raises(KeyboardInterrupt):
-            train(flat_folder, out, "ray-tracing", scene=room, settings=DIRECT, split=split)
+            train(flat_folder, "ray-tracing", out=out, scene=room, settings=DIRECT, split=split)
     written = (out / "paths.npz").stat().st_mtime_ns  # an hour's work may lie there
     again = ["train", flat_folder, "--model", "ray-tracing", "--scene", room, "--paths", "line-of-sight", "--depth", 0]
     refused([*again, "--out", out], f"{out}: exists and is not empty; choose another --out", capsys)

@@ -62,7 +62,7 @@ def test_examples_of_how_to_pages_run(tmp_path, monkeypatch):
     try:
         for page in ("own-data", "model", "receiver", "benchmark"):
             exec("\n".join(blocks(DOCS / "howto" / f"{page}.md", "python")), names)
-        run = wrf_mi.train("office", "run", "nearest")
+        run = wrf_mi.train("office", "nearest", out="run")
         assert wrf_mi.check_data("office").suspicions == ()
         assert wrf_mi.open_run("run").predict([[2.0, 3.0, 1.2]], "kitchen").mean.shape == (1,)
         assert run.metrics["abs_error_db"]["median"] < 5

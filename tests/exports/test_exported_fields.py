@@ -37,7 +37,9 @@ SPLAT_TRANSFORM = shutil.which("splat-transform") or shutil.which(
 def runs(two_gateways: Record, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A run of each field, after very few steps."""
     out = tmp_path_factory.mktemp("runs")
-    return {name: train(folder, out / name, name, settings=settings("steps=4", model=name)).folder for name in FIELDS}
+    return {
+        name: train(folder, name, out=out / name, settings=settings("steps=4", model=name)).folder for name in FIELDS
+    }
 
 
 def gaussians(run: Path) -> Any:

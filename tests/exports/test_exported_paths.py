@@ -28,7 +28,7 @@ SINGLE_M = 1e-5
 @pytest.fixture(scope="module")
 def run(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("traced") / "run"
-    return train(flat_folder, out, "ray-tracing", scene=room, settings=TraceOptions(depth=2)).folder
+    return train(flat_folder, "ray-tracing", out=out, scene=room, settings=TraceOptions(depth=2)).folder
 
 
 def assert_same_paths(read: Paths, written: Paths) -> None:

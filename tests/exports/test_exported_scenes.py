@@ -139,7 +139,7 @@ def test_ply_has_colours_materials_and_is_a_scene_again(scene: Path, tmp_path: P
 
 
 def test_corrected_scene_of_a_run_is_exported(flat_folder: Path, room: Path, tmp_path: Path) -> None:
-    run = train(flat_folder, tmp_path / "run", "ray-tracing", scene=room, settings=["depth=0"]).folder
+    run = train(flat_folder, "ray-tracing", out=tmp_path / "run", scene=room, settings=["depth=0"]).folder
     assert export(run, "ply", tmp_path / "room.ply")["surfaces"] == 6
     # What a calibration of materials leaves in the run folder.
     fitted = {name_of("itu_concrete", "permittivity"): np.log([3.0])}

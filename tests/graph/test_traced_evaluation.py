@@ -262,7 +262,7 @@ def test_traced_run_with_a_scene_reproduces_its_score(tmp_path):
     record = Record("made", "spectrum", tx, (station,), spectra, frequencies_hz=np.array([WALLS_HZ]))
     asked = ["steps=4", *QUICK[:-1], "validate_every=2", "traced.rays=1024", "batch=2"]
     how = {"receiver": "pixel", "evaluation": "traced", "split": "random", "scene": write_xml(tmp_path, SHOEBOX)}
-    run = train(record, tmp_path / "run", "wrf-gs+", settings=asked, **how).folder
+    run = train(record, "wrf-gs+", out=tmp_path / "run", settings=asked, **how).folder
     stored = np.load(run / "predictions.npz")
     again = open_run(run, record).predict(tx[stored["row"]]).mean
     np.testing.assert_allclose(again, stored["prediction"].reshape(again.shape), atol=1e-5)
@@ -276,4 +276,4 @@ def test_untraceable_settings_are_refused_in_one_line(tmp_path):
         with_settings(TrainConfig(), ["evaluation=cast"])
     record, _ = made_record(24)
     with pytest.raises(InputError, match=r"--evaluation belongs to Gaussians .*, not to idw"):
-        train(record, tmp_path / "idw", "idw", evaluation="traced")
+        train(record, "idw", out=tmp_path / "idw", evaluation="traced")

@@ -175,7 +175,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
     places = np.column_stack([rng.uniform(0.3, 5.7, (60, 2)), np.ones(60)])
     record = record_of(places, strengths(places) + rng.normal(0, 1, (3, 60)), 40)
     data = write_ble_folder(folder / "data", record)
-    return train(data, folder / "run", "kriging").folder, record
+    return train(data, "kriging", out=folder / "run").folder, record
 
 
 def observations(path: Path, record: Record) -> Path:
@@ -249,7 +249,7 @@ def test_empty_fields_are_receivers_without_a_value(fitted: tuple[Path, Record],
 def test_bad_arguments_are_refused(fitted: tuple[Path, Record], tmp_path: Path, command: Command) -> None:
     run, record = fitted
     value = record.observation[:, :2]
-    without_std = train(write_ble_folder(tmp_path / "data", record), tmp_path / "run", "idw").folder
+    without_std = train(write_ble_folder(tmp_path / "data", record), "idw", out=tmp_path / "run").folder
     for folder, strengths_dbm, options, message in (
         (run, value[:2], {}, r"give strengths \[3, m\]"),
         (run, np.full((3, 1), np.nan), {}, "no receiver received transmitter 0"),
@@ -275,7 +275,7 @@ def test_candidates_do_not_depend_on_test_rows(tmp_path: Path) -> None:
     at = np.column_stack([np.random.default_rng(5).uniform(0.5, 5.5, (40, 2)), np.ones(40)])
     moved = np.concatenate([at[:30], np.full((10, 3), [50.0, -50.0, 9.0])])
     first, second = (
-        candidates_of(train(record_of(places, strengths(places), 30), tmp_path / name, "kriging"))
+        candidates_of(train(record_of(places, strengths(places), 30), "kriging", out=tmp_path / name))
         for name, places in (("first", at), ("second", moved))
     )
     np.testing.assert_array_equal(first.positions_m, second.positions_m)

@@ -19,6 +19,7 @@ import wrf_mi
 from wrf_mi.core import Record
 from wrf_mi.datasets import make_splits, write_ble_folder, write_nerf2_csi, write_spectrum_folder
 from wrf_mi.maps import picture
+from wrf_mi.maps.api import radio_map
 from wrf_mi.maps.dataset import write_map
 from wrf_mi.maps.picture import map_figure
 
@@ -27,7 +28,7 @@ BANDS_HZ = (9e8, 2.4e9)
 
 def mapped(data: Any, folder: Path, command: Command, *more: Any) -> tuple[xr.Dataset, Figure, wrf_mi.Run]:
     """Map by the command of a run of kriging with intervals, and its picture drawn anew."""
-    run = wrf_mi.train(data, folder / "run", "kriging", intervals=True)
+    run = wrf_mi.train(data, "kriging", out=folder / "run", intervals=True)
     out = folder / "map.nc"
     status, _, err = command(["map", run.folder, "--step", "0.5", "--out", out, *more])
     assert (status, err) == (0, "mapping\n")
@@ -97,7 +98,7 @@ def test_picture_of_a_carrier_has_the_rows_of_that_carrier(two_bands: Record, tm
     assert (len(found["trained"]), len(found["other"])) == (15, 5)
     assert np.concatenate(list(found.values())).max() < -50
     command.refused(["map", run.folder, "--out", tmp_path / "none.nc"], "900000000, 2400000000 Hz")
-    between = map_figure(wrf_mi.radio_map(run, step_m=1.0, frequency_hz=1.5e9), run)
+    between = map_figure(radio_map(run, step_m=1.0, frequency_hz=1.5e9), run)
     assert "no measured row at this carrier" in heading(between)
 
 

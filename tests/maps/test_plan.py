@@ -11,9 +11,9 @@ import pytest
 from wrf_mi_bench.planning import farthest_points
 
 import wrf_mi
-from wrf_mi import InputError, plan, train
+from wrf_mi import InputError, train
 from wrf_mi.cli.main import main
-from wrf_mi.maps.plan import error_priors, greedy
+from wrf_mi.maps.plan import error_priors, greedy, plan
 from wrf_mi.models.error_prior import ErrorPrior, with_columns
 from wrf_mi.models.interpolation.kriging import Kriging, UncertainKriged
 from wrf_mi.models.interpolation.kriging_equations import KrigingSystem, correlation
@@ -86,7 +86,7 @@ def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> wrf_mi.R
     far = record.tx_pos_m[:, 0] > 3.0
     split = wrf_mi.make_splits(record, "official")[0]
     split = replace(split, train=split.train[~far[split.train]], validation=split.validation[:0])
-    return train(record, tmp_path_factory.mktemp("runs") / "kriging", "kriging", split=split)
+    return train(record, "kriging", out=tmp_path_factory.mktemp("runs") / "kriging", split=split)
 
 
 def test_plan_goes_where_nothing_was_measured(run: wrf_mi.Run, tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_plan_goes_where_nothing_was_measured(run: wrf_mi.Run, tmp_path: Path) -
 def test_surfaces_of_a_scene_are_terms_of_the_process(
     run: wrf_mi.Run, flat_folder: Path, room: Path, tmp_path: Path
 ) -> None:
-    in_scene = train(flat_folder, tmp_path / "hybrid", "hybrid", scene=room, n_train=12)
+    in_scene = train(flat_folder, "hybrid", out=tmp_path / "hybrid", scene=room, n_train=12)
     at = np.array([[1.0, 1.0, 1.3], [3.0, 2.0, 1.3]])
     with_walls, alone = error_priors(in_scene, [0], at)[0], in_scene.fitted.error_prior(0)
     assert alone is not None

@@ -64,7 +64,7 @@ def free_space_db(positions_m: np.ndarray, receiver: wrf_mi.Receiver) -> np.ndar
 
 @pytest.fixture(scope="module")
 def law(strengths: Record, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return wrf_mi.train(strengths, tmp_path_factory.mktemp("runs") / "law", "mri", intervals=True)
+    return wrf_mi.train(strengths, "mri", out=tmp_path_factory.mktemp("runs") / "law", intervals=True)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +142,7 @@ def test_surface_has_the_values_of_its_points(law: Run, tmp_path: Path) -> None:
 
 
 def test_headings_are_averaged_by_the_law_of_total_variance(flat_folder: Path, tmp_path: Path) -> None:
-    run = wrf_mi.train(flat_folder, tmp_path / "run", "kriging", intervals=True)
+    run = wrf_mi.train(flat_folder, "kriging", out=tmp_path / "run", intervals=True)
     parts = radio_map(run, step_m=1.5)
     positions = grid_positions(parts).reshape(-1, 3)
     each = [run.predict(positions, 0, np.full(len(positions), turn)) for turn in np.arange(8) * np.pi / 4]
@@ -171,7 +171,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
 def traced(room: tuple[Path, Record], tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Lines of sight in the room."""
     out, known = tmp_path_factory.mktemp("runs") / "traced", {"scene": room[0], "settings": ["depth=0"]}
-    return wrf_mi.train(room[1], out, "ray-tracing", **known)
+    return wrf_mi.train(room[1], "ray-tracing", out=out, **known)
 
 
 def test_traced_paths_have_statistics_and_solids_are_left_out(traced: Run) -> None:
@@ -216,15 +216,15 @@ def test_map_above_a_scene_without_a_ceiling_is_told(
     _, record = room
     parts = {name: part for name, part in SHOEBOX.items() if name != "ceiling"}
     known: dict[str, Any] = {"scene": write_xml(tmp_path / "open", parts), "settings": ["depth=0"]}
-    run = wrf_mi.train(record, tmp_path / "run", "ray-tracing", **known)
+    run = wrf_mi.train(record, "ray-tracing", out=tmp_path / "run", **known)
     radio_map(run, step_m=2.0, height_m=20.0)
     assert "height 20 m: outside of the scene" in caplog.text
 
 
 def test_sides_of_a_hybrid_add_up_by_their_weights(room: tuple[Path, Record], tmp_path: Path) -> None:
     scene, record = room
-    traced = wrf_mi.train(record, tmp_path / "traced", "ray-tracing", scene=scene, settings=["rays=1024"])
-    law = wrf_mi.train(record, tmp_path / "law", "mri")
+    traced = wrf_mi.train(record, "ray-tracing", out=tmp_path / "traced", scene=scene, settings=["rays=1024"])
+    law = wrf_mi.train(record, "mri", out=tmp_path / "law")
     mixture = Mixture(np.array([0.0, 1.0]), np.array([[1.0, 0.0], [0.2, 0.8]]))
     fitted = {"paths": traced.fitted, "kriging": law.fitted}
     hybrid = FittedHybrid(traced.problem, np.arange(22), fitted, mixture, None, None, {"sizes": "predicted"})
@@ -245,7 +245,7 @@ def test_sides_of_a_hybrid_add_up_by_their_weights(room: tuple[Path, Record], tm
 def test_sides_of_a_joint_model_add_up_as_amplitudes(room: tuple[Path, Record], tmp_path: Path) -> None:
     scene, record = room
     settings = [*SMALL, "traced.depth=1", "traced.reflections=1", "traced.rays=1024"]
-    run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", scene=scene, settings=settings)
+    run = wrf_mi.train(record, "wrf-gs+", out=tmp_path / "run", scene=scene, settings=settings)
     run.field.predictor.reach = None  # Gaussians everywhere, whatever these few steps gained
     positions = record.tx_pos_m[:5]
     parts = run.fitted.decompose(Inputs(positions), 0)
@@ -263,7 +263,7 @@ def test_sides_of_a_joint_model_add_up_as_amplitudes(room: tuple[Path, Record], 
 
 def test_command_writes_map_and_picture(strengths: Record, tmp_path: Path, command: Command) -> None:
     run, out = tmp_path / "run", tmp_path / "map.nc"
-    wrf_mi.train(write_ble_folder(tmp_path / "data", strengths), run, "mri", intervals=True)
+    wrf_mi.train(write_ble_folder(tmp_path / "data", strengths), "mri", out=run, intervals=True)
     status, printed, err = command(["map", run, "--step", "0.5", "--out", out])
     assert (status, err) == (0, "mapping\n")
     assert "map.nc" in printed
@@ -337,12 +337,12 @@ def test_levels_drawn_as_predicted_are_reliable_and_narrower_statements_are_not(
 
 
 def test_reliability_of_a_run_is_that_of_its_test_rows(plain_flat_folder: Path, tmp_path: Path) -> None:
-    run = train(plain_flat_folder, tmp_path / "run", "kriging", intervals=True)
+    run = train(plain_flat_folder, "kriging", out=tmp_path / "run", intervals=True)
     found = run_reliability(run.folder, np.array([-55.0]))
     stored = arrays_in(run.folder / "predictions.npz")
     p, above = norm.sf(-55, stored["prediction"], stored["std"]), stored["truth"] > -55
     assert found.brier == pytest.approx(np.square(p - above).mean(), rel=1e-5)
     assert found.count.sum() == above.size
-    without = train(plain_flat_folder, tmp_path / "without", "mri")
+    without = train(plain_flat_folder, "mri", out=tmp_path / "without")
     with pytest.raises(InputError, match="states no standard deviation; train with --intervals"):
         run_reliability(without.folder)

@@ -32,10 +32,10 @@ def errors_db(folder: Path) -> dict[str, Any]:
 @pytest.mark.parametrize("model", FITS)
 def test_every_model_serves_them_and_the_others_are_as_without(model: str, tmp_path: Path) -> None:
     intervals = model in ("idw", "trees")
-    run = train(building(**SCARCE), tmp_path / "run", model, settings=FITS[model], intervals=intervals)
+    run = train(building(**SCARCE), model, out=tmp_path / "run", settings=FITS[model], intervals=intervals)
     assert run.metrics["receivers_with_few_rows"] == {"attic": 2, "cellar": 0}
     assert "receivers_left_out" not in run.metrics
-    without = train(building(), tmp_path / "clean", model, settings=FITS[model], intervals=intervals)
+    without = train(building(), model, out=tmp_path / "clean", settings=FITS[model], intervals=intervals)
     scarce, alone = errors_db(run.folder), errors_db(without.folder)
     assert list(scarce) == [*NAMES, "attic", "cellar"]
     assert np.mean([np.mean(scarce[name]) - np.mean(alone[name]) for name in NAMES]) < WORSE_DB
@@ -95,7 +95,7 @@ def test_several_carriers_share_the_law(tmp_path: Path) -> None:
     carriers_hz = np.where(np.arange(len(record)) % 2, 9e8, 2.4e9)
     record.observation[:] -= (20 * np.log10(carriers_hz / 2.4e9)).astype(np.float32)
     record = replace(record, frequencies_hz=None, carriers_hz=carriers_hz)
-    run = train(record, tmp_path / "run", "kriging")
+    run = train(record, "kriging", out=tmp_path / "run")
     low, high = (run.predict([[5, 5, 1.3]], "cellar", carriers_hz=[hz]).mean[0] for hz in (9e8, 2.4e9))
     assert low - high == pytest.approx(20 * np.log10(2.4e9 / 9e8), abs=1e-4)
     assert np.nanmean(errors_db(run.folder)["cellar"]) < 3 * NOISE_DB
@@ -104,10 +104,10 @@ def test_several_carriers_share_the_law(tmp_path: Path) -> None:
 def test_min_rows_leaves_receivers_out(tmp_path: Path) -> None:
     record = building(**SCARCE)
     for least, left in ((1, {"cellar": 0}), (3, {"attic": 2, "cellar": 0})):
-        run = train(record, tmp_path / f"run{least}", "mri", min_rows=least)
+        run = train(record, "mri", out=tmp_path / f"run{least}", min_rows=least)
         assert run.metrics["receivers_left_out"] == left
     with pytest.raises(InputError, match="min_rows -1: give a number of training rows, 0 or more"):
-        train(record, tmp_path / "none", "mri", min_rows=-1)
+        train(record, "mri", out=tmp_path / "none", min_rows=-1)
 
 
 def test_commands_take_a_run_with_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -136,8 +136,8 @@ def test_errors_of_rows_that_a_corrected_scene_knows_are_enlarged(flat_folder: P
 
 
 def test_training_with_intervals_predicts_as_without_and_is_restored(flat_folder: Path, tmp_path: Path):
-    plain = wrf_mi.train(flat_folder, tmp_path / "plain", "kriging", settings=("generic=true",))
-    run = wrf_mi.train(flat_folder, tmp_path / "run", "kriging", settings=("generic=true",), intervals=True)
+    plain = wrf_mi.train(flat_folder, "kriging", out=tmp_path / "plain", settings=("generic=true",))
+    run = wrf_mi.train(flat_folder, "kriging", out=tmp_path / "run", settings=("generic=true",), intervals=True)
     asked: dict[str, Any] = {"tx_pos_m": [[2.0, 1.0, 1.3]], "tx_heading_rad": [0.5]}
     found = wrf_mi.open_run(run.folder).predict(**asked)
     assert found.mean == pytest.approx(plain.predict(**asked).mean)
@@ -156,4 +156,4 @@ def test_intervals_without_rows_to_hold_out_are_refused(flat_folder: Path, tmp_p
     record = load(flat_folder)
     record.tx_pos_m[0] = np.nan
     with pytest.raises(wrf_mi.InputError, match="positions are not known"):
-        wrf_mi.train(record, tmp_path / "run", "kriging", intervals=True)
+        wrf_mi.train(record, "kriging", out=tmp_path / "run", intervals=True)

@@ -7,6 +7,8 @@ from calling import refused
 
 import wrf_mi
 from wrf_mi.core import InputError
+from wrf_mi.runs.api import evaluate_run
+from wrf_mi.runs.scene_view import scene_view
 
 OLD = {
     "field": "dataset: here\nsplit: official\nn_train: null\nseed: 0\nversions: {}\nsettings: {model: wrf-gs+}\n",
@@ -32,7 +34,7 @@ def test_runs_of_version_0_1_are_refused_by_every_command(kind: str, tmp_path: P
         ["compare", run, "--out", out],
     ):
         refused(arguments, message, capsys)
-    for use in (wrf_mi.open_run, wrf_mi.resume, wrf_mi.evaluate_run, lambda path: wrf_mi.scene_view(path, 0)):
+    for use in (wrf_mi.open_run, wrf_mi.resume, evaluate_run, lambda path: scene_view(path, 0)):
         with pytest.raises(InputError, match="format not stated"):
             use(run)
     assert not out.exists()

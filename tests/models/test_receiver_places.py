@@ -81,7 +81,7 @@ def test_places_come_from_the_rows_that_are_named_and_others_stay() -> None:
 def test_every_model_runs(model: str, tmp_path: Path) -> None:
     record = unmapped(building(cellar=(41, 42)), "lab", "stairs", "cellar")
     settings, intervals = FITS[model], model == "mri"
-    run = train(record, tmp_path / "run", model, settings=settings, intervals=intervals)
+    run = train(record, model, out=tmp_path / "run", settings=settings, intervals=intervals)
     places = run.metrics["receiver_places"]
     assert list(places) == ["stairs", "lab"]
     # Noise of 1 dB over 40 rows in a hall of 12 m x 8 m.
@@ -91,12 +91,12 @@ def test_every_model_runs(model: str, tmp_path: Path) -> None:
     for name in ("lab", "cellar"):
         assert np.isfinite(again.predict([[1, 2, 1.3], [5, 5, 1.3]], name).mean).all()
     if model in ("kriging", "mri", "hybrid"):
-        known = train(building(cellar=(41, 42)), tmp_path / "known", model, settings=settings, intervals=intervals)
+        known = train(building(cellar=(41, 42)), model, out=tmp_path / "known", settings=settings, intervals=intervals)
         assert run.metrics["abs_error_db"]["mean"] - known.metrics["abs_error_db"]["mean"] < 0.5
 
 
 def test_folds_locate_by_their_own_rows(tmp_path: Path) -> None:
-    run = train(unmapped(building(), "lab"), tmp_path / "run", "mri", split="blocked")
+    run = train(unmapped(building(), "lab"), "mri", out=tmp_path / "run", split="blocked")
     files = sorted(run.folder.glob("fold*/receiver_places.json"))
     places = {tuple(json.loads(file.read_text())["lab"]["position_m"]) for file in files}
     assert len(places) == len(files) > 1
@@ -109,7 +109,7 @@ def test_paths_of_a_scene_need_stated_places(tmp_path: Path) -> None:
     record = unmapped(building(), "lab", "hall")
     for model in ("ray-tracing", "hybrid"):
         with pytest.raises(InputError, match=r"receiver hall, lab unknown; .* give x, y, z, or omit --scene"):
-            train(record, tmp_path / "run", model, scene=room)
+            train(record, model, out=tmp_path / "run", scene=room)
 
 
 def test_commands_take_a_folder_without_positions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

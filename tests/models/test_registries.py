@@ -57,7 +57,7 @@ def attenuated() -> Iterator[None]:
 def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, flat_folder, tmp_path, capsys) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted, match=rf"stopped in nearest rows; go on with: wrf-mi train --resume {out}"):
-        train(flat_folder, out, "nearest", settings=("neighbours=2",), stop=lambda: True)
+        train(flat_folder, "nearest", out=out, settings=("neighbours=2",), stop=lambda: True)
     refused(["evaluate", out], r"model\.npz: missing, the fit was stopped; finish it with train --resume", capsys)
     reported: list[tuple[str, float]] = []
     run = resume(out, on_progress=lambda stage, share, _: reported.append((stage, share)))
@@ -71,7 +71,7 @@ def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, fla
     assert first.mean == pytest.approx([record.observation[0, rows].mean()])
     with pytest.raises(InputError, match="does not know how the transmitter is turned; omit heading_rad"):
         run.predict(record.tx_pos_m[:1], 0, [0.5])
-    other = train(flat_folder, tmp_path / "blocked", "nearest", split="blocked")
+    other = train(flat_folder, "nearest", out=tmp_path / "blocked", split="blocked")
     compare([out, other.folder], tmp_path / "page")
     with (tmp_path / "page" / "compare.csv").open(newline="") as file:
         assert [row["model"] for row in csv.DictReader(file)][:2] == ["nearest", "nearest"]
@@ -81,7 +81,7 @@ def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, fla
 def test_registered_receiver_is_trained_resumed_evaluated_and_compared(attenuated, flat_folder, tmp_path) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted):
-        train(flat_folder, out, "wrf-gs+", settings=SETTINGS, receiver="attenuated", stop=stop_after(30))
+        train(flat_folder, "wrf-gs+", out=out, settings=SETTINGS, receiver="attenuated", stop=stop_after(30))
     run = resume(out)
     assert evaluate_run(out)["abs_error_db"] == run.metrics["abs_error_db"]
     positions = load(flat_folder).tx_pos_m[:2]
@@ -96,7 +96,7 @@ def test_registered_receiver_is_trained_resumed_evaluated_and_compared(attenuate
 def test_receiver_of_another_task_or_unknown_is_refused(attenuated, flat_folder: Path, tmp_path: Path) -> None:
     for name, reason in (("pixel", "pixel does not report rssi"), ("horn", "'horn': unknown")):
         with pytest.raises(InputError, match=f"receiver model {reason}; choose from power, attenuated"):
-            train(flat_folder, tmp_path / "run", "wrf-gs+", receiver=name)
+            train(flat_folder, "wrf-gs+", out=tmp_path / "run", receiver=name)
     assert not (tmp_path / "run").exists()
 
 

@@ -81,7 +81,7 @@ def test_parallel_prediction_of_a_field_equals_serial(
     """One is splatted; the other is a product of matrices."""
     folder = write_spectrum_folder(tmp_path / "made-here", two_gateways, bits=16)
     record, fit = load(folder), settings("steps=4", model=model)
-    run = train(record, tmp_path / "run", model, settings=fit, split=official(record)).folder
+    run = train(record, model, out=tmp_path / "run", settings=fit, split=official(record)).folder
     lossy = Lossy(two, tmp_path)
     serial, parallel = both(run, positions(record), lossy, tmp_path)
     lossy.assert_one_was_lost()
@@ -96,8 +96,8 @@ def test_parallel_prediction_of_a_field_equals_serial(
 def test_parallel_trace_and_its_prediction_equal_serial(flat: Path, room: Path, two: Scheduler, tmp_path: Path) -> None:
     """The number of rays is chosen by the search, which uses all positions."""
     known: dict[str, Any] = {"scene": room, "settings": TraceOptions(depth=1, rays="auto")}
-    serial, lossy = train(flat, tmp_path / "serial", "ray-tracing", **known).folder, Lossy(two, tmp_path)
-    parallel = train(flat, tmp_path / "parallel", "ray-tracing", scheduler=lossy, **known).folder
+    serial, lossy = train(flat, "ray-tracing", out=tmp_path / "serial", **known).folder, Lossy(two, tmp_path)
+    parallel = train(flat, "ray-tracing", out=tmp_path / "parallel", scheduler=lossy, **known).folder
     lossy.assert_one_was_lost()
     for file in ("paths.npz", "predictions.npz", "split.npz"):
         assert_same_bits(arrays_in(serial / file), arrays_in(parallel / file))
@@ -112,8 +112,8 @@ def test_parallel_trace_of_random_paths_equals_serial(
     monkeypatch.setattr(ray_tracing, "TRACED_AT_LEAST", 4)  # one part for each worker
     for kind, code in (("scattering", 2), ("diffraction", 8)):
         known: dict[str, Any] = {"scene": room, "settings": TraceOptions(depth=1, rays=1 << 8, **{kind: True})}
-        serial = train(flat, tmp_path / f"{kind}-serial", "ray-tracing", **known).folder
-        parallel = train(flat, tmp_path / f"{kind}-parallel", "ray-tracing", scheduler=two, **known).folder
+        serial = train(flat, "ray-tracing", out=tmp_path / f"{kind}-serial", **known).folder
+        parallel = train(flat, "ray-tracing", out=tmp_path / f"{kind}-parallel", scheduler=two, **known).folder
         arrays = arrays_in(serial / "paths.npz")
         assert (arrays["interactions"] == code).any()
         assert_same_bits(arrays, arrays_in(parallel / "paths.npz"))
@@ -123,7 +123,7 @@ def test_parallel_prediction_of_kriging_equals_serial(flat: Path, two: Scheduler
     waves = write_spectrum_folder(tmp_path / "waves", wave_record(24, 6))
     for name, data, given in (("strengths", flat, ()), ("spectra", waves, ("directions=20", "lengths=2"))):
         folder = tmp_path / name
-        run = train(data, folder / "run", "kriging", settings=given).folder
+        run = train(data, "kriging", out=folder / "run", settings=given).folder
         places = positions(load(data))
         heading = np.linspace(-3, 3, len(places)) if name == "strengths" else None
         serial, parallel = both(run, places, two, folder, heading)
@@ -139,7 +139,7 @@ def test_errors_of_parts_name_the_row_of_the_whole_input(
     box.export(tmp_path / "box.ply")
     known: dict[str, Any] = {"scene": tmp_path / "box.ply", "material": "concrete"}
     direct = TraceOptions(reflection=False, depth=0)
-    run = train(flat, tmp_path / "run", "ray-tracing", settings=direct, **known).folder
+    run = train(flat, "ray-tracing", out=tmp_path / "run", settings=direct, **known).folder
     places = np.concatenate([positions(load(flat)), [[50.0, 50.0, 1.0]]])
     with pytest.raises(InputError, match=f"^transmitter {POSITIONS + 1} at .* is inside the solid 'box'"):
         predict_to_file(run, places, tmp_path / "p.npz", scheduler=two)

@@ -29,7 +29,7 @@ ROUNDING = 1e-4
 
 @pytest.fixture(scope="module")
 def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(flat_folder, tmp_path_factory.mktemp("runs") / "mri", "mri").folder
+    return train(flat_folder, "mri", out=tmp_path_factory.mktemp("runs") / "mri").folder
 
 
 def test_run_folder_holds_the_model(flat_folder: Path, run: Path) -> None:
@@ -50,7 +50,7 @@ def test_run_folder_holds_the_model(flat_folder: Path, run: Path) -> None:
 def test_stored_models_reproduce_the_scored_predictions(name: str, flat_folder: Path, tmp_path: Path) -> None:
     """From the file alone, headings and all; the blend is the reference of every run to the last bit."""
     few = {"trees": ("trees=20",), "kriging": ("generic=true",)}.get(name, ())
-    out = train(flat_folder, tmp_path / "run", name, settings=few).folder
+    out = train(flat_folder, name, out=tmp_path / "run", settings=few).folder
     record, arrays, opened = load(flat_folder), stored(out), open_run(out)
     assert [receiver.name for receiver in opened.receivers] == ["anchor1", "anchor2"]
     heading = record.tx_heading_rad[arrays["row"]]
@@ -95,7 +95,7 @@ def test_evaluation_reproduces_the_scores(flat_folder: Path, run: Path, capsys: 
 def test_every_block_is_held_out_in_turn_and_a_stopped_run_goes_on(
     folder: Path, tmp_path: Path, command: Command
 ) -> None:
-    out = train(folder, tmp_path / "run", "kriging", split="blocked").folder
+    out = train(folder, "kriging", out=tmp_path / "run", split="blocked").folder
     assert contents(out) == FILES - {"split.npz", "model.npz"} | {"fold0", "fold1", "fold2"}
     whole = read_run(out)
     assert sorted(whole.row) == list(range(24))
@@ -117,7 +117,7 @@ def test_a_stopped_run_keeps_the_folds_that_are_fitted(folder: Path, tmp_path: P
     ends: dict[str, Any] = {"on_progress": lambda stage, share, _: stages.append(stage)}
     ends["stop"] = lambda: stages[-1].startswith("fold1")
     with pytest.raises(Interrupted, match=rf"stopped in kriging: receivers; go on with: wrf-mi train --resume {out}"):
-        train(folder, out, "kriging", split="blocked", **ends)
+        train(folder, "kriging", out=out, split="blocked", **ends)
     assert [(out / f"fold{k}" / "model.npz").exists() for k in range(3)] == [True, False, False]
     assert sorted(read_run(resume(out).folder).row) == list(range(24))
 
@@ -139,7 +139,7 @@ def test_resumed_network_is_bit_identical(name: str, two_gateways: Record, tmp_p
     data, settings, networks = TRAINED[name]
     record = two_gateways if data == "spectra" else channels()
     ends: dict[str, Any] = {"settings": (*SHORT, *settings), "deterministic": True}
-    whole = train(record, tmp_path / "whole", name, **ends).folder
+    whole = train(record, name, out=tmp_path / "whole", **ends).folder
     told: list[tuple[str, int]] = []
 
     def on_progress(stage: str, share: float, progress: Progress | None) -> None:
@@ -148,7 +148,7 @@ def test_resumed_network_is_bit_identical(name: str, two_gateways: Record, tmp_p
 
     out = tmp_path / "run"
     with pytest.raises(Interrupted, match=rf"stopped after step 12 of 20 of {networks[-1]}; .* --resume {out}"):
-        train(record, out, name, **ends, on_progress=on_progress, stop=lambda: told[-1:] == [(networks[-1], 12)])
+        train(record, name, out=out, **ends, on_progress=on_progress, stop=lambda: told[-1:] == [(networks[-1], 12)])
     assert (out / "checkpoint.npz").exists()
     del told[:]
     resume(out, record=record, on_progress=on_progress)
@@ -174,10 +174,10 @@ def test_a_killed_network_goes_on_from_its_last_checkpoint(two_gateways: Record,
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(two_gateways, tmp_path / "killed", "vae", **ends, on_progress=kill)
+        train(two_gateways, "vae", out=tmp_path / "killed", **ends, on_progress=kill)
     assert int(read_checkpoint(tmp_path / "killed")["step"]) == 8
     resume(tmp_path / "killed", record=two_gateways)
-    train(two_gateways, tmp_path / "whole", "vae", **ends)
+    train(two_gateways, "vae", out=tmp_path / "whole", **ends)
     assert_same_model(tmp_path / "whole", tmp_path / "killed")
 
 

@@ -159,7 +159,7 @@ def test_commands_parse_and_give_the_same_configuration(folder: Path, flat_folde
 @pytest.mark.usefixtures("undrawn")
 def test_settings_of_a_run_are_those_that_differ(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
     steps = [*SMALL, "loss.ssim_weight=0.25"]
-    run = train(folder, tmp_path / "run", "wrf-gs+", settings=steps, seed=2).folder
+    run = train(folder, "wrf-gs+", out=tmp_path / "run", settings=steps, seed=2).folder
     changed = changed_settings(read_config(run))
     resolved = "encoding.tx_scale_m"  # found from the data, which the command states, too
     assert set(changed) - {resolved} == {setting.partition("=")[0] for setting in steps}

@@ -53,12 +53,12 @@ Fit = Callable[..., Run]
 @pytest.fixture(scope="module")
 def fitted(law: Record, tmp_path_factory: pytest.TempPathFactory) -> Fit:
     """Fits a model to the law's record with a split, once for all tests."""
-    return cache(lambda model, split: train(law, tmp_path_factory.mktemp("runs") / "run", model, split=split))
+    return cache(lambda model, split: train(law, model, out=tmp_path_factory.mktemp("runs") / "run", split=split))
 
 
 def test_a_held_out_receiver_takes_the_law_of_the_others(law: Record, tmp_path: Path) -> None:
     folder = write_ble_folder(tmp_path / "law", law)
-    run = train(folder, tmp_path / "run", "mri", split="receiver:3")
+    run = train(folder, "mri", out=tmp_path / "run", split="receiver:3")
     found = read_run(run.folder)
     assert np.isnan(found.truth[:3]).all()
     assert np.isnan(found.prediction[:3]).all()
@@ -69,7 +69,7 @@ def test_a_held_out_receiver_takes_the_law_of_the_others(law: Record, tmp_path: 
     # The mean offset of the three others, to which distances are not exactly alike, is 9 dB below.
     assert run.metrics["abs_error_db"]["median"] == pytest.approx(9, abs=1)
     assert evaluate_run(run.folder)["abs_error_db"] == run.metrics["abs_error_db"]
-    assert train(folder, tmp_path / "all", "mri", split="receiver").metrics["n_test"] == 80
+    assert train(folder, "mri", out=tmp_path / "all", split="receiver").metrics["n_test"] == 80
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_what_new_receivers_observed_changes_no_fit_but_in_rows_left(
     hidden = np.setdiff1d(np.arange(40), left)
     observation[3, hidden] = 1e6 * (1 + hidden)
     expected = fitted(name, split)
-    broken = train(replace(law, observation=observation), tmp_path / "broken", name, split=split)
+    broken = train(replace(law, observation=observation), name, out=tmp_path / "broken", split=split)
     arrays, found = (arrays_in(run.folder / "model.npz") for run in (expected, broken))
     for key in arrays:
         if not key.startswith("run/") and key != CHECKSUM:
@@ -162,12 +162,12 @@ def test_held_out_predictions_are_those_of_their_receivers(law: Record, tmp_path
 
 
 def test_intervals_of_any_model_at_new_receivers(law: Record, tmp_path: Path) -> None:
-    run = train(law, tmp_path / "run", "mri", split="receiver", intervals=True)
+    run = train(law, "mri", out=tmp_path / "run", split="receiver", intervals=True)
     # Offsets of -3, 1, 2 and 9 dB: one receiver of three is held out, whose error says little of the fourth's.
     assert run.metrics["inside_90"] >= 0.5
     two = Split("two", 0, np.arange(40), np.zeros(0, np.int64), np.arange(40, 60), (0, 1, 2))
     with pytest.raises(InputError, match="one receiver trains; intervals at others need two at least"):
-        train(law, tmp_path / "two", "mri", split=two, intervals=True)
+        train(law, "mri", out=tmp_path / "two", split=two, intervals=True)
 
 
 def test_a_stopped_run_goes_on_without_the_held_out_receivers(law: Record, fitted: Fit, tmp_path: Path) -> None:
@@ -183,11 +183,11 @@ def test_traced_strengths_take_the_mean_gain_or_offset(law: Record, tmp_path: Pa
     (tmp_path / "layout.csv").write_text("x,y\n-3,-3\n9,-3\n9,9\n-3,9\n-3,-3\n")
     hall = make_scene(tmp_path / "layout.csv", tmp_path / "scene", height_m=8.0).folder
     traced: dict[str, Any] = {"model": "ray-tracing", "scene": hall, "split": "receiver:2"}
-    plain = train(law, tmp_path / "run", settings=["depth=1"], **traced).folder
+    plain = train(law, out=tmp_path / "run", settings=["depth=1"], **traced).folder
     offset_db = arrays_in(plain / "model.npz")["offset_db"]
     assert offset_db[2] == pytest.approx(offset_db[[0, 1, 3]].mean())
     settings = ["depth=1", "calibration=gain", "steps=40", "validate_every=20"]
-    run = train(law, tmp_path / "calibrated", settings=settings, **traced).folder
+    run = train(law, out=tmp_path / "calibrated", settings=settings, **traced).folder
     gain = [arrays_in(run / "model.npz")[f"param/receiver.anchor{k}.gain"] for k in range(4)]
     np.testing.assert_allclose(gain[2], np.mean([gain[0], gain[1], gain[3]], axis=0), rtol=1e-6)
     assert np.isfinite(read_run(run).prediction[2]).all()
@@ -201,14 +201,14 @@ def test_gaussians_are_seen_from_the_pose_of_a_new_receiver(name: str, law: Reco
     record = replace(law, receivers=receivers, observation=np.concatenate([law.observation, law.observation[1:2]]))
     split = replace(make_splits(law, "official")[0], held_receivers=(4,))
     settings = ["steps=20", "validate_every=10", "initial.gaussians=40"]
-    run = train(record, tmp_path / "run", name, split=split, settings=settings)
+    run = train(record, name, out=tmp_path / "run", split=split, settings=settings)
     level = arrays_in(run.folder / "model.npz")["param/level"][0]
     assert level[4] == pytest.approx(level[:4].mean(), rel=1e-6)
     model = open_run(run.folder, record)
     clone, known = (model.predict(law.tx_pos_m[40:], receiver).mean for receiver in ("copy", "anchor1"))
     np.testing.assert_allclose(clone - known, 20 / np.log(10) * (level[4] - level[1]), atol=1e-2)
     broken = np.where(np.arange(5)[:, None] == 4, 1e6, record.observation).astype(np.float32)
-    again = train(replace(record, observation=broken), tmp_path / "broken", name, split=split, settings=settings)
+    again = train(replace(record, observation=broken), name, out=tmp_path / "broken", split=split, settings=settings)
     np.testing.assert_allclose(arrays_in(again.folder / "model.npz")["param/level"][0], level, rtol=1e-3)
 
 
@@ -225,30 +225,30 @@ def test_offsets_of_receivers_that_heard_nothing() -> None:
 def test_models_of_trained_receivers_refuse(name: str, law: Record, tmp_path: Path) -> None:
     if MODELS[name].serves("rssi") and MODELS[name].scene != "required":
         with pytest.raises(InputError, match=f"receiver:0: {name.replace('+', '.')} predicts for the receivers it is"):
-            train(law, tmp_path / "run", name, split="receiver")
+            train(law, name, out=tmp_path / "run", split="receiver")
         assert not (tmp_path / "run").exists()
 
 
 def test_kriging_of_each_receiver_alone_refuses_receivers_without_rows(law: Record, tmp_path: Path) -> None:
     for record, settings in ((replace(law, frequencies_hz=None), ()), (law, ("generic=true",))):
         with pytest.raises(InputError, match=r"split receiver:3: kriging of each receiver alone.*; choose mri"):
-            train(record, tmp_path / "run", "kriging", split="receiver:3", settings=settings)
+            train(record, "kriging", out=tmp_path / "run", split="receiver:3", settings=settings)
         assert not (tmp_path / "run").exists()
-    few = train(law, tmp_path / "few", "kriging", split="receiver+5:3", settings=("generic=true",))
+    few = train(law, "kriging", out=tmp_path / "few", split="receiver+5:3", settings=("generic=true",))
     assert few.metrics["receivers"]["anchor3"]["n_test"] == 20
 
 
 def test_receivers_of_spectra_are_not_held_out(tmp_path: Path) -> None:
     record = make_record(gateways=2)
     with pytest.raises(InputError, match="holds spectrum; split receiver:0 serves signal strengths, so choose another"):
-        train(record, tmp_path / "run", "kriging", split="receiver")
+        train(record, "kriging", out=tmp_path / "run", split="receiver")
 
 
 def test_all_receivers_held_out_are_refused(law: Record, tmp_path: Path) -> None:
     rows = np.arange(40), np.zeros(0, np.int64), np.arange(40, 60)
     for held in ((0, 1, 2, 3), (4,)):
         with pytest.raises(InputError, match=r"split mine holds out receivers .* of 4; leave some to train on"):
-            train(law, tmp_path / "run", "mri", split=Split("mine", 0, *rows, held))
+            train(law, "mri", out=tmp_path / "run", split=Split("mine", 0, *rows, held))
 
 
 def test_pictures_of_a_comparison_show_the_receivers_that_were_held_out(

@@ -80,7 +80,7 @@ def fit(rooms: dict[str, Path], data: Path) -> Fit:
     """Trains Gaussians and paths of the known room together."""
     scene = rooms["known"]
     return lambda out, *settings, **more: train(
-        str(data), out, "wrf-gs+", settings=config(*settings), scene=scene, **more
+        str(data), "wrf-gs+", out=out, settings=config(*settings), scene=scene, **more
     )
 
 
@@ -96,7 +96,7 @@ def median(run: Path) -> float:
 def test_joint_training_predicts_better_than_paths_or_gaussians_alone(
     rooms: dict[str, Path], data: Path, run: Path, tmp_path: Path, command: Command
 ) -> None:
-    train(str(data), tmp_path / "field", "wrf-gs+", settings=config(with_scene=False))
+    train(str(data), "wrf-gs+", out=tmp_path / "field", settings=config(with_scene=False))
     command.done(["trace", rooms["known"], data, "--depth", "1", "--rays", "4096", "--out", tmp_path / "traced"])
     assert median(run) > median(tmp_path / "field") + 0.03
     assert median(run) > median(tmp_path / "traced") + 0.03

@@ -33,7 +33,7 @@ def waves(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(waves: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(waves, tmp_path_factory.mktemp("runs") / "run", "kriging", settings=QUICK).folder
+    return train(waves, "kriging", out=tmp_path_factory.mktemp("runs") / "run", settings=QUICK).folder
 
 
 def test_run_folder_holds_model_and_standard_deviation(waves: Path, run: Path) -> None:
@@ -103,7 +103,7 @@ def test_predictions_at_new_positions_have_standard_deviations(run: Path, tmp_pa
 
 
 def test_heading_changes_signal_strengths(flat_folder: Path, tmp_path: Path, command: Command) -> None:
-    run, record = train(flat_folder, tmp_path / "run", "kriging"), load(flat_folder)
+    run, record = train(flat_folder, "kriging", out=tmp_path / "run"), load(flat_folder)
     held_out = stored(run.folder)
     assert record.tx_heading_rad is not None
     assert run.metrics["task"] == "rssi"
@@ -117,7 +117,7 @@ def test_heading_changes_signal_strengths(flat_folder: Path, tmp_path: Path, com
 
 
 def test_standard_deviations_of_folds_are_pooled(waves: Path, tmp_path: Path) -> None:
-    run = train(waves, tmp_path / "run", "kriging", split="blocked", settings=QUICK)
+    run = train(waves, "kriging", out=tmp_path / "run", split="blocked", settings=QUICK)
     arrays = stored(run.folder)
     assert run.metrics["inside_90"] == inside_interval(arrays["prediction"], arrays["std"], arrays["truth"])
 
@@ -152,6 +152,6 @@ def test_bad_calls_are_refused(waves: Path, run: Path, tmp_path: Path, command: 
 def test_record_in_memory_and_progress(tmp_path: Path) -> None:
     heard: list[str] = []
     known = {"settings": QUICK, "on_progress": lambda stage, *told: heard.append(stage)}
-    run = train(wave_record(36, 10, receivers=1), tmp_path / "run", "kriging", **known)
+    run = train(wave_record(36, 10, receivers=1), "kriging", out=tmp_path / "run", **known)
     assert set(heard) == {"one: element signals of spectra", "one: signals", "one: weights", "kriging: receivers"}
     assert stored(run.folder)["std"].shape == (10, *SIZE)  # one receiver: no axis for it

@@ -56,8 +56,8 @@ def test_where_no_receiver_has_two_rows_one_is_enough() -> None:
 @pytest.mark.parametrize("model", ["idw", "kriging", "mri", "hybrid", *FITS])
 def test_a_run_is_as_without_the_receivers(model: str, tmp_path: Path) -> None:
     known = {"settings": FITS.get(model, ()), "intervals": model in ("idw", "trees")}
-    with_them = train(building(attic=(3, 45, 46), cellar=()), tmp_path / "run", model, min_rows=2, **known)
-    without = train(building(), tmp_path / "clean", model, **known)
+    with_them = train(building(attic=(3, 45, 46), cellar=()), model, out=tmp_path / "run", min_rows=2, **known)
+    without = train(building(), model, out=tmp_path / "clean", **known)
     assert with_them.metrics["receivers_left_out"] == {"attic": 1, "cellar": 0}
     assert with_them.metrics.keys() - {"receivers_left_out"} == without.metrics.keys()
     assert list(with_them.metrics["receivers"]) == NAMES
@@ -74,8 +74,8 @@ def test_a_run_is_as_without_the_receivers(model: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("split", ["blocked", "random", "receiver", "receiver+2", "trajectory"])
 def test_every_split_leaves_them_out(split: str, tmp_path: Path) -> None:
     record = building(attic=(3,), cellar=(44,))
-    run = train(record, tmp_path / "run", "mri", split=split, min_rows=2)
-    expected = train(building(), tmp_path / "clean", "mri", split=split)
+    run = train(record, "mri", out=tmp_path / "run", split=split, min_rows=2)
+    expected = train(building(), "mri", out=tmp_path / "clean", split=split)
     assert set(run.metrics["receivers_left_out"]) == {"attic", "cellar"}
     assert run.metrics["abs_error_db"] == expected.metrics["abs_error_db"]
     assert list(run.metrics["receivers"]) == NAMES
@@ -83,14 +83,14 @@ def test_every_split_leaves_them_out(split: str, tmp_path: Path) -> None:
 
 def test_rows_that_only_they_received_are_in_no_split(tmp_path: Path) -> None:
     record = silent_in(building(attic=(3,), cellar=(44,)), [3, 44], *NAMES)
-    metrics = train(record, tmp_path / "run", "idw", min_rows=2).metrics
+    metrics = train(record, "idw", out=tmp_path / "run", min_rows=2).metrics
     assert (metrics["n_train"], metrics["n_test"]) == (39, 11)
 
 
 def test_held_out_receivers_of_a_given_split_keep_their_place(tmp_path: Path) -> None:
     record, left = building(attic=(3,)).at_receivers([3, 0, 1, 2]), np.array([[2, 0], [2, 9]])
     split = Split("mine", 0, np.arange(40), NONE, np.arange(40, 52), held_receivers=(2,), left=left)
-    run = train(record, tmp_path / "run", "mri", split=split, min_rows=2)
+    run = train(record, "mri", out=tmp_path / "run", split=split, min_rows=2)
     assert list(run.metrics["receivers_left_out"]) == ["attic"]
     assert run.metrics["receivers"]["stairs"]["n_test"] == 12
     assert run.metrics["receivers"]["hall"]["n_test"] == 0
@@ -100,7 +100,7 @@ def test_held_out_receivers_of_a_given_split_keep_their_place(tmp_path: Path) ->
 def test_two_and_three_training_rows_are_enough_also_for_intervals(model: str, tmp_path: Path) -> None:
     """Parts of the training rows that are held out leave the receivers one row or none, and them out."""
     record = building(attic=(3, 7, 45), cellar=(5, 6, 9))
-    run = train(record, tmp_path / "run", model, intervals=True, settings=FITS.get(model, ()))
+    run = train(record, model, out=tmp_path / "run", intervals=True, settings=FITS.get(model, ()))
     assert "receivers_left_out" not in run.metrics
     assert run.metrics["receivers"]["attic"]["n_test"] == 1
     assert np.isfinite(run.predict([[1, 2, 1.3]], "cellar").stated_std).all()
@@ -109,7 +109,7 @@ def test_two_and_three_training_rows_are_enough_also_for_intervals(model: str, t
 def test_a_receiver_whose_rows_are_at_one_distance_takes_the_exponent_of_all(tmp_path: Path) -> None:
     record = building(attic=(3, 4, 5, 6, 7))
     record.tx_pos_m[4:8] = record.tx_pos_m[3]
-    run = train(record, tmp_path / "run", "mri")
+    run = train(record, "mri", out=tmp_path / "run")
     level_dbm = run.predict(record.tx_pos_m[[3]], "attic").mean
     assert level_dbm == pytest.approx(record.observation[3, 3:8].mean(), abs=1e-4)  # single precision
 
@@ -118,7 +118,7 @@ def test_kriging_of_a_trend_through_every_row_is_the_trend(tmp_path: Path) -> No
     """Residuals of two rows from a level and a slope are zero, which leaves nothing to interpolate."""
     record = building()
     split = Split("two", 0, np.array([3, 4]), NONE, np.arange(40, 52))
-    run = train(record, tmp_path / "run", "kriging", split=split, settings=("generic=true",))
+    run = train(record, "kriging", out=tmp_path / "run", split=split, settings=("generic=true",))
     observed = record.observation[0, 3:5]
     np.testing.assert_allclose(run.predict(record.tx_pos_m[3:5], "hall").mean, observed, atol=1e-3)  # float32
 
@@ -126,7 +126,7 @@ def test_kriging_of_a_trend_through_every_row_is_the_trend(tmp_path: Path) -> No
 def test_a_receiver_with_few_rows_at_one_carrier_is_interpolated_between_its_other_carriers(tmp_path: Path) -> None:
     record = building(attic=(*range(1, 52, 2), 4))
     record = replace(record, frequencies_hz=None, carriers_hz=np.where(np.arange(len(record)) % 2, 9e8, 2.4e9))
-    run = train(record, tmp_path / "run", "kriging", settings=("generic=true",))
+    run = train(record, "kriging", out=tmp_path / "run", settings=("generic=true",))
     assert "receivers_left_out" not in run.metrics
     hz = (9e8, 2.4e9)
     attic = [open_run(run.folder, record).predict([[1, 2, 1.3]], "attic", carriers_hz=[f]).mean for f in hz]
@@ -166,7 +166,7 @@ def test_paths_that_folds_share_serve_other_receivers(model: str, tmp_path: Path
     room = make_scene(plan, tmp_path / "room", height_m=2.7).folder
     record = building(cellar=(1, 2, 50))
     settings = ["stages=mean,residual"] if model == "hybrid" else ["depth=1", "reflection=false"]
-    run = train(record, tmp_path / "run", model, scene=room, settings=settings, intervals=model == "ray-tracing")
+    run = train(record, model, out=tmp_path / "run", scene=room, settings=settings, intervals=model == "ray-tracing")
     assert "receivers_left_out" not in run.metrics
     assert run.metrics["receivers"]["cellar"]["n_test"] == 1
     assert np.isfinite(run.predict([[1, 2, 1.3]], "cellar").stated_std).all()

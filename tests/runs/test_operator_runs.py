@@ -111,7 +111,7 @@ def test_networks_in_numpy_equal_those_of_the_field(field: Any, monkeypatch: pyt
 @pytest.fixture(scope="module")
 def run(one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = settings("steps=5", model="factorised")
-    return train(one_gateway, tmp_path_factory.mktemp("runs") / "run", config.model, settings=config).folder
+    return train(one_gateway, config.model, out=tmp_path_factory.mktemp("runs") / "run", settings=config).folder
 
 
 def test_operator_is_stored_with_the_run(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

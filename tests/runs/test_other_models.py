@@ -18,7 +18,7 @@ from wrf_mi.runs.results import read_runs
 @pytest.fixture(scope="module")
 def flat(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Path]:
     """Signal strengths, and a run on them."""
-    run = train(flat_folder, tmp_path_factory.mktemp("runs") / "kriging", "kriging")
+    run = train(flat_folder, "kriging", out=tmp_path_factory.mktemp("runs") / "kriging")
     return load(flat_folder), run.folder
 
 

@@ -26,7 +26,8 @@ MODELS = ["kriging", "trees", "mri"]
 def runs(plain_flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder, few = tmp_path_factory.mktemp("runs"), {"trees": ("trees=20",)}
     return {
-        model: train(plain_flat_folder, folder / model, model, settings=few.get(model, ())).folder for model in MODELS
+        model: train(plain_flat_folder, model, out=folder / model, settings=few.get(model, ())).folder
+        for model in MODELS
     }
 
 
@@ -95,7 +96,7 @@ def test_files_of_other_forms_are_refused(
 
 
 def test_table_of_spectra_is_refused(folder: Path, place: Path, tmp_path: Path, command: Command) -> None:
-    run = train(folder, tmp_path / "run", "idw").folder
+    run = train(folder, "idw", out=tmp_path / "run").folder
     words = ["predict", run, "--tx", place, "--out", tmp_path / "out.csv"]
     command.refused(words, r"out\.csv: \.csv holds signal strengths \(rssi\), .* predicts spectrum; give out\.npz")
     assert not (tmp_path / "out.csv").exists()

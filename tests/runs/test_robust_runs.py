@@ -32,14 +32,14 @@ DEAD = 2**22 + 1
 @pytest.fixture(scope="module")
 def kriging(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "kriging"
-    return train(flat_folder, out, "kriging", settings=("heading=false", "generic=true")).folder
+    return train(flat_folder, "kriging", out=out, settings=("heading=false", "generic=true")).folder
 
 
 @pytest.fixture(scope="module")
 def stopped(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "stopped"
     with pytest.raises(Interrupted):
-        train(folder, out, "wrf-gs+", settings=settings("steps=10"), stop=stop_after(4))
+        train(folder, "wrf-gs+", out=out, settings=settings("steps=10"), stop=stop_after(4))
     return out
 
 
@@ -73,9 +73,9 @@ def test_a_run_that_ctrl_c_ends_before_its_configuration_is_begun_again(
     with monkeypatch.context() as patched:
         patched.setattr(folder_module, "write_configs", pressed)
         with pytest.raises(KeyboardInterrupt):
-            train(flat_folder, tmp_path / "run", "idw")
+            train(flat_folder, "idw", out=tmp_path / "run")
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [LOCK, "split.npz"]
-    assert not (train(flat_folder, tmp_path / "run", "idw").folder / LOCK).exists()
+    assert not (train(flat_folder, "idw", out=tmp_path / "run").folder / LOCK).exists()
 
 
 def test_two_threads_do_not_fit_at_a_time(flat_folder: Path, tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_sizes_are_checked_before_they_are_allocated(tmp_path: Path) -> None:
 
 def test_too_many_gaussians_are_refused_at_once(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"initial.gaussians=500000000 with batch=.*; lower one of them"):
-        train(folder, tmp_path / "run", "wrf-gs+", settings=settings("initial.gaussians=500000000"))
+        train(folder, "wrf-gs+", out=tmp_path / "run", settings=settings("initial.gaussians=500000000"))
     assert not (tmp_path / "run").exists()
 
 

@@ -67,7 +67,7 @@ def whole(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with rounds of density control that nothing interrupts."""
     out = tmp_path_factory.mktemp("runs") / "whole"
     known = {"settings": DETERMINISTIC, "on_progress": lambda *told: keep_checkpoint(out, told[2])}
-    return train(folder, out, "wrf-gs+", **known).folder
+    return train(folder, "wrf-gs+", out=out, **known).folder
 
 
 def assert_same_arrays(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
@@ -78,7 +78,7 @@ def assert_same_arrays(found: dict[str, np.ndarray], expected: dict[str, np.ndar
 
 def stopped_and_resumed(folder: Path, out: Path, config: TrainConfig, at: int) -> None:
     with pytest.raises(Interrupted, match=rf"stopped after step {at} of 40; .* train --resume {out}"):
-        train(folder, out, "wrf-gs+", settings=config, stop=stop_after(at))
+        train(folder, "wrf-gs+", out=out, settings=config, stop=stop_after(at))
     assert not (out / "metrics.json").exists()
     assert int(read_checkpoint(out)["step"]) == at
     assert [entry["step"] for entry in log_of(out)] == [s for s in range(5, 41, 5) if s <= at]
@@ -112,7 +112,7 @@ def test_resumed_run_is_bit_identical(folder: Path, whole: Path, tmp_path: Path)
 def test_resumed_run_on_several_threads_is_close(folder: Path, tmp_path: Path) -> None:
     set_threads(max(2, dr.thread_count()))
     config = settings("steps=40", "checkpoint_every=8")
-    train(folder, tmp_path / "whole", "wrf-gs+", settings=config)
+    train(folder, "wrf-gs+", out=tmp_path / "whole", settings=config)
     stopped_and_resumed(folder, tmp_path / "resumed", config, 17)
     greys = [stored(tmp_path / name)["prediction"] for name in ("whole", "resumed")]
     assert np.abs(greys[0] - greys[1]).mean() < PARALLEL_TOLERANCE
@@ -134,7 +134,7 @@ def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, whole: Path, 
     """The log has no line twice."""
     killed = tmp_path / "killed"
     with pytest.raises(PowerCut):
-        train(folder, killed, "wrf-gs+", settings=DETERMINISTIC, on_progress=kill_at(30))
+        train(folder, "wrf-gs+", out=killed, settings=DETERMINISTIC, on_progress=kill_at(30))
     assert int(read_checkpoint(killed)["step"]) == 24
     assert log_of(killed)[-1]["step"] == 30
     resume(killed)
@@ -160,7 +160,7 @@ def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
     with monkeypatch.context() as patched:
         patched.setattr(Spectrum, "loss", loss)
         with pytest.raises(NumericsError, match=f"^step {step}: not finite: loss"):
-            train(record, broken, "wrf-gs+", settings=DETERMINISTIC)
+            train(record, "wrf-gs+", out=broken, settings=DETERMINISTIC)
     assert int(read_checkpoint(broken)["step"]) == (step - 1) // 8 * 8
     resume(broken)
     assert_same_arrays(arrays_of(broken), arrays_of(whole))
@@ -168,7 +168,7 @@ def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
 
 def test_run_stopped_before_its_first_checkpoint_starts_anew(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(PowerCut):
-        train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=10"), on_progress=kill_at(5))
+        train(folder, "wrf-gs+", out=tmp_path / "run", settings=settings("steps=10"), on_progress=kill_at(5))
     assert not (tmp_path / "run" / "checkpoint.npz").exists()
     with pytest.raises(InputError, match=r"model\.npz: missing, the fit was stopped; finish it with train"):
         open_run(tmp_path / "run").predictor()
@@ -178,7 +178,7 @@ def test_run_stopped_before_its_first_checkpoint_starts_anew(folder: Path, tmp_p
 
 def test_run_folder_is_complete(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
     known = {"settings": settings("steps=10", "seed=3"), "split": "random", "n_train": 0.5}
-    run = train(folder, tmp_path / "run", "wrf-gs+", **known)
+    run = train(folder, "wrf-gs+", out=tmp_path / "run", **known)
     files = {"config.yaml", "log.jsonl", "metrics.json", "model.npz", "predictions.npz", "split.npz"}
     assert contents(run.folder) == files
     config = yaml.safe_load((run.folder / "config.yaml").read_text())
@@ -208,7 +208,7 @@ def test_run_folder_is_complete(folder: Path, tmp_path: Path, one_gateway: Recor
 
 def test_two_gateways_are_scored_each_and_together(two_gateways: Record, tmp_path: Path) -> None:
     data = write_spectrum_folder(tmp_path / "data", two_gateways, bits=16)
-    run = train(data, tmp_path / "run", "wrf-gs+", settings=settings("steps=10"))
+    run = train(data, "wrf-gs+", out=tmp_path / "run", settings=settings("steps=10"))
     m = run.metrics
     assert list(m["receivers"]) == ["gateway1", "gateway2"]
     held = stored(run.folder)
@@ -228,7 +228,7 @@ def test_two_gateways_are_scored_each_and_together(two_gateways: Record, tmp_pat
 @pytest.fixture(scope="module")
 def finished(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "finished"
-    return train(folder, out, "wrf-gs+", settings=settings("steps=10"), n_train=10).folder
+    return train(folder, "wrf-gs+", out=out, settings=settings("steps=10"), n_train=10).folder
 
 
 def test_finished_run_is_only_scored_again(finished: Path, tmp_path: Path) -> None:
@@ -305,7 +305,7 @@ def test_rows_beyond_the_record_are_refused(finished: Path, tmp_path: Path, one_
     split = official(one_gateway)
     for wrong in (replace(split, train=np.append(split.train, 24)), replace(split, test=np.array([-1]))):
         with pytest.raises(InputError, match=r"split official: row (24|-1), but made-here has rows 0 to 23"):
-            train(one_gateway, tmp_path / "run", "wrf-gs+", settings=settings("steps=5"), split=wrong)
+            train(one_gateway, "wrf-gs+", out=tmp_path / "run", settings=settings("steps=5"), split=wrong)
     assert not (tmp_path / "run").exists()
     # A data set that has become shorter since.
     run = copied(finished, tmp_path / "copy")
@@ -319,7 +319,7 @@ def test_rows_beyond_the_record_are_refused(finished: Path, tmp_path: Path, one_
 
 
 def test_blocked_run_pools_its_folds(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
-    run = train(folder, tmp_path / "run", "wrf-gs+", settings=settings("steps=5"), split="blocked")
+    run = train(folder, "wrf-gs+", out=tmp_path / "run", settings=settings("steps=5"), split="blocked")
     m = run.metrics
     assert (m["split"], m["n_train"], m["n_test"]) == ("blocked", 16, 24)
     parts = [Run(run.folder / f"fold{k}").metrics for k in range(3)]
@@ -344,7 +344,7 @@ def test_blocked_run_pools_its_folds(folder: Path, tmp_path: Path, one_gateway: 
 def test_blocked_run_goes_on_in_the_fold_where_it_was_stopped(folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     with pytest.raises(Interrupted, match=rf"stopped after step 4 of 5; .* train --resume {run}"):
-        train(folder, run, "wrf-gs+", settings=settings("steps=5"), split="blocked", stop=stop_after(8))
+        train(folder, "wrf-gs+", out=run, settings=settings("steps=5"), split="blocked", stop=stop_after(8))
     assert [(run / f"fold{k}" / "metrics.json").exists() for k in (0, 1)] == [True, False]
     with pytest.raises(InputError, match=r"fold1.model\.npz: missing, the fit was stopped; finish it with train"):
         evaluate_run(run)
@@ -358,14 +358,14 @@ def test_folders_with_content_are_refused(folder: Path, tmp_path: Path) -> None:
     (run / "mine.txt").write_text("mine")
     for out, split in ((run, "official"), (run, "blocked"), (run / "mine.txt", "official")):
         with pytest.raises(InputError, match="exists and is not empty"):
-            train(folder, out, "wrf-gs+", settings=settings("steps=5"), split=split)
+            train(folder, "wrf-gs+", out=out, settings=settings("steps=5"), split=split)
     assert contents(run) == {"mine.txt"}
 
 
 def test_custom_split_is_trained(one_gateway: Record, tmp_path: Path) -> None:
     """A record in memory and a split by hand, without validation rows."""
     split = Split("mine", 0, np.arange(10), np.arange(0), np.arange(20, 24))
-    run = train(one_gateway, tmp_path / "run", "wrf-gs+", settings=settings("steps=5"), split=split)
+    run = train(one_gateway, "wrf-gs+", out=tmp_path / "run", settings=settings("steps=5"), split=split)
     assert (run.metrics["split"], run.metrics["n_train"], run.metrics["n_test"]) == ("mine", 10, 4)
     # Standard JSON knows no NaN.
     for name in ("log.jsonl", "metrics.json"):

@@ -31,7 +31,7 @@ def table(strengths: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(table: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return train(table, tmp_path_factory.mktemp("runs") / "run", "kriging", split="none").folder
+    return train(table, "kriging", out=tmp_path_factory.mktemp("runs") / "run", split="none").folder
 
 
 def test_all_rows_train_and_each_is_tested_once(strengths: Record):
@@ -57,7 +57,7 @@ def test_folds_are_drawn_where_space_has_none():
 
 def test_scores_are_those_of_blocks_and_the_model_that_of_all_rows(table: Path, run: Path, tmp_path: Path):
     record, metrics = load(table), open_run(run).metrics
-    blocked = train(table, tmp_path / "blocked", "kriging", split="blocked").metrics
+    blocked = train(table, "kriging", out=tmp_path / "blocked", split="blocked").metrics
     assert metrics["abs_error_db"] == blocked["abs_error_db"]
     assert metrics["reference"] == blocked["reference"]
     assert metrics["cross_validated"] == {"folds": 5, "n_train": blocked["n_train"]}
@@ -67,18 +67,18 @@ def test_scores_are_those_of_blocks_and_the_model_that_of_all_rows(table: Path, 
     longer = replace(record, tx_pos_m=record.tx_pos_m[twice], tx_heading_rad=np.asarray(record.tx_heading_rad)[twice])
     longer = replace(longer, observation=record.observation[:, twice])
     split = replace(final, test=np.array([len(record)]))
-    everything = train(longer, tmp_path / "all", "kriging", split=split)
+    everything = train(longer, "kriging", out=tmp_path / "all", split=split)
     place = [[1.0, 2.0, 1.3]], 1, [0.5]
     np.testing.assert_array_equal(open_run(run).predict(*place).mean, everything.predict(*place).mean)
 
 
 def test_it_is_the_default_of_data_without_a_split(table: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     with caplog.at_level(logging.WARNING, "wrf_mi"):
-        metrics = train(table, tmp_path / "run", "idw").metrics
+        metrics = train(table, "idw", out=tmp_path / "run").metrics
     assert metrics["split"] == "none"
     assert f"{table}: no official split, so --split none: scores are of folds held out in space" in caplog.text
     with pytest.raises(InputError, match="has no official split"):
-        train(table, tmp_path / "official", "idw", split="official")
+        train(table, "idw", out=tmp_path / "official", split="official")
 
 
 GAUSSIANS = (*SMALL, "patience=0")
@@ -89,7 +89,7 @@ GAUSSIANS = (*SMALL, "patience=0")
     [("trees", ("trees=10",)), ("mri", ()), ("wrf-gs+", GAUSSIANS), ("hybrid", ("stages=residual",))],
 )
 def test_models_of_strengths(model: str, settings: tuple[str, ...], strengths: Record, tmp_path: Path):
-    run = train(strengths, tmp_path / "run", model, split="none", settings=settings)
+    run = train(strengths, model, out=tmp_path / "run", split="none", settings=settings)
     headings = [0.1, 0.2] if run.takes_heading else None
     assert np.isfinite(run.predict([[1, 2, 1.3], [2, 2, 1.3]], 0, headings).mean).all()
     assert run.metrics["n_test"] == len(strengths)
@@ -97,7 +97,7 @@ def test_models_of_strengths(model: str, settings: tuple[str, ...], strengths: R
 
 @pytest.mark.parametrize(("model", "settings"), [("wrf-gs+", GAUSSIANS), ("idw", ())])
 def test_models_of_spectra(model: str, settings: tuple[str, ...], one_gateway: Record, tmp_path: Path):
-    run = train(one_gateway, tmp_path / "run", model, split="none", settings=settings)
+    run = train(one_gateway, model, out=tmp_path / "run", split="none", settings=settings)
     assert run.predict(one_gateway.tx_pos_m[:2]).mean.shape == (2, *one_gateway.observation.shape[2:])
     assert run.metrics["cross_validated"]["folds"] >= 2
 
@@ -105,12 +105,12 @@ def test_models_of_spectra(model: str, settings: tuple[str, ...], one_gateway: R
 @pytest.mark.parametrize("model", ["linear", "kriging"])
 def test_models_of_channels(model: str, tmp_path: Path):
     record = channels()
-    run = train(record, tmp_path / "run", model, split="none")
+    run = train(record, model, out=tmp_path / "run", split="none")
     assert run.predict(uplink=record.uplink[:2], tx_pos_m=record.tx_pos_m[:2]).mean.shape == (2, 3, 4)
 
 
 def test_ray_tracing_keeps_the_paths_of_each_part(room: Path, strengths: Record, tmp_path: Path):
-    run = train(strengths, tmp_path / "run", "ray-tracing", scene=room, split="none", settings=["depth=1"])
+    run = train(strengths, "ray-tracing", out=tmp_path / "run", scene=room, split="none", settings=["depth=1"])
     assert np.isfinite(run.predict([[1, 2, 1.3]]).mean).all()
     assert evaluate_run(run.folder)["abs_error_db"] == run.metrics["abs_error_db"]
 
@@ -135,8 +135,8 @@ def test_a_stopped_run_goes_on(strengths: Record, tmp_path: Path):
     known: dict[str, Any] = {"split": "none", "settings": ("stages=residual",)}
     ends = {"stop": lambda: len(shares) > 4, "on_progress": lambda stage, share, progress=None: shares.append(share)}
     with pytest.raises(Interrupted):
-        train(strengths, tmp_path / "run", "hybrid", **known, **ends)
+        train(strengths, "hybrid", out=tmp_path / "run", **known, **ends)
     assert not (tmp_path / "run" / "metrics.json").exists()
     resumed = resume(tmp_path / "run", record=strengths)
-    plain = train(strengths, tmp_path / "plain", "hybrid", **known)
+    plain = train(strengths, "hybrid", out=tmp_path / "plain", **known)
     assert resumed.metrics["abs_error_db"] == plain.metrics["abs_error_db"]

@@ -39,7 +39,7 @@ FLOAT32_DB = 1e-4
 
 
 def traced(data: Path | Record, scene: Path, out: Path, settings: Any = DIRECT) -> Path:
-    return train(data, out, "ray-tracing", scene=scene, settings=settings).folder
+    return train(data, "ray-tracing", out=out, scene=scene, settings=settings).folder
 
 
 @pytest.fixture(scope="module")

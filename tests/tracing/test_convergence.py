@@ -82,7 +82,7 @@ def test_run_states_its_convergence(shoebox_xml, tmp_path):
     split = np.arange(4), np.arange(4, 6)
     record = Record("made-here", "rssi", inside(6), (RX,), power, official=split, frequencies_hz=hz)
     settings = ("target_error_db=8", "target_kinds=")
-    folder = train(record, tmp_path / "run", "ray-tracing", scene=shoebox_xml, settings=settings).folder
+    folder = train(record, "ray-tracing", out=tmp_path / "run", scene=shoebox_xml, settings=settings).folder
     stated = json.loads((folder / "convergence.json").read_text())
     assert stated["target_db"] == 8.0
     assert stated["error_db"] <= 8.0

@@ -159,7 +159,7 @@ def test_calibration_learns_a_patch_that_no_surface_has(tmp_path):
     found = {}
     for parts in ("gain,materials", "gain,materials,surface"):
         settings = [f"calibration={parts}", "depth=1", "rays=4096", "transmission=false", "steps=300"]
-        run = wrf_mi.train(record, tmp_path / parts, "ray-tracing", scene=scene, settings=settings)
+        run = wrf_mi.train(record, "ray-tracing", out=tmp_path / parts, scene=scene, settings=settings)
         report = run.predict(tx[90:], 0).mean
         found[parts] = float(np.median(task_of(record).score(report, record.observation[0, 90:])))
         np.testing.assert_allclose(wrf_mi.open_run(run.folder, record).predict(tx[90:], 0).mean, report, rtol=1e-6)

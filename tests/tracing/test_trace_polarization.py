@@ -150,7 +150,7 @@ def test_run_predicts_with_its_antennas(shoebox_xml, turned_folder, tmp_path):
     def trained(**antennas):
         stated = AntennaOptions(rx_pattern="tr38901", **antennas)
         run = tmp_path / "run"
-        return train(turned_folder, run, "ray-tracing", scene=shoebox_xml, settings=OPTIONS, antennas=stated).folder
+        return train(turned_folder, "ray-tracing", out=run, scene=shoebox_xml, settings=OPTIONS, antennas=stated).folder
 
     with pytest.raises(InputError, match="state frame array"):
         trained()

@@ -46,7 +46,7 @@ def test_deterministic_fits_of_two_processes_have_equal_bits(folder, tmp_path):
     asked = ["train", str(folder), "--model", "wrf-gs+", "--deterministic", *words, "--out", str(complete)]
     assert run_module("wrf_mi.cli", asked)[0] == 0
     with pytest.raises(Interrupted):
-        train(folder, resumed, "wrf-gs+", settings=[*FIT, "deterministic=true"], stop=stop_after(17))
+        train(folder, "wrf-gs+", out=resumed, settings=[*FIT, "deterministic=true"], stop=stop_after(17))
     backend.set_threads(2)
     resume(resumed)
     assert_same_bits(complete, resumed)
@@ -58,7 +58,7 @@ def test_kriging_and_paths_do_not_depend_on_the_number_of_threads(model, flat_fo
     scene = make_scene(flat_folder / "layout.csv", tmp_path / "room", height_m=2.7).folder
     for threads in (1, 2):
         backend.set_threads(threads)
-        train(flat_folder, tmp_path / f"on-{threads}", model, scene=None if model == "kriging" else scene)
+        train(flat_folder, model, out=tmp_path / f"on-{threads}", scene=None if model == "kriging" else scene)
     assert_same_bits(tmp_path / "on-1", tmp_path / "on-2")
 
 
@@ -107,7 +107,7 @@ def test_no_deterministic_fit_or_run_on_a_gpu(one_gateway, tmp_path, monkeypatch
         Trainer(one_gateway, official(one_gateway), settings("steps=1", "deterministic=true"))
     for stated in ({"model": "wrf-gs+", "settings": ["deterministic=true"]}, {"model": "idw", "deterministic": True}):
         with refused():
-            train(one_gateway, tmp_path / "run", **stated)
+            train(one_gateway, out=tmp_path / "run", **stated)
         assert not (tmp_path / "run").exists()
 
 
@@ -140,7 +140,7 @@ def test_deterministic_run_is_resumed_on_the_cpu(tmp_path, asked):
 def test_deterministic_baseline_is_resumed_on_one_thread(one_gateway, tmp_path):
     """Stopped before it was fitted, and resumed by a process with more threads."""
     settings = ("steps=5", "width=8", "last=8")
-    run = train(one_gateway, tmp_path / "run", "vae", settings=settings, deterministic=True).folder
+    run = train(one_gateway, "vae", out=tmp_path / "run", settings=settings, deterministic=True).folder
     assert "deterministic: true" in (run / "config.yaml").read_text()
     fitted = np.load(run / "predictions.npz")["prediction"]
     (run / "model.npz").unlink()

@@ -151,7 +151,7 @@ def test_components_span_the_channels():
 def test_strengths_are_learned_and_kept(model, tmp_path):
     record = strengths()
     split = halves(record)
-    run = train(record, tmp_path / "run", model, split=split, settings=SMALL)
+    run = train(record, model, out=tmp_path / "run", split=split, settings=SMALL)
     with np.load(tmp_path / "run" / "predictions.npz") as stored:
         scored = stored["prediction"]
     for r in range(2):
@@ -165,7 +165,7 @@ def test_strengths_are_learned_and_kept(model, tmp_path):
 def test_channels_are_learned_from_the_uplink_and_kept(model, tmp_path):
     record = channels()
     split, own = halves(record), (*SMALL, "steps=200", "batch=32", "optimiser.network=3e-3")
-    run = train(record, tmp_path / "run", model, split=split, settings=own)
+    run = train(record, model, out=tmp_path / "run", split=split, settings=own)
     assert record.uplink is not None
     uplink, truth = record.uplink[split.test], record.observation[0, split.test]
     found = run.predict(uplink=uplink).mean
@@ -334,9 +334,9 @@ def test_inconsistent_readings_and_noise_are_refused(tmp_path):
         ({"runs": np.array(["a", "b"])}, r"runs \[2\]; give one for each of"),
     ):
         with pytest.raises(InputError, match=message):
-            train(replace(record, **change), tmp_path / "run", "idw", split=halves(record))
+            train(replace(record, **change), "idw", out=tmp_path / "run", split=halves(record))
     with pytest.raises(InputError, match="std belongs to signal strengths, not to csi"):
-        train(replace(channels(), std=std), tmp_path / "run", "idw", split=halves(record))
+        train(replace(channels(), std=std), "idw", out=tmp_path / "run", split=halves(record))
 
 
 def test_unsuitable_records_are_refused():

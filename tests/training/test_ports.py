@@ -146,7 +146,7 @@ def test_a_field_of_several_carriers_is_trained_and_restored(scene, xml, tmp_pat
     """With and without paths; a carrier without training rows is predicted, and predictions depend on the carrier."""
     record, settings = spectra(xml), (*QUICK, "steps=16", *("traced.rays=4096", "traced.depth=2") * scene)
     how = {"scene": str(xml) if scene else None, "split": "frequency-known:1", "settings": settings}
-    run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", **how)
+    run = wrf_mi.train(record, "wrf-gs+", out=tmp_path / "run", **how)
     again, positions = wrf_mi.open_run(run.folder, record), np.tile(record.tx_pos_m[:2], (2, 1))
     at = np.repeat([CARRIERS_HZ[0], CARRIERS_HZ[1]], 2)
     found = again.predict(positions, 0, carriers_hz=at).mean
@@ -162,7 +162,7 @@ def test_networks_learn_from_the_carrier(tmp_path):
     observed = (-40 - 20 * np.log10(carriers / CARRIERS_HZ[0]))[None].astype(np.float32)
     record = Record("falling", "rssi", positions, (receiver(),), observed, carriers_hz=carriers)
     settings = (*QUICK, "steps=200", "optimiser.network=0.005")
-    run = wrf_mi.train(record, tmp_path / "run", "wrf-gs+", split="random", settings=settings)
+    run = wrf_mi.train(record, "wrf-gs+", out=tmp_path / "run", split="random", settings=settings)
     assert run.metrics["abs_error_db"]["median"] < 2  # 6 dB for the middle carrier's strength, the median
 
 
@@ -174,7 +174,7 @@ def test_paths_are_calibrated_at_several_carriers(xml, tmp_path):
     def trained(name, *settings):
         how = {"scene": str(stated), "split": "frequency:1"}
         common = ("depth=2", "rays=4096", "transmission=true", *settings)
-        return wrf_mi.train(record, tmp_path / name, "ray-tracing", settings=common, **how)
+        return wrf_mi.train(record, "ray-tracing", out=tmp_path / name, settings=common, **how)
 
     plain, run = trained("plain"), trained("run", "calibration=gain,materials", "steps=60")
     assert run.metrics["ssim"]["mean"] > plain.metrics["ssim"]["mean"] + 0.01

@@ -22,13 +22,14 @@ from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.viewer.content import ViewOptions
 from wrf_mi.viewer.layers import path_layer, power_db, representative, scene_content, surfaces_in
 from wrf_mi.viewer.map_layer import read_map, thinned
+from wrf_mi.viewer.view import view
 
 FLOAT32 = 1e-5
 """Relative rounding of float32."""
 
 
 def trained(data: Path, make: pytest.TempPathFactory, model: str, **options: Any) -> Path:
-    return wrf_mi.train(data, make.mktemp("runs") / model, model, **options).folder
+    return wrf_mi.train(data, model, out=make.mktemp("runs") / model, **options).folder
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,7 @@ def test_scenes_by_name_folder_file_and_object_show_every_triangle(room, tmp_pat
     scene = open_scene(room, 2.4e9)
     triangles = scene_surfaces(scene).triangles
     for source in (room, room / "scene.xml", scene):
-        content = wrf_mi.view(source).content
+        content = view(source).content
         assert content.counts == {"triangles": len(triangles)}
         shown = np.concatenate([mesh.corners_m for mesh in content.scene.meshes])
         assert np.sort(shown.ravel()) == pytest.approx(np.sort(triangles.ravel()), rel=FLOAT32)
@@ -77,10 +78,10 @@ def test_scenes_by_name_folder_file_and_object_show_every_triangle(room, tmp_pat
         assert all(mesh.corners_m[..., 2] == pytest.approx(2.7) for mesh in ceilings)
     trimesh.creation.box((2, 3, 4)).export(tmp_path / "box.stl")
     for options, name in (({}, "no material"), ({"material": "concrete"}, "concrete")):
-        view = wrf_mi.view(tmp_path / "box.stl", **options)
-        assert view.counts == {"triangles": 12}
-        assert {mesh.material for mesh in view.content.scene.meshes} == {name}
-        assert len(view.content.scene.edges_m) == 12  # those of a box, without diagonals
+        shown = view(tmp_path / "box.stl", **options)
+        assert shown.counts == {"triangles": 12}
+        assert {mesh.material for mesh in shown.content.scene.meshes} == {name}
+        assert len(shown.content.scene.edges_m) == 12  # those of a box, without diagonals
 
 
 def test_the_largest_triangles_are_kept(room):
@@ -94,7 +95,7 @@ def test_the_largest_triangles_are_kept(room):
 
 
 def test_a_traced_run_shows_its_held_out_rows_and_stored_paths(traced):
-    results, content = read_run(traced), wrf_mi.view(traced).content
+    results, content = read_run(traced), view(traced).content
     rows, paths = content.rows, content.paths
     np.testing.assert_array_equal(rows.row, results.row)
     np.testing.assert_array_equal(rows.score, results.score)
@@ -121,11 +122,11 @@ def test_the_strongest_paths_of_each_pair_are_kept(traced):
 
 
 def test_a_joint_run_shows_gaussians_and_paths_of_its_settings(joint):
-    view = wrf_mi.view(joint, transmitters=3, gaussians=5)
-    content, run = view.content, open_run(joint)
+    shown = view(joint, transmitters=3, gaussians=5)
+    content, run = shown.content, open_run(joint)
     gaussians = content.gaussians
-    assert view.counts["transmitters"] == 3
-    assert (view.counts["gaussians"], gaussians.total) == (5, run.metrics["gaussians"])
+    assert shown.counts["transmitters"] == 3
+    assert (shown.counts["gaussians"], gaussians.total) == (5, run.metrics["gaussians"])
     positions_m = np.array(run.field.params["position"], float).T
     for at_m in gaussians.position_m:
         assert np.abs(positions_m - at_m).max(axis=1).min() < FLOAT32
@@ -138,16 +139,16 @@ def test_a_joint_run_shows_gaussians_and_paths_of_its_settings(joint):
 
 
 def test_layers_of_two_runs_of_the_same_data_are_combined(traced, joint, field):
-    both = wrf_mi.view(traced, joint)
+    both = view(traced, joint)
     assert {"triangles", "gaussians", "paths", "held_out_rows"} <= both.counts.keys()
     np.testing.assert_array_equal(both.content.rows.score, read_run(traced).score)
-    other = wrf_mi.view(traced, field).content
+    other = view(traced, field).content
     assert other.gaussians is None
     assert "wrf-gs+: of other data than the first run; only its scene is shown." in other.notes
 
 
 def test_a_field_of_spectra_shows_them(field):
-    content, results = wrf_mi.view(open_run(field)).content, read_run(field)
+    content, results = view(open_run(field)).content, read_run(field)
     observed = content.rows.observed
     assert (observed["kind"], observed["size"]) == ("image", list(results.truth.shape[-2:]))
     for key in ("measured", "predicted"):
@@ -158,15 +159,15 @@ def test_a_field_of_spectra_shows_them(field):
 
 def test_channels_are_curves_where_positions_are_known(tmp_path):
     record, unplaced = channels(True), channels(False)
-    run = open_run(wrf_mi.train(record, tmp_path / "placed", "idw").folder, record)
-    rows = wrf_mi.view(run).content.rows
+    run = open_run(wrf_mi.train(record, "idw", out=tmp_path / "placed").folder, record)
+    rows = view(run).content.rows
     assert rows.observed["kind"] == "curve"
     assert rows.observed["measured"]["shape"] == [1, 10, 4]
     truth = read_run(tmp_path / "placed").truth
     assert power_db(truth) == pytest.approx(10 * np.log10(np.square(np.abs(truth)).mean(axis=2)))
-    folder = wrf_mi.train(unplaced, tmp_path / "unplaced", "linear").folder
+    folder = wrf_mi.train(unplaced, "linear", out=tmp_path / "unplaced").folder
     with pytest.raises(InputError, match="neither scene nor positions are known"):
-        wrf_mi.view(open_run(folder, unplaced))
+        view(open_run(folder, unplaced))
 
 
 def test_representative_rows_span_the_scores():
@@ -178,14 +179,14 @@ def test_representative_rows_span_the_scores():
 
 def test_maps_are_shown_with_their_heights_and_thinned_where_they_are_large(traced, tmp_path):
     files = [write_map(tmp_path / f"at{height}.nc", height) for height in (0.5, 1.5)]
-    content = wrf_mi.view(traced, *files).content
+    content = view(traced, *files).content
     assert content.counts["maps"] == 2
     assert [layer.height_m for layer in content.maps] == [0.5, 1.5]
     first = content.maps[0]
     assert first.labels == {"power_dbm": "received power (dBm)", "best_receiver": "best receiver"}
     shapes = {name: values.shape for name, values in first.values.items()}
     assert shapes == {"power_dbm": (2, 3, 5), "best_receiver": (1, 3, 5)}
-    assert first.receivers == ("anchor1", "anchor2") == tuple(wrf_mi.view(files[0]).content.receivers)
+    assert first.receivers == ("anchor1", "anchor2") == tuple(view(files[0]).content.receivers)
     assert any("spectrum not shown" in note for note in content.notes)
     (thin,), notes = thinned([first], most=20)
     assert len(notes) == 1
@@ -250,7 +251,7 @@ def test_command_refuses_in_one_line(traced, tmp_path, capsys, monkeypatch):
     refused(["view", traced, "--out", out, "--gaussians", 0], "setting gaussians: 0 is out of range", capsys)
     assert not out.exists()
     with pytest.raises(InputError, match="nothing to show"):
-        wrf_mi.view()
+        view()
     (tmp_path / "bad.zarr").mkdir()
     for file, package in (("bad.nc", "h5py"), ("bad.zarr", "zarr"), ("bad.nc", "xarray")):
         monkeypatch.setitem(sys.modules, package, None)

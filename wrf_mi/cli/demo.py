@@ -123,7 +123,7 @@ class Demo:
         for model, in_scene in MODELS.items():
             how: dict[str, Any] = {"settings": settings.get(model, ()), **options}
             how |= {"scene": scene if in_scene else None, "on_progress": self.on_progress, "stop": self.stop}
-            runs.append(train(dataset, self.folder / f"{prefix}{model}", model, **how))
+            runs.append(train(dataset, model, out=self.folder / f"{prefix}{model}", **how))
             self._say(summary(runs[-1:]))
         return runs
 

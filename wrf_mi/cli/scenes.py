@@ -13,7 +13,7 @@ from .options import DATASET, Arguments, add_command, add_n_train
 from .output import Watch, show
 
 if TYPE_CHECKING:
-    from ..core import Record, Split
+    from ..core import Record
     from ..correction.options import CorrectionOptions
     from ..scene.edit import Move
 
@@ -105,12 +105,13 @@ def correct_command(a: Arguments) -> int:
     """Correct a scene, and write its page."""
     from ..checking import warn_of_suspicions
     from ..correction import correct_scene, write_page
+    from ..datasets.splits import single_split
     from ..synthetic import load_record
 
     if Path(a.out).exists() and not a.replace:  # before the work, not after it
         raise InputError(f"{a.out}: exists; remove it, choose another folder, or give --replace")
     record = load_record(a.dataset, progress=sys.stderr.isatty())
-    options, split = _correction_options(a, record), _single_split(a, record)
+    options, split = _correction_options(a, record), single_split(record, a.split, a.seed, a.n_train)
     warn_of_suspicions(record)
     with Watch() as watch:
         correction = correct_scene(a.scene, record, split, options, a.material, watch.on_progress)
@@ -140,17 +141,6 @@ def _correction_options(a: Arguments, record: Record) -> CorrectionOptions:
     if a.shift_sd is not None and not {PLANES, FRAME} & set(options.parts):
         raise InputError(f"--shift-sd: of {PLANES} and {FRAME}, which --fit {','.join(options.parts)} leaves; omit it")
     return options
-
-
-def _single_split(a: Arguments, record: Record) -> Split:
-    from ..datasets import make_splits
-    from ..datasets.splits import NONE, default_split
-
-    name = default_split(record) if a.split is None else a.split
-    splits = make_splits(record, name, a.seed, a.n_train)
-    if len(splits) > 1 and name != NONE:
-        raise InputError(f"--split {a.split}: a scene is corrected by one split; choose a fold, such as {a.split}:0")
-    return splits[-1]
 
 
 def _add_edit(commands: Any) -> None:

@@ -61,7 +61,7 @@ def run_training(a: Arguments, **more: Any) -> int:
 
     with Watch(resumable=True) as watch:
         session: dict[str, Any] = {"on_progress": watch.on_progress, "stop": watch.stop, **more}
-        run = train(a.dataset, a.out, **vars(request), **session, progress=sys.stderr.isatty())
+        run = train(a.dataset, out=a.out, **vars(request), **session, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
 
 
@@ -81,8 +81,18 @@ def training_request(a: Arguments) -> RunRequest:
     from ..runs.folder import RunRequest
 
     model = a.model or HYBRID
-    settings = [*_preset(a, model), *_tracing_settings(a, model), *_stages(a, model), *a.set]
-    names = ("scene", "material", "receiver", "evaluation", "n_train", "min_rows", "deterministic", "intervals")
+    settings = [*_tracing_settings(a, model), *_stages(a, model), *a.set]
+    names = (
+        "scene",
+        "material",
+        "receiver",
+        "evaluation",
+        "n_train",
+        "min_rows",
+        "deterministic",
+        "intervals",
+        "preset",
+    )
     stated = {name: getattr(a, name) for name in names} | {"split": a.split, "seed": a.seed or 0}
     antennas = AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)})
     return RunRequest(model, settings=settings, antennas=antennas, **stated)
@@ -96,20 +106,6 @@ def _stages(a: Arguments, model: str) -> list[str]:
     if model != HYBRID:
         raise InputError(f"--stages belongs to --model {HYBRID}, not to {model}")
     return [f"stages={stages}"]
-
-
-def _preset(a: Arguments, model: str) -> tuple[str, ...]:
-    from ..datasets.registry import stated_task
-    from ..models import known_model
-
-    if a.preset is None:
-        return ()
-    # A data set that is neither a path nor known is refused when it is read.
-    presets = known_model(model).serving(stated_task(a.dataset) or "spectrum", a.scene is not None).presets
-    if a.preset not in presets:
-        known = f"has the presets {', '.join(presets)}" if presets else "has no presets; use --set"
-        raise InputError(f"--preset {a.preset}: {model} on {a.dataset} {known}")
-    return presets[a.preset]
 
 
 def _tracing_settings(a: Arguments, model: str) -> list[str]:

@@ -44,6 +44,15 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield f"{prefix}{key}", value
 
 
+def setting_texts(values: Mapping[str, Any]) -> list[str]:
+    """Texts ``key=value`` of values by nested or dotted names, as `with_settings` takes them.
+
+    >>> setting_texts({"steps": 200, "initial": {"gaussians": 500}})
+    ['steps=200', 'initial.gaussians=500']
+    """
+    return [f"{key}={json.dumps(value, default=lambda v: v.tolist())}" for key, value in flat(values)]
+
+
 _adapter = cache(TypeAdapter)
 
 
@@ -149,7 +158,7 @@ def _mismatch(hint: Any, value: Any, error: ValidationError) -> str:
 def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
     """Settings with ``key=value`` applied in order; keys dotted, values YAML; `InputError`: any that does not fit.
 
-    >>> from wrf_mi import TrainConfig
+    >>> from wrf_mi.training.config import TrainConfig
     >>> config = with_settings(TrainConfig(), ["steps=200", "initial.gaussians=500"])
     >>> config.steps, config.initial.gaussians
     (200, 500)

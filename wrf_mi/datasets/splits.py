@@ -133,6 +133,15 @@ def default_split(record: Record) -> str:
     return NONE if record.official is None else "official"
 
 
+def single_split(record: Record, name: str | None, seed: int = 0, n_train: int | float | None = None) -> Split:
+    """Rows that correct a scene: those of a split, None: the default one; `InputError`: a split of several folds."""
+    chosen = default_split(record) if name is None else name
+    splits = make_splits(record, chosen, seed, n_train)
+    if len(splits) > 1 and chosen != NONE:
+        raise InputError(f"--split {name}: a scene is corrected by one split; choose a fold, such as {name}:0")
+    return splits[-1]
+
+
 def splits_below(record: Record, name: str) -> tuple[str, ...]:
     """Name of the split of rows that a split by receivers divides further; none for any other split."""
     if re.split("[+:]", name)[0] != "receiver":

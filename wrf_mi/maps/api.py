@@ -6,6 +6,8 @@ Powers of a made-up receiver with noise of 2 dB, mapped by kriging with interval
     >>> from pathlib import Path
     >>> import numpy as np
     >>> import wrf_mi
+    >>> from wrf_mi.maps.coverage import run_reliability
+    >>> from wrf_mi.maps.dataset import write_map
     >>> rng = np.random.default_rng(0)
     >>> positions_m = rng.uniform([1, 1, 1.3], [5, 4, 1.3], (40, 3))
     >>> rssi_dbm = -40 - 20 * np.log10(np.linalg.norm(positions_m, axis=1))[None] + rng.normal(0, 2, (1, 40))
@@ -13,17 +15,17 @@ Powers of a made-up receiver with noise of 2 dB, mapped by kriging with interval
     >>> known = {"frequencies_hz": np.array([2.44e9]), "official": (np.arange(30), np.arange(30, 40))}
     >>> record = wrf_mi.Record("made-up", "rssi", positions_m, (receiver,), rssi_dbm.astype("float32"), **known)
     >>> folder = Path(tempfile.mkdtemp())
-    >>> run = wrf_mi.train(record, folder / "run", "kriging", intervals=True)
-    >>> dataset = wrf_mi.radio_map(run, step_m=0.5, threshold_dbm=-52)
+    >>> run = wrf_mi.train(record, "kriging", out=folder / "run", intervals=True)
+    >>> dataset = run.map(step_m=0.5, threshold_dbm=-52)
     >>> dict(dataset["power_dbm"].sizes), dataset["power_dbm"].units
     ({'receiver': 1, 'y': 8, 'x': 10}, 'dBm')
     >>> bool((dataset["coverage_probability"] <= 1).all())
     True
-    >>> int(wrf_mi.run_reliability(run.folder).count.sum())  # 10 test rows and 9 thresholds
+    >>> int(run_reliability(run.folder).count.sum())  # 10 test rows and 9 thresholds
     90
-    >>> wrf_mi.write_map(dataset, folder / "map.nc").name
+    >>> write_map(dataset, folder / "map.nc").name
     'map.nc'
-    >>> planned = wrf_mi.plan(run, count=2)
+    >>> planned = run.plan(count=2)
     >>> planned.tx_pos_m.shape, bool(planned.expected_error[2] < planned.expected_error[0])
     ((2, 3), True)
     >>> shutil.rmtree(folder)
@@ -174,7 +176,7 @@ def _attributes(run: Run, task: Task, conditions: Conditions, heading_deg: float
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions common to all positions of a map, as the arguments of `wrf_mi.radio_map`."""
+    """Conditions common to all positions of a map, as the arguments of `radio_map`."""
 
     threshold_db: float | None
     transmit_dbm: float

@@ -139,8 +139,8 @@ def locate(
     >>> record = wrf_mi.Record("made-up", "rssi", tx_pos_m, tuple(receivers), rssi_dbm, **known)
     >>> folder = Path(tempfile.mkdtemp())
     >>> data = write_ble_folder(folder / "data", record)
-    >>> run = wrf_mi.train(data, folder / "run", "kriging")
-    >>> found = wrf_mi.locate(run.folder, rssi_dbm[:, 50:], level=0.9)
+    >>> run = wrf_mi.train(data, "kriging", out=folder / "run")
+    >>> found = run.locate(rssi_dbm[:, 50:], level=0.9)
     >>> bool(np.median(found.error_m(tx_pos_m[50:])) < 1)
     True
     >>> shutil.rmtree(folder)

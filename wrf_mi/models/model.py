@@ -175,6 +175,31 @@ class Model(ABC):
 
     One line in `wrf_mi.models` registers it; a model of another package is an instance that an entry point of the group
     ``wrf_mi.models`` names.
+
+    The mean of the training rows as a model; `wrf_mi.models.register` makes it known to `wrf_mi.train`:
+
+    >>> class FittedMean(Fitted):
+    ...     def __init__(self, arrays):
+    ...         self._arrays = arrays
+    ...
+    ...     def predict(self, inputs, receiver):
+    ...         return Prediction(np.full(len(inputs), self._arrays["mean"][receiver]))
+    ...
+    ...     def arrays(self):
+    ...         return self._arrays
+    >>> @dataclass(frozen=True)
+    ... class NoSettings:
+    ...     pass
+    >>> class Mean(Model):
+    ...     name, source, settings, tasks = "mean", "mean of the training rows", NoSettings, ("rssi",)
+    ...
+    ...     def fit(self, problem, split, session):
+    ...         return FittedMean({"mean": np.nanmean(problem.record.observation[:, problem.rows(split)], axis=1)})
+    ...
+    ...     def load(self, arrays, problem, folder):
+    ...         return FittedMean(arrays)
+    >>> Mean().serves("rssi"), Mean().serves("spectrum")
+    (True, False)
     """
 
     name: str  #: name as in ``wrf-mi train --model``

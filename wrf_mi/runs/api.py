@@ -16,15 +16,13 @@ Signal strengths of a made-up receiver, in the layout of flat-ble:
     >>> data = write_ble_folder(folder / "data", record)
     >>> [len(split.test) for split in wrf_mi.make_splits(wrf_mi.load(data), "official")]
     [10]
-    >>> run = wrf_mi.train(data, folder / "run", "kriging")
+    >>> run = wrf_mi.train(data, "kriging", out=folder / "run")
     >>> bool(run.metrics["abs_error_db"]["median"] < 1)
     True
     >>> wrf_mi.open_run(run.folder).predict([[2, 3, 4]]).mean.shape
     (1,)
-    >>> wrf_mi.evaluate_run(run.folder)["n_test"]
+    >>> run.score()["n_test"]
     10
-    >>> wrf_mi.predict_to_file(run.folder, positions_m[:2], folder / "new.npz")["prediction"]
-    (2,)
     >>> (run.folder / "model.npz").unlink()  # as if stopped
     >>> wrf_mi.resume(run.folder).metrics["n_test"]
     10
@@ -42,8 +40,10 @@ from __future__ import annotations
 
 import logging
 import shutil
+import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+import weakref
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,7 @@ from ..checking import warn_of_suspicions
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
+from ..core.settings import setting_texts
 from ..datasets import make_splits
 from ..datasets.observations import LEAST_ROWS, check_observations, fitted_receivers, place_of, warn_of_left_out
 from ..datasets.splits import NONE, default_split, splits_below
@@ -86,6 +87,7 @@ from .folder import (
     write_fitted,
 )
 from .run import Run, load_fitted, open_run, predict_to_file
+from .scenes import Scene
 
 logger = logging.getLogger(__name__)
 
@@ -144,15 +146,27 @@ def _settings_of(model: Model, request: RunRequest) -> Any:
     kind: Any = model.settings
     stated = request.settings
     if is_dataclass(stated) and not isinstance(stated, type):
+        if request.preset is not None:
+            raise InputError(f"preset {request.preset}: the settings state all values; give one of both")
         if not issubclass(kind, type(stated)):
             raise InputError(f"settings of {model.name}: {type(stated).__name__}; give {kind.__name__}")
         settings: Any = kind(**{field.name: getattr(stated, field.name) for field in fields(stated)})
     else:
         assert isinstance(stated, Iterable)
-        settings = default_settings(model, stated, {name: getattr(request, name) for name in GIVEN})
+        texts = setting_texts(stated) if isinstance(stated, Mapping) else stated
+        settings = default_settings(
+            model, [*_preset(model, request.preset), *texts], {name: getattr(request, name) for name in GIVEN}
+        )
     if "model" in model.train_arguments and settings.model != model.name:
         raise InputError(f"setting model: {settings.model}, where the model is {model.name}; choose it with --model")
     return settings
+
+
+def _preset(model: Model, name: str | None) -> tuple[str, ...]:
+    if name is not None and name not in model.presets:
+        known = f"has the presets {', '.join(model.presets)}" if model.presets else "has no presets; use --set"
+        raise InputError(f"--preset {name}: {model.name} for such data {known}")
+    return () if name is None else model.presets[name]
 
 
 def _least_rows(record: Record, request: RunRequest) -> int:
@@ -202,10 +216,11 @@ def _check_scene(model: Model, record: Record, scene: str | None, request: RunRe
 @alone_in_process()
 def train(
     dataset: str | Path | Record,
-    out: str | Path,
     model: str = "hybrid",
+    scene: str | Path | Scene | None = None,
     *,
-    scene: str | Path | None = None,
+    out: str | Path | None = None,
+    preset: str | None = None,
     material: str | None = None,
     antennas: AntennaOptions = AS_STATED,
     receiver: str | None = None,
@@ -226,9 +241,10 @@ def train(
 
     Args:
         dataset: name or folder of a data set, or a loaded record.
-        out: run folder to make; must not exist or be empty.
         model: name of the model, a key of `wrf_mi.models.MODELS`.
-        scene: name, scene folder, Mitsuba XML or mesh to trace, for models that take a scene.
+        scene: scene, or name, scene folder, Mitsuba XML or mesh to trace, for models that take one.
+        out: run folder to make; must not exist or be empty. None: a temporary one, removed with the run.
+        preset: settings by a name of `wrf_mi.models.Model.presets`, such as ``"fast"``; ``settings`` are beside them.
         material: radio material of a bare mesh.
         antennas: patterns and polarisations that override the data set; with a scene.
         receiver: ``"pixel"``, ``"array"`` or ``"auto"``, for models that have a choice.
@@ -237,7 +253,8 @@ def train(
             or the rows themselves; None: ``official``, or ``none`` where the data have no split.
         n_train: number or fraction of the training rows to use; None: all.
         seed: seed of split and fit.
-        settings: ``key=value`` of the model, or all settings as its dataclass, whose seed and determinism then count.
+        settings: settings of the model: values by name, nested or dotted, ``key=value`` texts, or its dataclass, whose
+            seed and determinism then count.
         deterministic: fit on one thread of the CPU, bit-identical from run to run.
         intervals: calibrate the standard deviations of predictions on training rows that are held out in space; the
             model is fitted once more.
@@ -257,12 +274,13 @@ def train(
         Interrupted: ``stop`` ended the run; continue with `resume`.
         BackendError: a deterministic fit in a process that computes on a GPU already.
     """
-    folder = Path(out)
+    folder = Path(tempfile.mkdtemp(prefix="wrf-mi-") if out is None else out)
     check_new(folder)
     if deterministic:  # before anything is read: reading a data set may choose the GPU
         init("llvm", threads=1)
-    what = RunRequest(model, scene, material, antennas, receiver, evaluation, split, n_train, seed, settings)
-    request = replace(what, deterministic=deterministic, intervals=intervals, min_rows=min_rows)
+    place = scene.folder if isinstance(scene, Scene) else scene
+    what = RunRequest(model, place, material, antennas, receiver, evaluation, split, n_train, seed, settings)
+    request = replace(what, deterministic=deterministic, intervals=intervals, min_rows=min_rows, preset=preset)
     problem, config, splits = plan_run(dataset, request, progress)
     warn_of_suspicions(problem.record)
     warn_of_left_out(problem.record, config.left_out, _least_rows(problem.record, request))
@@ -279,7 +297,11 @@ def train(
             if not any(any(folder.rglob(name)) for name in (FITTED, CHECKPOINT)):
                 shutil.rmtree(folder)
             raise
-    return Run(folder, problem.record)
+    run = Run(folder, problem.record)
+    object.__setattr__(run, "scene", scene)  # whose temporary folder, if it has one, lives as long as the run
+    if out is None:
+        weakref.finalize(run, shutil.rmtree, folder, ignore_errors=True)
+    return run
 
 
 def _warn_of_known_rows(problem: Problem, splits: Sequence[Split]) -> None:
@@ -349,13 +371,16 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
 
 
 @alone_in_process()
-def evaluate_run(folder: str | Path, split: str | None = None, operator: bool = True) -> dict[str, Any]:
+def evaluate_run(
+    folder: str | Path, split: str | None = None, operator: bool = True, record: Record | None = None
+) -> dict[str, Any]:
     """Score a run again.
 
     Args:
         folder: run folder; without ``split`` its ``metrics.json`` and ``predictions.npz`` are written anew.
         split: name of another split, whose test rows are scored except those used in training; nothing is written.
         operator: learned fields predict by operator where they can.
+        record: data that the model was fitted to; None: the data set that the folder names.
 
     Returns:
         The metrics.
@@ -363,7 +388,7 @@ def evaluate_run(folder: str | Path, split: str | None = None, operator: bool = 
     Raises:
         InputError: not a run folder, a stopped run, or no row of ``split`` that was not used in training.
     """
-    run = open_run(folder, operator=operator)
+    run = open_run(folder, record, operator)
     config, problem, folders = run.config, run.problem, run_parts(run.folder)
     if split is not None and folders != [run.folder]:
         raise InputError(f"{run.folder}: every row is held out in one of its folds; omit --split")

@@ -117,6 +117,12 @@ def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
     return [(f"{slug}-{name}.png", heading, figure) for name, heading, figure in drawn if figure is not None]
 
 
+def sample_figure(run_dirs: Sequence[str | Path]) -> Figure:
+    """Truth of some test rows beside the predictions of runs on one data set: spectra, or power over positions."""
+    runs = read_runs(run_dirs)
+    return (_spectra(runs) if TASKS[runs[0].task].image else _maps(runs))[1]
+
+
 def _times(runs: Sequence[Results]) -> Figure:
     """Median scores over the times of a prediction and of the training."""
     task = TASKS[runs[0].task]

@@ -51,7 +51,7 @@ CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model
 VERSION, SECONDS = "run/format", "run/train_seconds"  # keys of ``model.npz`` beside the model's arrays
 
 
-Settings = Iterable[str] | object  # ``key=value`` of the model's settings, or all settings as its dataclass
+Settings = Iterable[str] | Mapping[str, Any] | object  # settings by name, ``key=value``, or the model's dataclass
 GIVEN = ("model", "seed", "deterministic", "receiver", "evaluation")  # arguments of `train` that may be settings, too
 
 
@@ -72,6 +72,7 @@ class RunRequest:
     deterministic: bool = False
     intervals: bool = False
     min_rows: int | None = None
+    preset: str | None = None
 
 
 @dataclass(frozen=True)

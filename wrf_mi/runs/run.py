@@ -19,6 +19,7 @@ from ..core.carriers import FREQUENCY, carriers_text
 from ..core.files import readable
 from ..core.memory import require_memory
 from ..core.receivers import receiver_index
+from ..core.registry import resolve
 from ..datasets import load_split
 from ..models import Fitted, Inputs, Model, Problem
 from ..models.checks import check_inputs
@@ -118,29 +119,69 @@ class Run:
     def predict(
         self,
         tx_pos_m: ArrayLike | None = None,
-        receiver: int | str = 0,
+        receiver: int | str | None = None,
         tx_heading_rad: ArrayLike | None = None,
         uplink: ArrayLike | None = None,
         carriers_hz: ArrayLike | None = None,
     ) -> Prediction:
-        """Predict the observations of a receiver.
+        """Predict the observations of a receiver, or of all.
 
         Args:
             tx_pos_m: transmitter positions [m, 3], metres; None: unknown.
-            receiver: name, or index from 0.
+            receiver: name, or index from 0; None: all receivers.
             tx_heading_rad: yaw of the transmitter [m], radians; None: unknown.
             uplink: uplink channels [m, antennas, subcarriers]; None: unknown.
             carriers_hz: carrier of each position [m], Hz, where the data have several; else None.
 
         Returns:
-            Observations [m, ...] as in `wrf_mi.core.Record` and, if the model states them, standard deviations.
+            Observations [m, ...] as in `wrf_mi.core.Record` and, if the model states them, standard deviations; of
+            several receivers [n_rx, m, ...], as in ``predictions.npz``.
 
         Raises:
             InputError: not a finished run with one split, inputs that the model does not predict from, or no such
                 receiver.
         """
-        index = receiver_index(self.receivers, receiver)
-        return self.predict_inputs(_inputs(tx_pos_m, tx_heading_rad, uplink, carriers_hz), index)
+        inputs = _inputs(tx_pos_m, tx_heading_rad, uplink, carriers_hz)
+        if receiver is not None or len(self.receivers) == 1:
+            return self.predict_inputs(inputs, receiver_index(self.receivers, receiver or 0))
+        every = [self.predict_inputs(inputs, index) for index in range(len(self.receivers))]
+        stds = [prediction.std for prediction in every if prediction.std is not None]
+        mean = np.stack([prediction.mean for prediction in every])
+        return Prediction(mean, np.stack(stds) if len(stds) == len(every) else None)
+
+    def score(self, split: str | None = None) -> dict[str, Any]:
+        """Scores on the test rows, or on those of another split (`wrf_mi.runs.api.evaluate_run`)."""
+        return dict(resolve("wrf_mi.runs.api:evaluate_run")(self.folder, split, self.operator, self.record))
+
+    @property
+    def stages(self) -> list[dict[str, Any]]:
+        """Stages of a hybrid in their order, with what each contributes on held-out rows; empty for other models."""
+        return list(self.metrics.get("stages", []))
+
+    def map(self, **options: Any) -> Any:
+        """Map of power, coverage and best receiver, ``xarray.Dataset``; options of `wrf_mi.maps.api.radio_map`."""
+        return resolve("wrf_mi.maps.api:radio_map")(self, **options)
+
+    def locate(self, observed_dbm: ArrayLike, **options: Any) -> Any:
+        """Positions of transmitters from signal strengths; options of `wrf_mi.maps.locate.locate`."""
+        return resolve("wrf_mi.maps.locate:locate")(self, observed_dbm, **options)
+
+    def plan(self, count: int = 10, **options: Any) -> Any:
+        """Positions to measure next; options of `wrf_mi.maps.plan.plan`."""
+        return resolve("wrf_mi.maps.plan:plan")(self, count, **options)
+
+    def view(self, *more: Any, **options: Any) -> Any:
+        """Interactive 3D view of the run and of ``more``, such as maps; options of `wrf_mi.viewer.view.view`."""
+        return resolve("wrf_mi.viewer.view:view")(self, *more, **options)
+
+    def plot(self) -> Any:
+        """Matplotlib figure of test rows: truth, prediction and interpolation side by side."""
+        return resolve("wrf_mi.runs.compare:sample_figure")([self.folder])
+
+    def export(self, format: str, out: str | Path, **options: Any) -> dict[str, Any]:
+        """Write a file for other programs; formats and options of `wrf_mi.exports.export`."""
+        stated = resolve("wrf_mi.exports:ExportOptions")(**options)
+        return dict(resolve("wrf_mi.exports:export")(self.folder, format, out, stated))
 
     def predict_inputs(self, inputs: Inputs, receiver: int) -> Prediction:
         """Predict the observations of the receiver of an index; errors as those of `predict`."""

@@ -94,14 +94,14 @@ def make_scene(
     A room of 6 m x 5 m from the walls of a plan, and the same without its ceiling:
 
     >>> import shutil, tempfile
-    >>> import wrf_mi
     >>> folder = Path(tempfile.mkdtemp())
     >>> corners = ["x,y", "0,0", "6,0", "6,5", "0,5", "0,0"]
     >>> characters = (folder / "layout.csv").write_text("\n".join(corners))
     >>> made = make_scene(folder / "layout.csv", folder / "room", height_m=2.5)
     >>> made.xml.name, dict(made.counts)
     ('scene.xml', {'surfaces': 6, 'faces': 12})
-    >>> wrf_mi.edit_scene(made.folder, folder / "open", remove=["ceiling*"]).name
+    >>> from wrf_mi.scene.edit import edit_scene
+    >>> edit_scene(made.folder, folder / "open", remove=["ceiling*"]).name
     'open'
     >>> shutil.rmtree(folder)
     """

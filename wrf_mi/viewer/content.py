@@ -18,7 +18,7 @@ STORED_TRANSMITTERS, SHOWN_GAUSSIANS, SHOWN_PATHS = 40, 1000, 200
 
 @dataclass(frozen=True)
 class ViewOptions(CheckedSettings):
-    """Limits of a view, as the arguments of `wrf_mi.view`."""
+    """Limits of a view, as the arguments of `wrf_mi.viewer.view.view`."""
 
     transmitters: Count = STORED_TRANSMITTERS
     gaussians: Count = SHOWN_GAUSSIANS

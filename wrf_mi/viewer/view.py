@@ -189,8 +189,8 @@ def view(
     Raises:
         InputError: no source, one that cannot be read, a number out of range, or plotly is not installed.
 
-    >>> import wrf_mi
-    >>> wrf_mi.view("laboratory").counts["triangles"] > 0
+    >>> from wrf_mi.viewer.view import view
+    >>> view("laboratory").counts["triangles"] > 0
     True
     """
     options = ViewOptions(transmitters, gaussians, paths)

@@ -12,6 +12,7 @@ from wrf_mi.core import InputError, Record, Split
 from wrf_mi.datasets import make_splits
 from wrf_mi.models import Problem
 from wrf_mi.models.hybrid.model import HybridSettings, parts_of
+from wrf_mi.runs.api import evaluate_run
 from wrf_mi.tasks.scores import cea_db
 from wrf_mi.training.selection import HeldOut, hold_out
 
@@ -20,8 +21,8 @@ EXACT_DB = 30.0  # CEA of a downlink that is its uplink turned, from twenty rows
 
 
 def test_strengths_without_a_scene_are_those_of_kriging_and_restored(flat_folder: Path, tmp_path: Path):
-    run = wrf_mi.train(flat_folder, tmp_path / "run")
-    kriging = wrf_mi.train(flat_folder, tmp_path / "kriging", "kriging")
+    run = wrf_mi.train(flat_folder, out=tmp_path / "run")
+    kriging = wrf_mi.train(flat_folder, "kriging", out=tmp_path / "kriging")
     assert run.metrics["abs_error_db"] == kriging.metrics["abs_error_db"]
     assert run.metrics["weights"] == [{"distance_m": 0.0, "kriging": 1.0}]
     assert 0.5 < run.metrics["inside_90"] <= 1
@@ -29,15 +30,15 @@ def test_strengths_without_a_scene_are_those_of_kriging_and_restored(flat_folder
     before, after = (opened.predict(position, 1) for opened in (run, wrf_mi.open_run(run.folder)))
     assert after.mean == pytest.approx(before.mean)
     assert after.std == pytest.approx(before.std)
-    assert wrf_mi.evaluate_run(run.folder)["weights"] == run.metrics["weights"]
+    assert evaluate_run(run.folder)["weights"] == run.metrics["weights"]
 
 
 def test_two_rows_are_interpolated_by_kriging_and_five_spectra_have_intervals(flat_folder, tmp_path, folder):
-    run = wrf_mi.train(flat_folder, tmp_path / "run", "hybrid", n_train=2)
+    run = wrf_mi.train(flat_folder, "hybrid", out=tmp_path / "run", n_train=2)
     assert list(run.metrics["weights"][0]) == ["distance_m", "kriging"]
     assert "inside_90" not in run.metrics
     # Three remain where two are held out, through which kriging may pass without any deviation.
-    run = wrf_mi.train(folder, tmp_path / "five", n_train=5)
+    run = wrf_mi.train(folder, out=tmp_path / "five", n_train=5)
     assert 0 < run.metrics["inside_90"] <= 1
 
 
@@ -53,7 +54,7 @@ def test_hybrid_mixes_models_from_positions_and_from_the_uplink(tmp_path: Path, 
     """Without the networks, whose training takes a minute."""
     monkeypatch.setattr("wrf_mi.models.hybrid.model.UPLINK_PARTS", ("r2f2", "linear"))
     record = channels()
-    run = wrf_mi.train(record, tmp_path / "run")
+    run = wrf_mi.train(record, out=tmp_path / "run")
     accuracy = run.metrics["held_out"]
     assert {"r2f2", "linear", "kriging"} <= set(accuracy)
     assert accuracy["hybrid"] >= accuracy["linear"] - UNCLEAR_DB > accuracy["kriging"]
@@ -103,7 +104,7 @@ def test_a_carrier_is_held_out_as_the_split_does(bands: Record, known: bool) -> 
 
 def test_a_carrier_between_others_is_predicted_with_intervals(bands: Record, tmp_path: Path) -> None:
     """Strengths are linear in the logarithm of the frequency, so that interpolation has the error of one carrier."""
-    run = wrf_mi.train(bands, tmp_path / "run", split="frequency-known:2")
+    run = wrf_mi.train(bands, out=tmp_path / "run", split="frequency-known:2")
     assert run.metrics["abs_error_db"]["median"] < 0.5  # positions are known at the other carriers
     assert 0.5 < run.metrics["inside_90"] <= 1
     asked = {"tx_pos_m": bands.tx_pos_m[:3], "receiver": 0, "carriers_hz": np.full(3, 2.4e9)}

@@ -64,7 +64,7 @@ def assert_restored(run: wrf_mi.Run, record: Record) -> wrf_mi.Run:
 def spectra(scenes: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[wrf_mi.Run, Record]:
     record, split = measured(scenes, "spectrum")
     folder = tmp_path_factory.mktemp("runs") / "run"
-    return wrf_mi.train(record, folder, scene=scenes["thought"], split=split, settings=QUICK), record
+    return wrf_mi.train(record, out=folder, scene=scenes["thought"], split=split, settings=QUICK), record
 
 
 def test_stages_are_reported_in_their_order_and_kept_where_they_gain(spectra: tuple[wrf_mi.Run, Record]) -> None:
@@ -83,7 +83,7 @@ def test_stages_are_reported_in_their_order_and_kept_where_they_gain(spectra: tu
 def test_hybrid_of_a_wrong_scene_is_above_its_trace_and_interpolation(spectra, scenes, tmp_path) -> None:
     run, record = spectra
     for model, scene in (("ray-tracing", scenes["thought"]), ("kriging", None)):
-        other = wrf_mi.train(record, tmp_path / model, model, scene=scene, split=measured(scenes, "spectrum")[1])
+        other = wrf_mi.train(record, model, out=tmp_path / model, scene=scene, split=measured(scenes, "spectrum")[1])
         assert run.metrics["ssim"]["mean"] > other.metrics["ssim"]["mean"]
 
 
@@ -108,7 +108,7 @@ def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(scenes: dict[str, Path],
     record = replace(record, official=(split.train, split.test))
     data, out = str(write_spectrum_folder(tmp_path / "room", record)), tmp_path / "stopped"
     how = {"scene": scenes["thought"], "settings": ("steps=20",), "deterministic": True}
-    uninterrupted = wrf_mi.train(data, tmp_path / "whole", **how)
+    uninterrupted = wrf_mi.train(data, out=tmp_path / "whole", **how)
     sitting = partial(wrf_mi.train, data, out, **how)
     for stage, share in (("paths: choices", 0.0), ("paths: training", 0.5), ("kriging, held-out rows: signals", 0.0)):
         reports = [("", 0.0)]
@@ -126,7 +126,7 @@ def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(scenes: dict[str, Path],
 @pytest.mark.parametrize("task", ["rssi", "csi"])
 def test_strengths_and_channels_are_fitted_in_stages(task: str, scenes: dict[str, Path], tmp_path: Path) -> None:
     record, split = measured(scenes, task)
-    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split, settings=QUICK)
+    run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=QUICK)
     names = [report["stage"] for report in run.metrics["stages"]]
     assert (names[0], names[-1]) == ("mean", "residual")
     assert ("field" in names) == (task == "csi")  # powers of uncertain positions have none
@@ -136,7 +136,7 @@ def test_strengths_and_channels_are_fitted_in_stages(task: str, scenes: dict[str
 def test_strengths_at_exact_positions_are_those_of_the_trace(scenes: dict[str, Path], tmp_path: Path) -> None:
     """Local means are off by the ripple of two paths and more, 1 to 3 dB at 920 MHz."""
     record, split = measured(scenes, "rssi")
-    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["true"], split=split)
+    run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["true"], split=split)
     assert json.loads((run.folder / "parts" / "paths" / "mean.json").read_text())["exact"]
     assert run.metrics["abs_error_db"]["median"] < CLEAR_DB
     assert_restored(run, record)
@@ -144,7 +144,7 @@ def test_strengths_at_exact_positions_are_those_of_the_trace(scenes: dict[str, P
 
 def test_few_rows_train_paths_and_hold_two_out(scenes: dict[str, Path], tmp_path: Path) -> None:
     record, split = measured(scenes, "spectrum", 5)
-    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split, settings=QUICK)
+    run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=QUICK)
     assert [report["stage"] for report in run.metrics["stages"]] == ["surfaces", "residual"]
     assert run.metrics["inside_90"] > 0.5
 
@@ -155,7 +155,7 @@ def test_scene_as_stated_is_kept_where_few_rows_prefer_it(scenes, tmp_path, monk
     monkeypatch.setattr(scene_side, "_held_out_score", lambda side: float(side.problem.scene == stated))
     record, split = measured(scenes, "spectrum", 16)
     settings = ("stages=mean,correction,surfaces", "steps=20")
-    run = wrf_mi.train(record, tmp_path / "run", scene=stated, split=split, settings=settings)
+    run = wrf_mi.train(record, out=tmp_path / "run", scene=stated, split=split, settings=settings)
     again = assert_restored(run, record)
     assert all(opened.fitted.parts["paths"].problem.scene == stated for opened in (run, again))
     assert not (run.folder / "parts" / "paths" / "scene").exists()
@@ -169,7 +169,7 @@ def test_scene_as_stated_is_kept_where_few_rows_prefer_it(scenes, tmp_path, monk
 def test_correction_that_is_not_wanted_is_not_fitted(scenes: dict[str, Path], tmp_path: Path) -> None:
     record, split = measured(scenes, "spectrum", 16)
     settings = ("stages=mean,calibration", "steps=20")
-    run = wrf_mi.train(record, tmp_path / "run", scene=scenes["thought"], split=split, settings=settings)
+    run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=settings)
     assert [report["stage"] for report in run.metrics["stages"]] == ["mean", "calibration"]
     assert list(run.metrics["held_out"]) == ["paths", "hybrid"]
 

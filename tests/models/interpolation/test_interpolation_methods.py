@@ -13,9 +13,8 @@ from changed_folders import needs
 from made_channels import channels
 from sklearn.ensemble import ExtraTreesRegressor
 
-import wrf_mi
 from wrf_mi.core import InputError, Record
-from wrf_mi.core.settings import describe, settings_from
+from wrf_mi.core.settings import describe, settings_from, with_settings
 from wrf_mi.datasets import load, make_splits, write_nerf2_csi, write_spectrum_folder
 from wrf_mi.models import MODELS, known_model
 from wrf_mi.models.interpolation.kriging import Kriging, Trend
@@ -51,7 +50,7 @@ def test_settings_are_listed_and_accept_null(flat_folder: Path, capsys: pytest.C
     for line in ("idw:", "neighbours=null", "kriging, spectra:", "length_m=null", "mri:", "shared=False"):
         assert line in out.splitlines(), line
     defaults = MODELS["kriging"].serving("rssi", False).settings(length_m=2.0)
-    changed = wrf_mi.with_settings(defaults, ["length_m=null", "noise=1", "trend=constant"])
+    changed = with_settings(defaults, ["length_m=null", "noise=1", "trend=constant"])
     assert (changed.length_m, changed.noise, changed.trend) == (None, 1.0, "constant")
     assert isinstance(changed.noise, float)
 
@@ -62,7 +61,7 @@ def test_settings_round_trip_through_the_configuration_and_the_list(name: str) -
     settings = SETTINGS[name]()
     kept = yaml.safe_load(yaml.safe_dump(json.loads(json.dumps(asdict(settings)))))
     assert settings_from(type(settings), kept, "config.yaml") == settings
-    assert wrf_mi.with_settings(settings, describe(settings).splitlines()) == settings
+    assert with_settings(settings, describe(settings).splitlines()) == settings
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class Several:
 
 
 def test_settings_of_every_type() -> None:
-    changed = wrf_mi.with_settings(Several(), ["pair=[3, 4]", "many=[5, 6, 7]", "kind=b", "maybe=2"])
+    changed = with_settings(Several(), ["pair=[3, 4]", "many=[5, 6, 7]", "kind=b", "maybe=2"])
     assert changed == Several((3.0, 4.0), (5, 6, 7), "b", 2.0)
     for wrong, message in (
         ("pair=[3]", "setting pair: expected a list of 2 values"),
@@ -86,7 +85,7 @@ def test_settings_of_every_type() -> None:
         ("maybe=x", "setting maybe: expected float, got 'x'"),
     ):
         with pytest.raises(InputError, match=message):
-            wrf_mi.with_settings(Several(), [wrong])
+            with_settings(Several(), [wrong])
 
 
 def test_mri_recovers_an_exact_path_loss_law(flat_folder: Path, tmp_path: Path) -> None:
@@ -97,7 +96,7 @@ def test_mri_recovers_an_exact_path_loss_law(flat_folder: Path, tmp_path: Path) 
     record.observation[:] = exact
     record.observation[1, 3:9] = np.nan
     for shared in ("false", "true"):
-        out = train(record, tmp_path / shared, "mri", settings=(f"shared={shared}",)).folder
+        out = train(record, "mri", out=tmp_path / shared, settings=(f"shared={shared}",)).folder
         with np.load(out / "model.npz") as arrays:
             np.testing.assert_allclose(arrays["1/law"], [-45, -2], atol=ROUNDING)
         np.testing.assert_allclose(stored(out)["prediction"], exact[:, 24:], atol=ROUNDING)
@@ -106,7 +105,7 @@ def test_mri_recovers_an_exact_path_loss_law(flat_folder: Path, tmp_path: Path) 
 def test_kriging_runs_equal_the_library_for_every_task(folder: Path, tmp_path: Path) -> None:
     """Given lengths and noise: the adapter's constant trend and, for channels, complex numbers and all antennas."""
     for data in (folder, write_nerf2_csi(tmp_path / "stations", channels())):
-        out = train(data, tmp_path / f"run-{data.name}", "kriging", settings=("length_m=0.5", "noise=0.1")).folder
+        out = train(data, "kriging", out=tmp_path / f"run-{data.name}", settings=("length_m=0.5", "noise=0.1")).folder
         record, arrays = load(data), stored(out)
         (split,) = make_splits(record, "official")
         model = Kriging(0.5, 0.1).fit(record.tx_pos_m[split.all_train], record.observation[0, split.all_train])
@@ -120,7 +119,7 @@ def test_runs_with_headings_equal_the_library(flat_folder: Path, tmp_path: Path)
     place, turned, known = record.tx_pos_m, record.tx_heading_rad, split.all_train
     kriging, trees = ("length_m=0.5", "noise=0.1", "heading_length=1.5"), ("trees=20", "leaf_rows=2")
     for name, settings in (("kriging", kriging), ("trees", trees)):
-        predicted = stored(train(flat_folder, tmp_path / name, name, settings=settings).folder)["prediction"]
+        predicted = stored(train(flat_folder, name, out=tmp_path / name, settings=settings).folder)["prediction"]
         for r, receiver in enumerate(record.receivers):
             law = Trend(receiver.position_m)
             model = Kriging(0.5, 0.1, 1.5, trend=law, trend_fit="ols") if name == "kriging" else Trees(20, 2)
@@ -149,13 +148,13 @@ def test_grown_trees_predict_as_scikit_learn(flat_folder: Path) -> None:
 @needs("flat-ble")
 def test_published_figure_of_mri(tmp_path: Path) -> None:
     """Median 4.17 dB, 90th percentile 10.2 dB, over all anchors and test rows: the data's description."""
-    error_db = train("flat-ble", tmp_path / "run", "mri").metrics["abs_error_db"]
+    error_db = train("flat-ble", "mri", out=tmp_path / "run").metrics["abs_error_db"]
     assert error_db["median"] == pytest.approx(4.17, abs=0.01)
     assert error_db["p90"] == pytest.approx(10.2, abs=0.05)
 
 
 def test_idw_of_one_training_row_copies_it_at_every_receiver(two_gateways: Record, tmp_path: Path) -> None:
     data = write_spectrum_folder(tmp_path / "data", two_gateways, bits=16)
-    arrays = stored(train(data, tmp_path / "run", "idw", n_train=1).folder)
+    arrays = stored(train(data, "idw", out=tmp_path / "run", n_train=1).folder)
     assert arrays["prediction"].shape == arrays["truth"].shape
     assert (arrays["prediction"] == arrays["prediction"][:, :1]).all()

@@ -91,7 +91,7 @@ def test_errors_are_lower_than_by_lengths_of_rooms(tmp_path: Path, monkeypatch: 
 @needs("duke-cbrs")
 def test_hybrid_over_a_real_campus(tmp_path: Path) -> None:
     """Within the error of generic kriging, whose lengths are by likelihood, and intervals that cover."""
-    metrics = train(load(DATA / "duke-cbrs"), tmp_path / "run", "hybrid").metrics
+    metrics = train(load(DATA / "duke-cbrs"), "hybrid", out=tmp_path / "run").metrics
     assert metrics["abs_error_db"]["median"] <= 6.1
     assert 0.85 < metrics["inside_90"] < 0.95
 

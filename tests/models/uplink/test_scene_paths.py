@@ -72,7 +72,9 @@ def test_distinct_paths_are_the_strongest_of_those_that_are_alike():
 
 def test_scene_raises_the_accuracy_of_the_downlink(room: Record, tmp_path: Path):
     run = {
-        scene: wrf_mi.train(room, tmp_path / str(scene), "r2f2", scene=scene, settings=SETTINGS[: None if scene else 4])
+        scene: wrf_mi.train(
+            room, "r2f2", out=tmp_path / str(scene), scene=scene, settings=SETTINGS[: None if scene else 4]
+        )
         for scene in ("laboratory", None)
     }
     with_scene, without = (run[scene].metrics["cea_db"]["median"] for scene in ("laboratory", None))
@@ -84,4 +86,4 @@ def test_scene_raises_the_accuracy_of_the_downlink(room: Record, tmp_path: Path)
     with pytest.raises(InputError, match="position"):
         opened.predict(tx_pos_m=np.full((1, 3), np.nan), uplink=room.uplink[:1])
     with pytest.raises(InputError, match="another wavefront than free"):
-        wrf_mi.train(room, tmp_path / "free", "r2f2", scene="laboratory", settings=["wavefront=free"])
+        wrf_mi.train(room, "r2f2", out=tmp_path / "free", scene="laboratory", settings=["wavefront=free"])

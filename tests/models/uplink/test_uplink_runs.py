@@ -64,7 +64,7 @@ def turned(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_channels_of_an_array_are_scored_over_antennas_and_subcarriers(csi_folder: Path, tmp_path: Path) -> None:
-    out = train(csi_folder, tmp_path / "run", "idw").folder
+    out = train(csi_folder, "idw", out=tmp_path / "run").folder
     metrics, arrays, record = json.loads((out / "metrics.json").read_text()), stored(out), load(csi_folder)
     assert arrays["prediction"].shape == arrays["truth"].shape == (10, ANTENNAS, SUBCARRIERS)
     error = np.square(np.abs(arrays["prediction"] - arrays["truth"])).sum(axis=(1, 2))
@@ -85,7 +85,7 @@ def test_methods_are_fitted_to_measurements_and_scored_by_the_truth(turned: None
     record = channels()
     measured = (record.observation * np.exp(0.1j)).astype(np.complex64)
     data = write_nerf2_csi(tmp_path / "noisy", replace(record, observation=measured, truth=record.observation))
-    metrics = train(data, tmp_path / "run", "turned").metrics
+    metrics = train(data, "turned", out=tmp_path / "run").metrics
     assert metrics["cea_db"]["median"] == pytest.approx(TURNED_DB, abs=1e-3)
     assert metrics["reference"]["uplink"]["median"] == pytest.approx(TURNED_DB, abs=1e-3)
 
@@ -97,13 +97,13 @@ def test_receivers_and_antennas_are_distinguished(tmp_path: Path) -> None:
     two = replace(one, receivers=stations, observation=one.observation.repeat(2, 0))
     single = replace(two, observation=two.observation[:, :, 0], uplink=two.uplink[:, :1])
     for record, shape in ((one, (1, 10, 3, 4)), (two, (2, 10, 3, 4)), (single, (2, 10, 4))):
-        run = read_run(train(record, tmp_path / "x".join(map(str, shape)), "idw").folder)
+        run = read_run(train(record, "idw", out=tmp_path / "x".join(map(str, shape))).folder)
         assert (run.prediction.shape, run.score.shape) == (shape, shape[:2])
 
 
 def test_uplink_predicts_without_positions(turned: None, tmp_path: Path, capsys) -> None:
     data = write_nerf2_csi(tmp_path / "unplaced", channels(positions=False))
-    out = train(data, tmp_path / "run", "turned").folder
+    out = train(data, "turned", out=tmp_path / "run").folder
     metrics, arrays = json.loads((out / "metrics.json").read_text()), stored(out)
     assert metrics["cea_db"]["median"] > 100  # exact but for single precision
     assert list(metrics["reference"]) == ["uplink"]
@@ -125,7 +125,7 @@ def test_uplink_predicts_without_positions(turned: None, tmp_path: Path, capsys)
 
 
 def test_invalid_uplinks_of_predictions_are_refused(flat_folder, csi_folder, tmp_path: Path, capsys) -> None:
-    run, placed = (train(data, tmp_path / name, name) for data, name in ((flat_folder, "mri"), (csi_folder, "idw")))
+    run, placed = (train(data, name, out=tmp_path / name) for data, name in ((flat_folder, "mri"), (csi_folder, "idw")))
     good = np.ones((2, ANTENNAS, SUBCARRIERS), np.complex64)
     broken = good.copy()
     broken[1, 0, 0] = np.nan + 1j
@@ -169,7 +169,7 @@ BAD_CHANNELS: dict[str, Changed] = {
 @pytest.mark.parametrize("message", BAD_CHANNELS)
 def test_invalid_channels_are_refused(message: str, turned: None, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message) as error:
-        train(replace(CSI, **BAD_CHANNELS[message]), tmp_path / "run", "turned")
+        train(replace(CSI, **BAD_CHANNELS[message]), "turned", out=tmp_path / "run")
     assert "\n" not in str(error.value)
     assert not (tmp_path / "run").exists()
 
@@ -204,6 +204,6 @@ def test_strengths_are_refused_with_their_file(
     monkeypatch.setattr("wrf_mi.datasets.observations.ROWS_PER_CHUNK", 7)  # the rows come in parts
     record = load(flat_folder)
     with pytest.raises(InputError, match=message.format(folder=re.escape(str(flat_folder)))) as error:
-        train(replace(record, **changed(record, "observation", where, value)), tmp_path / "run", model, split=split)
+        train(replace(record, **changed(record, "observation", where, value)), model, out=tmp_path / "run", split=split)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "run").exists()

@@ -1,0 +1,131 @@
+"""Scenes as objects: made from scans or plans, corrected by measurements, edited and traced.
+
+>>> import wrf_mi
+>>> room = wrf_mi.Scene.open("laboratory")
+>>> traced = room.trace("laboratory", n_train=20, settings={"depth": 1})
+>>> sorted(traced.predict([[2.2, 3.0, 1.7]]).mean.shape)
+[1, 90, 360]
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..core import InputError, Record, Split
+from ..core.registry import resolve
+from ..correction import CorrectionOptions, correct_scene, write_page
+from ..correction.options import OnStage
+from ..datasets.splits import single_split
+from ..scene.correction_data import FILE
+from ..scene.edit import Move, edit_scene
+from ..scene.make import make_scene
+from ..synthetic import load_record
+
+if TYPE_CHECKING:
+    from .run import Run
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene to trace.
+
+    Scenes that are made without ``out`` lie in a temporary folder, which is removed with the object.
+
+    Attributes:
+        folder: scene folder, or name, Mitsuba XML or mesh of one that was opened.
+    """
+
+    folder: Path
+
+    @classmethod
+    def open(cls, scene: str | Path) -> Scene:
+        """A scene by name, folder, Mitsuba XML or mesh, which is read where it is used."""
+        return cls(Path(scene))
+
+    @classmethod
+    def from_scan(
+        cls, points: str | Path | Sequence[str | Path], out: str | Path | None = None, **options: Any
+    ) -> Scene:
+        """Make a scene from a 3D scan or mesh; options and errors of `wrf_mi.scene.make.make_scene`."""
+        place = _new_folder(out)
+        make_scene(points, place, **options)
+        return cls(place)._owned(out)
+
+    @classmethod
+    def from_plan(cls, plan: str | Path, height_m: float, out: str | Path | None = None, **options: Any) -> Scene:
+        """Make a scene from a plan in two dimensions, with walls of a height; options as those of `from_scan`."""
+        return cls.from_scan(plan, out, height_m=height_m, **options)
+
+    def correct(
+        self,
+        data: str | Path | Record,
+        out: str | Path | None = None,
+        *,
+        split: str | Split | None = None,
+        n_train: int | float | None = None,
+        seed: int = 0,
+        options: CorrectionOptions | None = None,
+        material: str | None = None,
+        on_stage: OnStage = lambda what, share: None,
+    ) -> Scene:
+        """The scene with planes and materials fitted to the training rows of measurements.
+
+        Args:
+            data: name or folder of a data set, or a loaded record.
+            out: scene folder to make.
+            split: name of a split, or its rows; None: the data's own, or else all rows.
+            n_train: number or fraction of the training rows to use; None: all.
+            seed: seed of split and held-out rows.
+            options: what may change; None: by the kind of measurements.
+            material: radio material of a bare mesh.
+            on_stage: called as the correction goes on.
+
+        Raises:
+            InputError: data or a scene that cannot be used, or a folder that exists.
+        """
+        record = data if isinstance(data, Record) else load_record(str(data))
+        rows = split if isinstance(split, Split) else single_split(record, split, seed, n_train)
+        place = _new_folder(out)
+        write_page(correct_scene(self.folder, record, rows, options, material, on_stage), place)
+        return Scene(place)._owned(out)
+
+    @property
+    def correction(self) -> dict[str, Any] | None:
+        """Facts of the correction that made the scene, as on its page; None: made by no correction."""
+        file = self.folder / FILE
+        return dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else None
+
+    def edit(self, moves: Sequence[Move] = (), remove: Sequence[str] = (), out: str | Path | None = None) -> Scene:
+        """The scene with parts moved or removed; errors of `wrf_mi.scene.edit.edit_scene`."""
+        place = _new_folder(out)
+        edit_scene(self.folder, place, moves, remove)
+        return Scene(place)._owned(out)
+
+    def trace(self, data: str | Path | Record, out: str | Path | None = None, **options: Any) -> Run:
+        """Ray tracing in the scene as a run, scored on the test rows of the data; options of `wrf_mi.train`."""
+        run: Run = resolve("wrf_mi.runs.api:train")(data, "ray-tracing", self, out=out, **options)
+        return run
+
+    def view(self, *more: Any, **options: Any) -> Any:
+        """Interactive 3D view of the scene and of ``more``, such as runs; options of `wrf_mi.viewer.view.view`."""
+        return resolve("wrf_mi.viewer.view:view")(self.folder, *more, **options)
+
+    def _owned(self, out: str | Path | None) -> Scene:
+        if out is None:
+            weakref.finalize(self, shutil.rmtree, self.folder.parent, ignore_errors=True)
+        return self
+
+
+def _new_folder(out: str | Path | None) -> Path:
+    """A folder that does not exist yet; `InputError`: it does."""
+    place = Path(tempfile.mkdtemp(prefix="wrf-mi-")) / "scene" if out is None else Path(out)
+    if place.exists():
+        raise InputError(f"{place}: exists; remove it, or choose another folder")
+    return place
