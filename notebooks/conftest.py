@@ -1,4 +1,4 @@
-"""Notebooks that need a package which is no dependency are skipped where it is absent (``requires`` in their metadata)."""
+"""Notebooks whose metadata name packages beside the dependencies (``requires``) are skipped where one is absent."""
 
 from __future__ import annotations
 

@@ -3,9 +3,9 @@
 Before the sources are read, each notebook of ``notebooks/`` is executed and written with its outputs to
 ``docs/notebooks/``, which git ignores. Executions are kept in ``docs/_build/executed`` by a digest of the notebook's
 code, the package's code without docstrings, the versions and the data sets on this machine, so that only what has
-changed is executed again. ``-D execute_notebooks=0`` shows stored executions and, where there is none, the notebook as it
-is: the code, and outputs of notebooks that need a package which is no dependency (``requires`` in their metadata). Where
-such a package is absent they are not executed.
+changed is executed again. ``-D execute_notebooks=0`` shows stored executions and, where there is none, the notebook as
+it is: the code, with the stored outputs of notebooks whose metadata name packages beside the dependencies
+(``requires``). These are not executed where such a package is absent.
 """
 
 from __future__ import annotations
