@@ -3,8 +3,9 @@
 Before the sources are read, each notebook of ``notebooks/`` is executed and written with its outputs to
 ``docs/notebooks/``, which git ignores. Executions are kept in ``docs/_build/executed`` by a digest of the notebook's
 code, the package's code without docstrings, the versions and the data sets on this machine, so that only what has
-changed is executed again. ``-D execute_notebooks=0`` shows stored executions and, where there is none, the code without
-outputs.
+changed is executed again. ``-D execute_notebooks=0`` shows stored executions and, where there is none, the notebook as
+it is: the code, with the stored outputs of notebooks whose metadata name packages beside the dependencies
+(``requires``). These are not executed where such a package is absent.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import io
 import json
 import re
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,7 @@ GALLERY_ORDER = (
     "rssi_and_csi",
     "what_the_array_sees",
     "own_model_and_plugin",
+    "pytorch_field",
     "run_as_mitsuba_scene",
     "run_time_against_error",
 )
@@ -66,7 +69,7 @@ def write_notebook_pages(app: Sphinx) -> None:
     common = _common() if execute or any(kept.glob("*.ipynb")) else ""
     stored = {path: kept / f"{path.stem}-{_key(path, common)}.ipynb" for path in paths}
     if execute:
-        _execute([(path, stored[path]) for path in paths if not stored[path].exists()])
+        _execute([(path, stored[path]) for path in paths if not stored[path].exists() and _executable(path)])
     target.mkdir(exist_ok=True)
     cards = []
     for path in paths:
@@ -109,6 +112,12 @@ def _code(file: Path) -> str:
 def _is_text(node: ast.stmt) -> bool:
     """Whether a statement is a string alone: a docstring of a module, class, function or constant."""
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+
+
+def _executable(path: Path) -> bool:
+    """Whether the packages that a notebook requires beside the dependencies are installed."""
+    required = json.loads(path.read_text(encoding="utf-8"))["metadata"].get("requires", ())
+    return all(find_spec(name) is not None for name in required)
 
 
 def _key(path: Path, common: str) -> str:

@@ -16,7 +16,6 @@ coefficient from the user to the base station, as in the other layouts.
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,9 +34,8 @@ from ..core.array_files import stored_array, stored_arrays
 from ..core.files import readable, text_lines
 from ..core.settings import CheckedSettings, Positive, settings_from
 from ..core.yaml_files import read_yaml
-from ..parallel import run_module
 from .folder_files import data_folder, fits_single, numbers_of, read_official, shown
-from .read_mat import FAULT
+from .read_mat import FAULT, mat_arrays
 
 CHANNEL_PARAMS = "channel_params.yml"  # file of a scenario's folder that selects what is computed; optional
 MAX_NUMBER, MAX_ELEMENTS = 1 << 20, 1 << 10  # most subcarriers, and most elements of an array along one axis
@@ -50,7 +48,6 @@ PATH_MATRICES = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_e
 """Matrices [users, paths]: dBW, degrees, seconds; azimuths and zenith angles in degrees. NaN: no path."""
 TEST_FRACTION = 0.2  # share of the users with a path in the official test rows
 SPLIT_SEED = 0
-MAT_S, MAT_BYTES_PER_S = 30.0, 1 << 20  # time that the process which reads MAT files has
 VALUES_PER_CHUNK = 1 << 20  # complex values of the largest array in a chunk of users
 Pattern = Literal["isotropic", "halfwave-dipole"]
 """DeepMIMO's names of antenna patterns."""
@@ -320,7 +317,7 @@ def _matrices(folder: Path, pair: str) -> dict[str, NDArray[Any]]:
         files[key] = next(filter(Path.exists, (Path(f"{stem}{suffix}") for suffix in SUFFIXES)), stem)
         if files[key] == stem:
             raise InputError(f"{stem}: no {', '.join(SUFFIXES)} file of that name; fetch the scenario again")
-    of_mat = _mat_arrays(files)
+    of_mat = mat_arrays(files, "fetch the scenario again")
     matrices = {}
     for key, file in files.items():
         with readable(file, "", "fetch the scenario again"):
@@ -338,22 +335,6 @@ def _matrix(file: Path, key: str, of_mat: Mapping[str, NDArray[Any]]) -> NDArray
     if fault := of_mat.get(f"{FAULT}{key}"):
         raise ValueError(str(fault))
     return of_mat.get(key)
-
-
-def _mat_arrays(files: Mapping[str, Path]) -> dict[str, NDArray[Any]]:
-    """Arrays of those files that are MAT files by their keys, and messages of those that cannot be read."""
-    files = {key: file for key, file in files.items() if file.suffix == ".mat"}
-    if not files:
-        return {}
-    with tempfile.TemporaryDirectory() as place:
-        out = Path(place) / "arrays.npz"
-        stated = [f"{key}={file}" for key, file in files.items()]
-        seconds = MAT_S + sum(file.stat().st_size for file in files.values()) / MAT_BYTES_PER_S
-        status, _ = run_module("wrf_mi.datasets.read_mat", [str(out), *stated], quiet=True, most_s=seconds)
-        if status != 0:
-            first = next(iter(files.values()))
-            raise InputError(f"{first}: it, or a matrix beside it, is damaged; fetch the scenario again")
-        return stored_arrays(out)
 
 
 def _channels(

@@ -249,7 +249,7 @@ def _read_images(folder: Path, poses: dict[str, dict[Any, Any]], rows: int) -> N
     for receiver, place in enumerate([folder] if len(poses) == 1 else [folder / name for name in poses]):
         for row, image in _images(place, rows).items():
             with recoverable():
-                grey = _read_grey(image, row, None if observation is None else observation.shape[2:])
+                grey = read_grey(image, row, None if observation is None else observation.shape[2:])
                 if observation is None:
                     what = f"{folder}: {len(poses) * rows} spectra of {grey.shape[1]} x {grey.shape[0]} pixels"
                     needed = 4 * len(poses) * rows * grey.size
@@ -278,7 +278,8 @@ def _images(place: Path, rows: int) -> dict[int, Path]:
     return {row: place / image for image, row in row_of.items() if image in present}
 
 
-def _read_grey(path: Path, row: int, size: tuple[int, ...] | None) -> NDArray[np.float32]:
+def read_grey(path: Path, row: int, size: tuple[int, ...] | None) -> NDArray[np.float32]:
+    """Grey values [height, width] in 0..1 of a row's picture (InputError: unreadable, or another ``size`` or mode)."""
     try:
         with open_picture(path, MOST_PIXELS) as image:
             if size is not None and image.size != size[::-1]:

@@ -22,6 +22,7 @@ from ..synthetic import load_record
 from ..tasks import TASKS
 from .evaluate import Scores, evaluate, pool, write_results
 from .folder import RunConfig, check_new, clear_begun, start_run
+from .released_outputs import read_released
 from .run import Run
 
 REMEDY = "store row [m] and prediction [n_rx, m, ...] as predictions.npz of a run has them"
@@ -47,8 +48,9 @@ def score_predictions(
             `wrf_mi.core.Record` has observations, and ``row`` [m], rows of the data set from 0, or ``tx_pos`` [m, 3],
             metres; optionally ``std`` of the same shape, ``receiver_name`` [n_rx], ``train_seconds``,
             ``ms_per_sample`` and ``peak_memory_mb``. Of signal strengths also a ``.csv`` with columns ``row``, or
-            ``x``, ``y``, ``z``, and ``<receiver>_dbm`` and optionally ``<receiver>_std_db`` of each receiver. Rows
-            beside the test rows are ignored.
+            ``x``, ``y``, ``z``, and ``<receiver>_dbm`` and optionally ``<receiver>_std_db`` of each receiver. Also what
+            the test scripts of NeRF2 and WRF-GS+ write: a folder of plots of spectra, ``result.txt`` or ``result.mat``
+            (`wrf_mi.runs.released_outputs`). Rows beside the test rows are ignored.
         out: run folder to make; must not exist or be empty.
         name: name of the model, for tables and legends; none of this package's.
         split: split on whose test rows the predictions are scored; they must not have been trained on.
@@ -67,7 +69,7 @@ def score_predictions(
     splits = make_splits(record, split, seed, n_train)
     path, folder = Path(predictions), Path(out)
     check_new(folder)
-    arrays = _read_csv(path, record) if path.suffix.lower() == ".csv" else _read_npz(path, record)
+    arrays = _read(path, record)
     place = _places(path, arrays, record, np.unique(np.concatenate([part.test for part in splits])))
 
     def predict(rows: IntArray, receiver: int) -> Prediction:
@@ -87,6 +89,12 @@ def score_predictions(
         start_run(folder, config, splits)
         write_results(folder, header | metrics | costs, scored)
     return Run(folder, record)
+
+
+def _read(path: Path, record: Record) -> dict[str, NDArray[Any]]:
+    if path.is_dir() or path.suffix.lower() in (".txt", ".mat"):
+        return read_released(path, record)
+    return _read_csv(path, record) if path.suffix.lower() == ".csv" else _read_npz(path, record)
 
 
 def _read_npz(path: Path, record: Record) -> dict[str, NDArray[Any]]:
@@ -160,8 +168,10 @@ def _places(path: Path, arrays: dict[str, NDArray[Any]], record: Record, test: I
     if len(missing):
         text = f"{len(missing)} of the {len(test)} test rows have no prediction (first: row {missing[0]})"
         raise InputError(f"{path}: {text}; predict them all")
-    values = arrays["prediction"][:, place[test]].reshape(len(arrays["prediction"]), len(test), -1)
-    broken = np.flatnonzero(~np.isfinite(values).all(axis=(0, 2)))
+    values = arrays["prediction"][:, place[test]]
+    # What was not received is not scored, and need not be predicted.
+    needed = np.isfinite(record.scored[:, test])
+    broken = np.flatnonzero((needed & ~np.isfinite(values)).reshape(*needed.shape[:2], -1).any(axis=(0, 2)))
     if len(broken):
         raise InputError(f"{path}: the prediction of row {test[broken[0]]} is not finite; correct it")
     return place
