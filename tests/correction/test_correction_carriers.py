@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from correction_rooms import CARRIER_HZ, TRUE_MATERIALS, channels, stated_scene
 
-from wrf_mi.core import Record
+from wrf_mi.core import Antenna, Record
 from wrf_mi.correction import CorrectionOptions, correct_scene, write_page
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.state import ABSENT, ABSENT_VALUES, ScenePosterior, State, material_places
@@ -74,6 +74,18 @@ def test_residuals_are_those_of_each_carrier_alone(truth):
         single = Misfit(alone, rows[which], Prepared(open_scene(scene, carrier_hz)), OPTIONS)
         assert not single.several_carriers
         np.testing.assert_allclose(residual[which], single.residual(single.start), atol=ROUNDING_DB)
+
+
+def test_antennas_of_transmitters_are_those_of_the_record(truth):
+    """Of horizontal dipoles, with which paths of vertical antennas have other powers."""
+    scene, record = truth
+    rows, hz = np.arange(20), np.array([CARRIER_HZ])
+    vertical = Record("made-up", "rssi", record.tx_pos_m[rows], record.receivers, np.zeros((1, 20)), frequencies_hz=hz)
+    horizontal = replace(vertical, tx_antenna=Antenna("dipole", "H"))
+    powers = RayTracer(scene, instrument_of(horizontal), TRACE)(vertical.tx_pos_m).astype(np.float32)
+    for stated, below in ((horizontal, True), (vertical, False)):
+        misfit = Misfit(replace(stated, observation=powers), rows, Prepared(open_scene(scene, CARRIER_HZ)), OPTIONS)
+        assert (np.abs(misfit.residual(misfit.start)).max() < ROUNDING_DB) == below
 
 
 def test_paths_are_searched_once_for_all_carriers(truth, searches):

@@ -1,6 +1,7 @@
 """The layout of the BLE signal-strength data: what is read, and every way in which a folder can be wrong."""
 
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from spectrum_records import assert_same
 
 from wrf_mi.core import Antenna
 from wrf_mi.datasets import load, make_splits, read_ble_folder, write_ble_folder
+from wrf_mi.datasets.spectrum_folder import read_spectrum_folder, write_spectrum_folder
 
 FLOAT32 = 1e-5
 """Rounding of powers of tens of dBm to float32."""
@@ -182,11 +184,39 @@ def test_antennas_are_read(tmp_path: Path):
     assert record.tx_antenna == Antenna("iso", "H")
 
 
+def test_patterns_are_files_of_the_folder(tmp_path: Path):
+    """By paths relative to it, in strengths and spectra; folders that are written hold copies."""
+    folder, pattern = (
+        write_flat(tmp_path / "own"),
+        "theta,phi,gain_db\n"
+        + "".join(f"{theta},{phi},{-1 - (theta > 90)}\n" for theta in range(0, 181, 30) for phi in range(0, 360, 60)),
+    )
+    (folder / "antennas").mkdir()
+    (folder / "antennas" / "a.csv").write_text(pattern)
+    record = read_ble_folder(with_columns(folder, pattern=["antennas/a.csv", ""], tx_pattern=["antennas/a.csv"] * 2))
+    assert (record.receivers[0].antenna.pattern, record.tx_antenna.frame) == (str(folder / "antennas/a.csv"), "world")
+    assert record.receivers[0].antenna.measured.peak_dbi == -1
+    copied = read_ble_folder(write_ble_folder(tmp_path / "copy", record))
+    shutil.rmtree(folder)
+    images = replace(copied, task="spectrum", observation=np.zeros((2, len(copied), 3, 6)), n_readings=None, std=None)
+    unstated = {"tx_heading_rad": None, "official": None, "runs": None}
+    spectra = read_spectrum_folder(write_spectrum_folder(tmp_path / "spectra", replace(images, **unstated)))
+    for again in (copied, spectra):
+        for antenna, first in zip(antennas_of(again), antennas_of(record), strict=True):
+            assert replace(antenna, pattern="iso", digest="") == replace(first, pattern="iso", digest="")
+            assert antenna.digest == first.digest
+
+
+def antennas_of(record):
+    return [record.tx_antenna, *(receiver.antenna for receiver in record.receivers)]
+
+
 WRONG |= {
     f"antenna: {message}": (lambda folder, columns=columns: with_columns(folder, **columns), "anchors.csv", message)
     for columns, message in (
         ({"pattern": ["iso", "horn"]}, "row 2: antenna: pattern is 'horn'; choose from"),
         ({"polarization": ["vertical", "V"]}, "row 1: antenna: polarization is 'vertical'; choose from V, H"),
+        ({"pattern": ["none.msi", "iso"]}, r"row 1: antenna: .*/none\.msi: no such file or folder; restore it"),
         ({"tx_pattern": ["dipole", "iso"]}, "row 2: tx_pattern or tx_polarization differs from row 1"),
     )
 }

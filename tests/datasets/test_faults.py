@@ -127,7 +127,8 @@ def test_every_faulty_field_is_collected_once(tmp_path: Path) -> None:
     (folder / ble.TRAIN_FILE).write_text(header + train)
     (folder / ble.TEST_FILE).write_text(header + "0,0,-50,-60,2,3\n")
     assert sorted(line.partition(f"{folder}/")[2] for line in lines(folder)) == [
-        "anchors.csv: row 1: antenna: pattern is 'star'; choose from iso, dipole, hw_dipole, tr38901",
+        "anchors.csv: row 1: antenna: pattern is 'star'; choose from iso, dipole, hw_dipole, tr38901, or a file *.csv, "
+        "*.msi, *.pln",
         "anchors.csv: row 2: x is 'far'; give a finite number, or leave it empty",
         f"{ble.TRAIN_FILE}: row 2: count_3 is 'many'; give a finite number, or leave it empty",
         f"{ble.TRAIN_FILE}: row 2: rssi_1 is 'd'; give a finite number, or leave it empty",

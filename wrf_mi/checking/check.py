@@ -13,6 +13,7 @@ from ..datasets.faults import collect_faults
 from ..datasets.registry import find, known, locate
 from ..models.checks import check_parts
 from ..synthetic import load_record
+from .antennas import antenna_notes
 from .directions import spectrum_axes
 from .plans import distance_law
 from .rows import constant_observations, few_rows, not_heard, repeated_observations, repeated_rows, single_position
@@ -176,7 +177,8 @@ def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progr
         return DataReport(name, source, None, tuple(faults), ())
     suspicions = tuple(Suspicion(name, text) for name, text in _suspected(record, ignore) if name not in ignore)
     note = far_from_origin(record)
-    return DataReport(name, record.source, record, (), suspicions, () if note is None else (note,))
+    notes = *([] if note is None else [note]), *antenna_notes(record)
+    return DataReport(name, record.source, record, (), suspicions, notes)
 
 
 def _suspected(record: Record, ignore: Collection[str]) -> Found:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,8 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--strict", action="store_true", help="exit status 1 if there is a suspicion")
     text = "suspicion that is not reported, see docs/data.md; repeatable"
     parser.add_argument("--ignore", action="append", default=[], metavar="NAME", help=text)
+    text = "draw each measured antenna pattern into a PNG file in this folder"
+    parser.add_argument("--antennas", metavar="FOLDER", help=text)
 
 
 def _add_import(data: Any) -> None:
@@ -157,7 +160,15 @@ def check_command(a: Arguments) -> int:
     from ..checking import check_data
 
     report = check_data(a.dataset, a.ignore, progress=True)
-    show(a.json, report.as_dict(), "\n".join(report.lines()))
+    facts, lines = report.as_dict(), report.lines()
+    if a.antennas is not None and report.record is not None:
+        from ..checking.antennas import draw_antennas
+
+        facts["pictures"] = [str(file) for file in draw_antennas(report.record, Path(a.antennas))]
+        if not facts["pictures"]:
+            raise InputError(f"{a.dataset}: no measured antenna pattern; omit --antennas")
+        lines = [*facts["pictures"], *lines]
+    show(a.json, facts, "\n".join(lines))
     return exit_status(report.ok, a.strict and report.suspicions)
 
 
@@ -189,7 +200,7 @@ def summary(record: Record) -> dict[str, Any]:
         "carriers_hz": _counts(record.carriers_hz),
         "receiver_carriers_hz": None if hz_of is None else {r.name: r.frequency_hz for r in record.receivers},
         "folds": None if record.folds is None else np.bincount(record.folds).tolist(),
-        "antennas": sorted({f"{r.antenna.pattern} {r.antenna.polarization}" for r in record.receivers}),
+        "antennas": sorted({f"{Path(a.pattern).name} {a.polarization}" for a in (r.antenna for r in record.receivers)}),
         "runs": _counts(record.runs),
         "n_readings": _range(record.n_readings, received),
         "std_db": _range(record.std, received),

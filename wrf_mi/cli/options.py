@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any, NoReturn, get_args
 
-from ..core import InputError
+from ..core import AntennaOptions, InputError
 from ..core.antenna import FRAMES, OMNIDIRECTIONAL, PATTERNS, POLARIZATIONS
 from ..graph.settings import EvaluationName
 from ..models import MODELS
@@ -71,7 +72,7 @@ def add_training(parser: argparse.ArgumentParser) -> None:
 
 
 def add_tracing(parser: argparse.ArgumentParser) -> None:
-    """Add options of ray tracing and antennas."""
+    """Add options of ray tracing and of antennas."""
     add = parser.add_argument
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
     kinds = "line-of-sight,reflection,transmission,diffraction,scattering"
@@ -83,14 +84,27 @@ def add_tracing(parser: argparse.ArgumentParser) -> None:
     fit = "what to train on the training rows, separated by commas: gain, materials, planes, patterns, pose, surface"
     add("--calibrate", metavar="LIST", help=fit)
     add("--rays", metavar="N", help="number of rays from each source, or auto: until no more paths are found")
+    add_antennas(parser)
+
+
+def add_antennas(parser: argparse.ArgumentParser) -> None:
+    """Add options of antennas that override the data set, fields of `AntennaOptions`."""
+    add = parser.add_argument
     default = "overrides the data set, whose default is"
-    add("--rx-pattern", choices=PATTERNS, help=f"pattern of the receivers' antennas; {default} iso")
+    text = f"pattern of the receivers' antennas: {', '.join(PATTERNS)} or a file (docs/data.md)"
+    add("--rx-pattern", metavar="PATTERN", help=f"{text}; {default} iso")
     text = f"polarisation of the receivers' antennas; {default} V, vertical in --rx-frame"
     add("--rx-polarization", choices=POLARIZATIONS, help=text)
     text = f"frame of pattern and polarisation, the world's or the array's; {default} world"
     add("--rx-frame", choices=FRAMES, help=text)
-    add("--tx-pattern", choices=OMNIDIRECTIONAL, help="pattern of the transmitter's antenna")
+    text = f"pattern of the transmitter's antenna: {', '.join(OMNIDIRECTIONAL)} or a file"
+    add("--tx-pattern", metavar="PATTERN", help=text)
     add("--tx-polarization", choices=POLARIZATIONS, help="polarisation of the transmitter's antenna")
+
+
+def antenna_options(a: Arguments) -> AntennaOptions:
+    """The options of `add_antennas`."""
+    return AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)})
 
 
 def add_n_train(parser: argparse._ActionsContainer) -> None:

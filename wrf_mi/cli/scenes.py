@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core import InputError
-from .options import DATASET, Arguments, add_command, add_n_train
+from .options import DATASET, Arguments, add_antennas, add_command, add_n_train, antenna_options
 from .output import Watch, show
 
 if TYPE_CHECKING:
@@ -95,6 +95,7 @@ def _add_correct(commands: Any) -> None:
     add("--rays", type=int, metavar="N", help="number of rays from each receiver (default: 65536)")
     add("--shift-sd", type=float, metavar="M", help="standard deviation of a plane's stated position (default: 0.02 m)")
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
+    add_antennas(parser)
     add("--split", help="as for train; test rows are not used")
     add_n_train(parser)
     add("--seed", type=int, default=0, metavar="N", help="seed of split and held-out rows (default: 0)")
@@ -110,7 +111,7 @@ def correct_command(a: Arguments) -> int:
 
     if Path(a.out).exists() and not a.replace:  # before the work, not after it
         raise InputError(f"{a.out}: exists; remove it, choose another folder, or give --replace")
-    record = load_record(a.dataset, progress=sys.stderr.isatty())
+    record = load_record(a.dataset, progress=sys.stderr.isatty()).with_antennas(antenna_options(a))
     options, split = _correction_options(a, record), single_split(record, a.split, a.seed, a.n_train)
     warn_of_suspicions(record)
     with Watch() as watch:

@@ -5,14 +5,23 @@ from __future__ import annotations
 import json
 import sys
 from contextlib import suppress
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..backend import init
-from ..core import AntennaOptions, InputError
+from ..core import InputError
 from ..core.yaml_files import read_yaml
-from .options import DATASET, Arguments, Parser, add_command, add_n_train, add_scheduler, add_tracing, add_training
+from .options import (
+    DATASET,
+    Arguments,
+    Parser,
+    add_command,
+    add_n_train,
+    add_scheduler,
+    add_tracing,
+    add_training,
+    antenna_options,
+)
 from .output import Watch, show, show_metrics
 
 if TYPE_CHECKING:
@@ -94,8 +103,7 @@ def training_request(a: Arguments) -> RunRequest:
         "preset",
     )
     stated = {name: getattr(a, name) for name in names} | {"split": a.split, "seed": a.seed or 0}
-    antennas = AntennaOptions(**{field.name: getattr(a, field.name) for field in fields(AntennaOptions)})
-    return RunRequest(model, settings=settings, antennas=antennas, **stated)
+    return RunRequest(model, settings=settings, antennas=antenna_options(a), **stated)
 
 
 def _stages(a: Arguments, model: str) -> list[str]:

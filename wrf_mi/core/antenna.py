@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .angles import FloatArray, rotation_matrix
+from .digest import content_digest
 from .errors import InputError
+from .measured_pattern import MeasuredPattern
+from .pattern_files import PATTERN_FILES, read_pattern
+
+logger = logging.getLogger(__name__)
 
 OMNIDIRECTIONAL = ("iso", "dipole", "hw_dipole")
 """Sionna RT's antenna patterns without dependence on azimuth: isotropic, short and half-wave dipole."""
@@ -21,6 +29,24 @@ FRAMES = ("world", "array")
 # Arrays of a Sionna RT device lie in y-z with boresight +x: array x = device y, array y = device z, array z = device x.
 DEVICE_TO_ARRAY = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion of a frame parallel to the world's
+LEAST_EFFICIENCY = 0.1
+"""Least efficiency without a warning: small phones have more, gains relative to a beam's maximum seem to have less."""
+
+
+def pattern_path(pattern: object, folder: Path = Path()) -> Path | None:
+    """Absolute path of a pattern that is a file, relative to a folder; None: not a file."""
+    if not isinstance(pattern, str) or not pattern.lower().endswith(PATTERN_FILES):
+        return None
+    return (folder / Path(pattern).expanduser()).absolute()
+
+
+@lru_cache(maxsize=64)
+def _measured(path: Path, _digest: str) -> MeasuredPattern:
+    """The pattern of a file of this content: receivers share it."""
+    pattern = read_pattern(path)
+    if pattern.efficiency < LEAST_EFFICIENCY:
+        logger.warning("%s: %s; gains relative to the maximum? give them in dBi", path, pattern)
+    return pattern
 
 
 def boresight_orientation(azimuth_rad: float, downtilt_rad: float = 0.0) -> FloatArray:
@@ -52,23 +78,38 @@ class Antenna:
     direction of propagation and leaves the pattern's amplitude as it is (model 2 of 3GPP TR 38.901, section 7.3.2).
 
     Attributes:
-        pattern: name in `PATTERNS`.
+        pattern: name in `PATTERNS`, or path of a file with a measured pattern (`wrf_mi.core.pattern_files`).
         polarization: ``"V"``: along the unit vector of the zenith angle; ``"H"``: along the unit vector of the azimuth.
         frame: ``"world"``: the antenna's z axis is the world's, for any orientation of the array. ``"array"``: its z
             axis is the array's y axis, its boresight the array's normal.
+        digest: of a measured pattern's file, set from it; empty of other patterns.
 
     Raises:
-        InputError: an unknown name, or a directional pattern without orientation.
+        InputError: an unknown name, a directional pattern without orientation, or a file that is missing, wrong, or not
+            the one of the digest.
     """
 
     pattern: str = "iso"
     polarization: str = "V"
     frame: str = "world"
+    digest: str = ""
+
+    measured: ClassVar[MeasuredPattern | None] = None
+    """The pattern of the file, of instances; None: a pattern of Sionna RT."""
 
     def __post_init__(self) -> None:
+        path = pattern_path(self.pattern)
         for name, known in (("pattern", PATTERNS), ("polarization", POLARIZATIONS), ("frame", FRAMES)):
-            if (value := getattr(self, name)) not in known:
-                raise InputError(f"antenna: {name} is {str(value)[:40]!r}; choose from {', '.join(known)}")
+            if (value := getattr(self, name)) not in known and (name != "pattern" or path is None):
+                text = f"antenna: {name} is {str(value)[:40]!r}; choose from {', '.join(known)}"
+                raise InputError(text + f", or a file *{', *'.join(PATTERN_FILES)}" * (name == "pattern"))
+        if path is not None:
+            digest = content_digest(path)
+            if self.digest not in ("", digest):
+                raise InputError(f"{path}: changed since this antenna was stated; restore it, or state it anew")
+            # Attributes of a frozen class: the path from anywhere, and what equality and digests depend on.
+            for name, content in (("pattern", str(path)), ("digest", digest), ("measured", _measured(path, digest))):
+                object.__setattr__(self, name, content)
         if self.pattern == "tr38901" and self.frame == "world":
             text = "antenna: pattern tr38901 has a boresight, which the frame world does not tell; state frame array "
             text += "(--rx-frame array), for anchors azimuth_deg, or for transmitters one of "
@@ -87,16 +128,22 @@ class Antenna:
         """The antenna of an array with an orientation (unit quaternion, array's frame to world)."""
         return MountedAntenna(self, self.to_world(orientation_xyzw))
 
-    def field(self, directions: ArrayLike) -> FloatArray:
-        """Real field vectors [..., 3] in directions [..., 3] (unit vectors), both in the antenna's own frame.
+    def field(self, directions: ArrayLike) -> NDArray[Any]:
+        """Field vectors [..., 3] in directions [..., 3] (unit vectors), both in the antenna's own frame.
 
+        Real, or of a pattern with a measured phase complex.
         Source: Sionna RT's antenna patterns; Balanis, "Antenna Theory" (1997), equations 4-26a and 4-84; 3GPP
         TR 38.901, table 7.3-1 and equations 7.3-4 and 7.3-5.
         """
-        return np.stack(self.components(np, *np.moveaxis(np.asarray(directions, float), -1, 0)), axis=-1)
+        parts = self.components(np, *np.moveaxis(np.asarray(directions, float), -1, 0))
+        real, *imaginary = (np.stack(part, axis=-1) for part in parts)
+        return real + 1j * imaginary[0] if imaginary else real
 
-    def components(self, arrays: Any, x: Any, y: Any, z: Any) -> list[Any]:
-        """Components of `field` for unit vectors, with derivatives where ``arrays`` is Dr.Jit in place of NumPy."""
+    def components(self, arrays: Any, x: Any, y: Any, z: Any, tables: list[Any] | None = None) -> list[list[Any]]:
+        """Components of `field` for unit vectors: of the real part and, of a measured phase, of the imaginary part.
+
+        Differentiable where ``arrays`` is Dr.Jit in place of NumPy; ``tables`` as of `MeasuredPattern.amplitude`.
+        """
         select = arrays.where if arrays is np else arrays.select
         square = x * x + y * y
         pole = square < POLE
@@ -105,7 +152,10 @@ class Antenna:
         cosine, sine, level = select(pole, 1.0, x * inverse), select(pole, 0.0, y * inverse), square * inverse
         unit = [z * cosine, z * sine, -level] if self.polarization == "V" else [-sine, cosine, 0 * z]
         if self.pattern == "iso":
-            return unit
+            return [unit]
+        if self.measured is not None:
+            angles = arrays.atan2(level, z), arrays.atan2(sine, cosine)
+            return [[part * axis for axis in unit] for part in self.measured.amplitude(arrays, *angles, tables)]
         if self.pattern == "dipole":
             amplitude = math.sqrt(1.5) * level  # directivity 1.5
         elif self.pattern == "hw_dipole":
@@ -115,7 +165,7 @@ class Antenna:
             angles = (arrays.atan2(level, z) - math.pi / 2) / WIDTH_RAD, arrays.atan2(sine, cosine) / WIDTH_RAD
             vertical, horizontal = (arrays.minimum(12 * angle * angle, 30.0) for angle in angles)
             amplitude = arrays.exp(math.log(10) / 20 * (8 - arrays.minimum(vertical + horizontal, 30.0)))
-        return [amplitude * part for part in unit]
+        return [[amplitude * part for part in unit]]
 
 
 @dataclass(frozen=True)
@@ -139,6 +189,11 @@ class AntennaOptions:
     tx_pattern: str | None = None
     tx_polarization: str | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("rx_pattern", "tx_pattern"):
+            if (path := pattern_path(getattr(self, name))) is not None:  # runs are opened from anywhere
+                object.__setattr__(self, name, str(path))
+
     def __bool__(self) -> bool:
         """Whether any attribute is stated."""
         return any(getattr(self, field.name) is not None for field in fields(self))
@@ -149,7 +204,8 @@ class AntennaOptions:
         `InputError`: names that `Antenna` refuses.
         """
         stated = {field.name[3:]: getattr(self, field.name) for field in fields(self) if field.name.startswith(end)}
-        return replace(antenna, **{name: value for name, value in stated.items() if value is not None})
+        stated = {name: value for name, value in stated.items() if value is not None}
+        return replace(antenna, **stated, **({"digest": ""} if "pattern" in stated else {}))
 
 
 AS_STATED = AntennaOptions()  # antennas as in the data

@@ -50,7 +50,7 @@ def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
 def receiver_arrays(receivers: Sequence[Receiver]) -> dict[str, NDArray[Any]]:
     """Arrays of n receivers by name.
 
-    Shapes, in the order below: [n]; [n, 3] metres; [n, 4]; [n, 3] attributes of the antennas; [n] number of elements of
+    Shapes, in the order below: [n]; [n, 3] metres; [n, 4]; [n, 4] attributes of the antennas; [n] number of elements of
     each array; [all, 3] positions of all elements in the receivers' frames, metres; [n] carriers in Hz, if stated.
     """
     names, positions_m, orientations, antennas, frequencies, arrays = zip(*map(STORED, receivers), strict=True)

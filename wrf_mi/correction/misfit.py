@@ -112,7 +112,8 @@ class Misfit:
         searched: MovedSearch | None = None,
         surfaces: tuple[IntArray, IntArray] | None = None,
     ) -> None:
-        self.record, self.rows, self._traced, self._task = record, rows, options.traced, task_of(record)
+        self.record, self.rows, self._task = record, rows, task_of(record)
+        self._traced = replace(options.traced, tx_antenna=record.tx_antenna)
         self.tables = prepared.tables(self._traced.materials)  # materials and planes of the scene
         placed = placed_receivers(record, by_uplink=False)
         # Receivers without any observation are not traced, though their parameters are entries of the vector: some

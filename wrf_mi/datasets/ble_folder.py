@@ -167,6 +167,7 @@ def write_ble_folder(
         parts = (np.arange(len(record)),) if record.official is None else record.official
         for names, rows in zip(file_names, parts, strict=True):
             write_csv(part / names[0], of_rows, zip(*(values[rows] for values in of_rows.values()), strict=True))
+        files.write_patterns(part, record)
         files.write_extra(part, extra)
     return Path(path)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..core import Antenna, DataFault, InputError, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
-from ..core.antenna import ANTENNA
+from ..core.antenna import ANTENNA, pattern_path
 from ..core.carriers import FREQUENCY
 from ..core.files import one_line, text_lines, write_csv
 from ..core.types import IntArray
@@ -100,11 +101,16 @@ def unit_quaternion(path: Path, name: str, value: object) -> FloatArray:
 def read_antenna(
     path: Path, name: str, value: object, words: tuple[str, ...] = ANTENNA_WORDS, row: int | None = None
 ) -> Antenna:
-    """An antenna from YAML: a mapping with some of ``words``, or None for the default; else an `InputError`."""
+    """An antenna from YAML: a mapping with some of ``words``, or None for the default; else an `InputError`.
+
+    A pattern that is a file is relative to the folder of ``path``.
+    """
     if value is None:
         return ANTENNA
     if not isinstance(value, dict) or not set(value) <= set(words):
         raise DataFault(path, f"{one_line(name)} is {shown(value)}; give some of {', '.join(words)}", row=row)
+    if (pattern := pattern_path(value.get("pattern"), path.parent)) is not None:
+        value = {**value, "pattern": str(pattern)}
     try:
         return Antenna(**value)
     except InputError as error:
@@ -117,9 +123,25 @@ def read_tx_antenna(path: Path, info: Mapping[Any, Any]) -> Antenna:
     return read_antenna(path, TX_ANTENNA, info.get(TX_ANTENNA), TX_ANTENNA_WORDS)
 
 
+def antenna_words(antenna: Antenna) -> dict[str, str]:
+    """Attributes of an antenna as files state them; a measured pattern is a file of `write_patterns`."""
+    words = {word: getattr(antenna, word) for word in ANTENNA_WORDS}
+    if antenna.measured is not None:
+        path = Path(antenna.pattern)
+        words["pattern"] = f"{path.stem}-{antenna.digest[:8]}{path.suffix}"  # files of equal names may differ
+    return words
+
+
 def antenna_entry(antenna: Antenna) -> dict[str, str]:
     """Entry for `read_antenna`: the attributes that differ from the default."""
-    return {key: value for key, value in asdict(antenna).items() if value != getattr(ANTENNA, key)}
+    return {word: value for word, value in antenna_words(antenna).items() if value != getattr(ANTENNA, word)}
+
+
+def write_patterns(folder: Path, record: Record) -> None:
+    """Copy the files of measured patterns into a folder, so that it holds all that its record needs."""
+    for antenna in {record.tx_antenna, *(receiver.antenna for receiver in record.receivers)}:
+        if antenna.measured is not None:
+            shutil.copyfile(antenna.pattern, folder / antenna_words(antenna)["pattern"])
 
 
 @dataclass(frozen=True)

@@ -107,6 +107,7 @@ def write_nerf2_csi(
         if record.truth is not None:
             np.save(part / TRUTH, record.truth[0].astype(np.complex64))
         files.write_official(part, record.official, first=0)
+        files.write_patterns(part, record)
         files.write_extra(part, extra)
     return Path(path)
 

@@ -14,7 +14,7 @@ from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
 from ..core.antenna import ANTENNA, UPRIGHT, boresight_orientation
 from ..core.carriers import FREQUENCY
 from .faults import attempt, recoverable, refuse, stop_at_faults
-from .folder_files import ANTENNA_WORDS, TX_ANTENNA_WORDS, CsvTable, read_antenna, shown
+from .folder_files import ANTENNA_WORDS, TX_ANTENNA_WORDS, CsvTable, antenna_words, read_antenna, shown
 
 logger = logging.getLogger(__name__)
 
@@ -144,7 +144,8 @@ def _antenna_columns(prefix: str, antennas: list[Antenna], stated: bool = False)
     """Columns of antennas; none where all are the default, unless they are to be ``stated``."""
     if not stated and all(antenna == ANTENNA for antenna in antennas):
         return {}
-    return {prefix + word: [getattr(antenna, word) for antenna in antennas] for word in WORDS[prefix]}
+    words = [antenna_words(antenna) for antenna in antennas]
+    return {prefix + word: [of_antenna[word] for of_antenna in words] for word in WORDS[prefix]}
 
 
 def plain_id(text: str) -> str:

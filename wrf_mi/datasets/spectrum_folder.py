@@ -114,6 +114,7 @@ def write_spectrum_folder(
         files.write_official(part, record.official, first=1, digits=5)
         if record.folds is not None:
             files.write_lines(part / FOLDS, [str(fold) for fold in record.folds])
+        files.write_patterns(part, record)
         files.write_extra(part, extra)
     return Path(path)
 

@@ -71,6 +71,7 @@ class Chains:
         return plane, material, reflects
 
 
+PatternTables = list[Any] | None  # coefficients of a measured pattern on the device; None: a pattern of Sionna RT
 EvaluatedPaths = tuple[Complex, Any, Vector, Vector]  # gain, length, departure, arrival, see `evaluate_paths`
 
 
@@ -81,8 +82,11 @@ def evaluate_paths(
     frequency_hz: float,
     rx_antenna: Antenna = ANTENNA,
     tx_antenna: Antenna = ANTENNA,
+    patterns: tuple[PatternTables, PatternTables] = (None, None),
 ) -> EvaluatedPaths:
     """Evaluate q paths to a receiver. Differentiable in pose (numbers or arrays [q]), sources, planes and materials.
+
+    ``patterns``: `pattern_tables` of the receiver's and the transmitter's antenna.
 
     Returns:
         Gain lambda / (4 pi length) times interactions and antennas' fields, without the phase exp(-j k length);
@@ -112,20 +116,24 @@ def evaluate_paths(
     x, y, z = directions[0]
     departure = [cosine * x + sine * y, cosine * y - sine * x, z]
     sent = [[cosine, sine, zero], [-sine, cosine, zero], [zero, zero, unit]]
-    real = antenna_field(tx_antenna, directions[0], sent)
-    imaginary = [dr.zeros(float_type, dr.width(length)) for _ in range(3)]
+    real, *of_phase = antenna_field(tx_antenna, directions[0], sent, patterns[1])
+    imaginary = of_phase[0] if of_phase else [dr.zeros(float_type, dr.width(length)) for _ in range(3)]
     # The field after each interaction, as real and imaginary vectors.
     for level, before, after in zip(chains.levels, directions[:-1], directions[1:], strict=True):
         real, imaginary = _interact(level, before, after, (real, imaginary), tables, frequency_hz)
 
-    # What the receiver's antenna takes of it: the scalar product with its field vector, by reciprocity.
+    # What the receiver's antenna takes of it: the scalar product with its field vector, by reciprocity, hence without
+    # conjugate.
     world = [[unit, zero, zero], [zero, unit, zero], [zero, zero, unit]]
     # Columns of the array's rotation in the order of an antenna's axes: boresight z, then x, then y.
     x, y, z = map(list, zip(*pose.to_world, strict=True))
-    received = antenna_field(rx_antenna, arrival, world if rx_antenna.frame == "world" else [z, x, y])
+    axes = world if rx_antenna.frame == "world" else [z, x, y]
+    received, *of_phase = antenna_field(rx_antenna, arrival, axes, patterns[0])
+    re, im = dot(received, real), dot(received, imaginary)
+    if of_phase:
+        re, im = re - dot(of_phase[0], imaginary), im + dot(of_phase[0], real)
     loss = chains.exists * (speed_of_light / frequency_hz / (4 * np.pi)) / length  # Friis
-    gain = dot(received, real) * loss, dot(received, imaginary) * loss
-    return gain, length, departure, pose.to_local(arrival)
+    return (re * loss, im * loss), length, departure, pose.to_local(arrival)
 
 
 def _mirrored(vector: Vector, level: Level, offset_m: Any) -> Vector:
@@ -161,10 +169,16 @@ def _interact(
     return out[0], out[1]
 
 
-def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector]) -> Vector:
-    """Field vectors as of `wrf_mi.core.Antenna.field`, three arrays [q] in the arguments' frame, differentiable."""
-    local = antenna.components(dr, *(dot(direction, axis) for axis in axes))
-    return [sum(c * axis[k] for c, axis in zip(local, axes, strict=True)) for k in range(3)]
+def pattern_tables(antenna: Antenna, float_type: Any) -> PatternTables:
+    """Coefficients of a measured pattern on the device, inputs of recorded functions; None: a pattern of Sionna RT."""
+    return None if antenna.measured is None else columns_on_device(antenna.measured.flat, float_type)
+
+
+def antenna_field(antenna: Antenna, direction: Vector, axes: list[Vector], tables: PatternTables) -> list[Vector]:
+    """Field vectors of `wrf_mi.core.Antenna.components`, three arrays [q] in the arguments' frame, differentiable."""
+    x, y, z = (dot(direction, axis) for axis in axes)
+    parts = antenna.components(dr, x, y, z, tables)
+    return [[sum(c * axis[k] for c, axis in zip(part, axes, strict=True)) for k in range(3)] for part in parts]
 
 
 def chains_of(

@@ -35,7 +35,7 @@ from ..options import FACTOR, TraceOptions
 from ..search.chains import SPECULAR, TRANSMISSION
 from ..search.surfaces import Surfaces
 from .corrected_scene import MovedSearch
-from .field_calculator import Chains, EvaluatedPaths, Level, chains_of, evaluate_paths
+from .field_calculator import Chains, EvaluatedPaths, Level, chains_of, evaluate_paths, pattern_tables
 from .instrument_parameters import gain_name, instrument_parameters, moved_m, receiver_pose, spread_pose, with_antennas
 from .result import TraceResult, without_faint
 from .scene_parameters import TRAINED, MaterialGrouping, SceneTables, renumbered
@@ -110,6 +110,8 @@ class TracedField:
         self._shared, self._checks, self._present = prepared or Prepared(scene), prepared is None, present or {}
         self._gaussians: SurfaceGaussians | None = None
         self._weights: PathWeights | None = None
+        antennas = receiver.antenna, options.tx_antenna
+        self._patterns = pattern_tables(antennas[0], Float64), pattern_tables(antennas[1], Float64)
         self._stated_hz = float(scene.frequency[0])
         self.frequency_hz = float(frequency_hz or receiver.frequency_hz or self._stated_hz)
         self.searches = 0  # without that of ``traced``
@@ -133,7 +135,7 @@ class TracedField:
     @property
     def arrays(self) -> list[Any]:
         """Device arrays that a call reads beside its arguments, the inputs of a recording."""
-        return [self.chains, self._constants, self._planes, self.bounces, self._weights]
+        return [self.chains, self._constants, self._planes, self.bounces, self._weights, self._patterns]
 
     @property
     def form(self) -> tuple[int, int, int]:
@@ -207,7 +209,7 @@ class TracedField:
         tables = self.slabs.tables(parameters, self._constants, self.frequency_hz / self._stated_hz)
         pose = spread_pose(receiver_pose(self.receiver, parameters, Float64), dr.width(chains.exists))
         antennas = self.receiver.antenna, self.options.tx_antenna
-        return evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas)
+        return evaluate_paths(chains, pose, tables, self.frequency_hz, *antennas, self._patterns)
 
     def statistics(self, parameters: Mapping[str, Any]) -> PathStatistics:
         """Statistics of each transmitter's paths with the given parameters but the instrument's gain."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ...core import InputError
+from ...core import Antenna, InputError
 from ...core.angles import FloatArray
 from ...core.antenna import MountedAntenna
 from ..options import TraceOptions
@@ -207,23 +207,22 @@ def field_of(
         src_orientations=source_angles,
         tgt_orientations=target_angles,
         src_antenna_patterns=[_pattern(ends[0], buffer.source_indices)],
-        tgt_antenna_patterns=[_pattern(ends[1], buffer.target_indices)],
+        tgt_antenna_patterns=[_pattern(ends[1], buffer.target_indices, receives=True)],
     )
     gain = evaluated.a[0][0]
     return gain.real, gain.imag
 
 
-def _pattern(devices: Devices, index: Any) -> Any:
+def _pattern(devices: Devices, index: Any, receives: bool = False) -> Any:
     """Sionna RT's antenna pattern of the devices ``index`` of p paths, as a function of zenith and azimuth angle."""
     import drjit as dr
     import mitsuba as mi
-    from sionna.rt.antenna_pattern import antenna_pattern_registry
 
     from ...backend.device import to_uint
 
     antennas = [mounted.antenna for mounted in devices.antennas]
     distinct = list(dict.fromkeys(antennas))
-    functions = [antenna_pattern_registry.get(a.pattern)(polarization=a.polarization).patterns[0] for a in distinct]
+    functions = [sionna_pattern(antenna, receives) for antenna in distinct]
     if len(distinct) == 1:
         return functions[0]
     # The field calculator takes one pattern for all paths: this one evaluates each and selects by the path's antenna.
@@ -237,6 +236,35 @@ def _pattern(devices: Devices, index: Any) -> Any:
         return first, second
 
     return mixed
+
+
+def sionna_pattern(antenna: Antenna, receives: bool = False) -> Any:
+    """Sionna RT's antenna pattern: function of zenith and azimuth angle to the field's complex components of both.
+
+    Sionna RT multiplies by the conjugate of the receiver's pattern, so that reciprocity asks for the conjugate of a
+    measured phase where the antenna ``receives``.
+    """
+    from sionna.rt.antenna_pattern import PolarizedAntennaPattern, antenna_pattern_registry
+
+    measured = antenna.measured
+    if measured is None:
+        factory: Any = antenna_pattern_registry.get(antenna.pattern)
+        return factory(polarization=antenna.polarization).patterns[0]
+    import drjit as dr
+    import mitsuba as mi
+
+    from ...backend.device import columns_on_device
+
+    tables = columns_on_device(measured.flat, mi.Float)
+    complex_type: Any = mi.Complex2f
+    sign = -1 if receives else 1
+
+    def vertical(theta: Any, phi: Any) -> Any:
+        real, *imaginary = measured.amplitude(dr, theta, phi, tables)
+        return complex_type(real, sign * imaginary[0] if imaginary else 0)
+
+    how: dict[str, Any] = {"polarization": antenna.polarization, "polarization_model": "tr38901_2"}
+    return PolarizedAntennaPattern(v_pattern=vertical, **how).patterns[0]
 
 
 def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int) -> NDArray[np.complex128]:
