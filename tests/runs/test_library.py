@@ -47,13 +47,13 @@ def test_a_plan_becomes_a_scene_that_measurements_correct(flat_folder, tmp_path)
 
 
 def test_settings_by_name_and_presets(flat_folder):
-    """Nested and dotted names are those of texts; a preset is refused where a model has none, or states all settings."""
+    """Names, nested or dotted, are those of texts; presets are refused where a model has none or all is stated."""
     nested = wrf_mi.train(flat_folder, "wrf-gs+", settings={"steps": 3, "initial": {"gaussians": 5}})
     texts = wrf_mi.train(flat_folder, "wrf-gs+", settings=["steps=3", "initial.gaussians=5"])
     assert nested.config.settings == texts.config.settings
     fast = wrf_mi.train(flat_folder, preset="fast")
     assert "field" not in fast.config.settings.stages
-    with pytest.raises(wrf_mi.InputError, match="idw .* has no presets"):
+    with pytest.raises(wrf_mi.InputError, match=r"idw .* has no presets"):
         wrf_mi.train(flat_folder, "idw", preset="fast")
     with pytest.raises(wrf_mi.InputError, match="give one of both"):
         wrf_mi.train(flat_folder, preset="fast", settings=fast.config.settings)

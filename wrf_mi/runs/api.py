@@ -24,10 +24,8 @@ Signal strengths of a made-up receiver, in the layout of flat-ble:
     >>> run.score()["n_test"]
     10
     >>> (run.folder / "model.npz").unlink()  # as if stopped
-    >>> wrf_mi.resume(run.folder).metrics["n_test"]
-    10
-    >>> other = folder / "other.npz"
-    >>> np.savez(other, prediction=rssi_dbm + 1, row=np.arange(40))
+    >>> _ = wrf_mi.resume(run.folder)
+    >>> np.savez(other := folder / "other.npz", prediction=rssi_dbm + 1, row=np.arange(40))
     >>> scored = wrf_mi.score_predictions(data, other, folder / "other", "one decibel off")
     >>> round(scored.metrics["abs_error_db"]["median"], 3)
     1.0
