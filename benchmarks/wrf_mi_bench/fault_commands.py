@@ -120,8 +120,8 @@ class Correction(Command):
 
     def call(self, place: Path) -> list[str] | None:
         out, scene, data = (str(path) for path in (place / "scene", self._data / ROOM, self._data / HOME / FLAT))
-        options = ["--depth", "1", "--rays", "256", "--fit", "gain"]
-        return None if Path(out).exists() else ["correct", scene, data, "--out", out, *options]
+        options = ["--depth", "1", "--rays", "256", "--calibrate", "gain"]
+        return None if Path(out).exists() else ["correct", data, "--scene", scene, "--out", out, *options]
 
     def content(self, place: Path) -> dict[str, Any]:
         """All files of the scene folder, without the duration on its page."""

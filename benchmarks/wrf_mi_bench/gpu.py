@@ -33,7 +33,7 @@ FITS: Mapping[str, tuple[str, ...]] = {
     "WRF-GS, rfid-lab": ("train", RFID, "--model", "wrf-gs"),
     "factorised, rfid-lab": ("train", RFID, "--model", "factorised"),
     "joint fit, laboratory": ("train", "laboratory", "--model", "wrf-gs+", "--scene", "SCENE"),
-    "correct, laboratory": ("correct", "SCENE", "laboratory"),
+    "correct, laboratory": ("correct", "laboratory", "--scene", "SCENE"),
     "hybrid, laboratory": ("train", "laboratory", "--scene", "SCENE"),
 }
 ASKED = {

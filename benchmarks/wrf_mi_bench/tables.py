@@ -93,7 +93,7 @@ def corrected_scene(row: Row, folder: Path) -> Path:
     stated = scene_of(row.part, folder)
     scene = folder / f"corrected-{row.part.dataset}-{fit_key(row.rows, source_files(), scene_files(stated))}"
     if not scene.exists():
-        run_command(["correct", str(stated), row.part.dataset, *row.rows], scene, resumes=False)
+        run_command(["correct", row.part.dataset, "--scene", str(stated), *row.rows], scene, resumes=False)
     return scene
 
 

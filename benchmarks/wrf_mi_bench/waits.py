@@ -110,7 +110,7 @@ def cad(folder: Path) -> Figures:
 def correction(folder: Path) -> Figures:
     """A scanned, furnished room corrected by 400 spectra."""
     scene = _scan_scene("traced-room", folder)
-    seconds = command("correct", scene, "traced-room", "--n-train", "400", "--out", folder / "corrected")
+    seconds = command("correct", "traced-room", "--scene", scene, "--n-train", "400", "--out", folder / "corrected")
     page = json.loads((folder / "corrected" / "correction.json").read_text())
     return {"seconds": seconds, "kept": page["kept"]}
 

@@ -253,7 +253,7 @@ def test_a_corrected_scene_is_made_once_and_its_time_counts(flat_folder, monkeyp
         assert tables.measure(tmp_path, row)["train_seconds"] == 43
     assert [words[0] for words in calls] == ["correct", "train", "train"]  # the run is not finished: no metrics
     scene = tables.scene_of(part, tmp_path / "scenes")
-    assert calls[0] == ["correct", str(scene), "flat-ble", "--split", "official", "--seed", "0"]
+    assert calls[0] == ["correct", "flat-ble", "--scene", str(scene), "--split", "official", "--seed", "0"]
     assert Path(calls[1][calls[1].index("--scene") + 1]).name.startswith("corrected-flat-ble-")
 
 

@@ -28,7 +28,7 @@ def test_bad_arguments_are_refused(command: Command) -> None:
         ("train x --model nerf3 --out y", "invalid choice: 'nerf3'"),
         ("train x --seed one --out y", "invalid int value: 'one'"),
         ("train x --n-train many --out y", "argument --n-train: 'many' is no number"),
-        ("train x --preset best --out y", "invalid choice: 'best'"),
+        ("train x --preset slow --out y", "invalid choice: 'slow'"),
     ):
         command.refused(words.split(), message)
 

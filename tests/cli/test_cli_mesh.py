@@ -18,7 +18,7 @@ def test_a_plan_becomes_a_scene_that_can_be_traced(flat_folder: Path, tmp_path: 
     for line, name in zip(files, ("materials.yml", "preview.png"), strict=True):
         assert line.endswith(str(scene / name))
         assert (scene / name).is_file()
-    command.done(["trace", scene, flat_folder, "--out", run, "--depth", "1", "--rays", "1000"])
+    command.done(["trace", flat_folder, "--scene", scene, "--out", run, "--depth", "1", "--rays", "1000"])
     assert json.loads((run / "metrics.json").read_text())["scene"] == str(scene)
 
 

@@ -54,7 +54,7 @@ def test_settings_of_kinds_of_path_that_are_not_traced_have_no_effect(settings: 
 def test_options_of_trace_without_effect_are_refused(
     arguments: list[str], message: str, flat_folder: Path, room: Path, tmp_path: Path, command: Command
 ) -> None:
-    command.refused(["trace", room, flat_folder, *arguments, "--out", tmp_path / "run"], message)
+    command.refused(["trace", flat_folder, "--scene", room, *arguments, "--out", tmp_path / "run"], message)
     assert not (tmp_path / "run").exists()
 
 
@@ -97,8 +97,8 @@ def test_other_commands_refuse_or_name_options_without_effect(
     predict = ["predict", run, "--tx", positions, "--out", tmp_path / "new.csv"]
     command.refused([*predict, "--no-operator"], "--no-operator belongs to learned fields of spectra, not to kriging")
     command.refused(["evaluate", run, "--no-operator"], "--no-operator belongs to learned fields")
-    correct = ["correct", room, flat_folder, "--out", tmp_path / "corrected", "--shift-sd", "0.1"]
-    command.refused(correct, "--shift-sd: of planes and frame, which --fit materials,gain leaves")
+    correct = ["correct", flat_folder, "--scene", room, "--out", tmp_path / "corrected", "--shift-sd", "0.1"]
+    command.refused(correct, "--shift-sd: of planes and frame, which --calibrate materials,gain leaves")
     command.refused(["edit", room, "--replace"], "--out")
     view = ["view", run, "--material", "concrete", "--out", tmp_path / "view.html"]
     command.refused(view, "material concrete: of a bare mesh, and no source is one")

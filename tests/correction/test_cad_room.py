@@ -197,8 +197,8 @@ def test_commands_need_a_minute_and_two_gibibytes(large, tmp_path):
     room, spectra, run, places = large / "room", large / "spectra", tmp_path / "traced", tmp_path / "places.csv"
     places.write_text("x,y,z\n1.0,2.2,1.5\n3.0,2.5,1.3\n")
     commands = [
-        ("correct", room, spectra, "--out", tmp_path / "corrected"),
-        ("trace", room, spectra, "--out", run),
+        ("correct", spectra, "--scene", room, "--out", tmp_path / "corrected"),
+        ("trace", spectra, "--scene", room, "--out", run),
         ("train", spectra, "--model", "wrf-gs+", "--scene", room, "--set", "steps=300", "--out", tmp_path / "trained"),
         ("predict", run, "--tx", places, "--out", tmp_path / "predicted.npz"),
         ("map", run, "--out", tmp_path / "map.nc"),

@@ -336,14 +336,19 @@ def test_derivatives_are_those_of_finite_differences(task, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--fit", "walls"], "'walls' is not a part; choose of materials, planes, frame, hidden, gain, pose, patterns"),
+        (
+            ["--calibrate", "walls"],
+            "'walls' is not a part; choose of materials, planes, frame, hidden, gain, pose, patterns",
+        ),
         (["--split", "blocked"], "a scene is corrected by one split; choose a fold, such as blocked:0"),
         (["--depth", "0"], "setting depth: 0 is out of range"),
         (["--out", "."], "exists; remove it, choose another folder, or give --replace"),
     ],
 )
 def test_command_refuses_in_one_line(arguments, message, tmp_path, capsys):
-    refused(["correct", "laboratory", "laboratory", "--out", tmp_path / "corrected", *arguments], message, capsys)
+    refused(
+        ["correct", "laboratory", "--scene", "laboratory", "--out", tmp_path / "corrected", *arguments], message, capsys
+    )
     assert not (tmp_path / "corrected").exists()
 
 
@@ -353,7 +358,7 @@ def test_command_corrects_by_spectra(tmp_path, capsys):
     shutil.copytree(scenes()["laboratory"].folder, stated)
     text = (stated / xml).read_text()
     (stated / xml).write_text(re.sub(r'<ref id="mat-itu_\w+"', '<ref id="mat-itu_wood"', text))
-    words = ["correct", stated, "laboratory", "--out", tmp_path / "corrected", "--fit", "materials"]
+    words = ["correct", "laboratory", "--scene", stated, "--out", tmp_path / "corrected", "--calibrate", "materials"]
     status, out, _ = call([*words, "--depth", "2", "--rays", "4096", "--n-train", "60", "--json"], capsys)
     assert status == 0
     facts = json.loads(out)

@@ -153,7 +153,16 @@ def test_errors_of_parts_name_the_row_of_the_whole_input(
     assert status == 0
     assert re.fullmatch("predicting: 3 of 3, [12] workers?", err.splitlines()[-1])
     assert out.startswith("3 predictions: ")
-    traced_again = ["trace", tmp_path / "box.ply", flat, "--material", "concrete", "--paths", "line-of-sight"]
+    traced_again = [
+        "trace",
+        flat,
+        "--scene",
+        tmp_path / "box.ply",
+        "--material",
+        "concrete",
+        "--paths",
+        "line-of-sight",
+    ]
     status, _, err = command([*traced_again, "--out", tmp_path / "again", "--scheduler", "local"])
     assert status == 0
     assert re.fullmatch("tracing: 8 of 8, [12] workers?", err.splitlines()[-1])

@@ -97,7 +97,9 @@ def test_joint_training_predicts_better_than_paths_or_gaussians_alone(
     rooms: dict[str, Path], data: Path, run: Path, tmp_path: Path, command: Command
 ) -> None:
     train(str(data), "wrf-gs+", out=tmp_path / "field", settings=config(with_scene=False))
-    command.done(["trace", rooms["known"], data, "--depth", "1", "--rays", "4096", "--out", tmp_path / "traced"])
+    command.done(
+        ["trace", data, "--scene", rooms["known"], "--depth", "1", "--rays", "4096", "--out", tmp_path / "traced"]
+    )
     assert median(run) > median(tmp_path / "field") + 0.03
     assert median(run) > median(tmp_path / "traced") + 0.03
 

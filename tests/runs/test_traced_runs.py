@@ -195,7 +195,7 @@ def test_command_traces_predicts_and_compares(
 ) -> None:
     out = tmp_path / "run"
     asked = ["--paths", "line-of-sight, reflection", "--depth", "1", "--rays", "1000", "--seed", "3"]
-    metrics = command.json(["trace", room, flat_folder, "--out", out, *asked])
+    metrics = command.json(["trace", flat_folder, "--scene", room, "--out", out, *asked])
     assert metrics["rays"] == 1000
     assert metrics["paths"] > read_run(run).metrics["paths"]
     read = read_run(out)
@@ -217,15 +217,18 @@ def test_train_and_trace_give_equal_scores(
 def test_refused_trace_writes_nothing(
     folder: Path, flat_folder: Path, room: Path, run: Path, tmp_path: Path, command: Command
 ) -> None:
-    out, trace = ["--out", tmp_path / "out"], ["trace", room, flat_folder]
+    out, trace = ["--out", tmp_path / "out"], ["trace", flat_folder, "--scene", room]
     train = ["train", flat_folder, "--model", "ray-tracing"]
     for words, message in (
         ([*train, *out], "ray-tracing needs a scene; give --scene SCENE"),
         ([*train, "--scene", room, "--set", "beta=1", *out], "unknown setting beta"),
         (["train", flat_folder, "--depth", "1", *out], "belong to --model ray-tracing"),
-        (["trace", "laboratory", folder, *out], "carrier frequency unknown; state frequency_hz in its gateway_info"),
-        (["trace", tmp_path / "no.xml", flat_folder, *out], "no such scene file"),
-        (["trace", room, tmp_path / "none", *out], "no such folder"),
+        (
+            ["trace", folder, "--scene", "laboratory", *out],
+            "carrier frequency unknown; state frequency_hz in its gateway_info",
+        ),
+        (["trace", flat_folder, "--scene", tmp_path / "no.xml", *out], "no such scene file"),
+        (["trace", tmp_path / "none", "--scene", room, *out], "no such folder"),
         ([*trace, "--material", "brick", *out], "has radio materials of its own"),
         ([*trace, "--paths", "echo", *out], "kind of path 'echo': unknown"),
         ([*trace, "--rays", "many", *out], "give a whole number"),
@@ -275,7 +278,7 @@ def test_reflections_bound_the_paths_of_the_command(
     for bound in (0, 1):
         out = tmp_path / str(bound)
         limits = ["--depth", "2", "--reflections", bound, "--rays", "1024"]
-        command.done(["trace", room, flat_folder, *limits, "--out", out])
+        command.done(["trace", flat_folder, "--scene", room, *limits, "--out", out])
         assert (load_trace(out / "paths.npz").paths.interactions == 1).sum(axis=1).max() == bound
 
 

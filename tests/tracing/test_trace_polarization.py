@@ -82,8 +82,9 @@ def test_cross_polarised_data_warn_and_name_the_option(shoebox_xml, turned_folde
         caplog.clear()
         asked = [
             "trace",
-            shoebox_xml,
             turned_folder,
+            "--scene",
+            shoebox_xml,
             "--depth",
             "1",
             "--rays",

@@ -135,7 +135,19 @@ def test_what_cannot_be_written_is_refused(traced, tmp_path):
 
 
 def test_command_writes_the_traced_paths(room, flat_folder, tmp_path, capsys):
-    asked = ["trace", room, flat_folder, "--depth", "1", "--rays", "1024", "--json", "--out", tmp_path / "run"]
+    asked = [
+        "trace",
+        flat_folder,
+        "--scene",
+        room,
+        "--depth",
+        "1",
+        "--rays",
+        "1024",
+        "--json",
+        "--out",
+        tmp_path / "run",
+    ]
     refused([*asked, "--deepmimo", tmp_path / "Flat"], "choose small letters", capsys)
     asked += ["--deepmimo", tmp_path / "flat"]
     message = "--calibrate trains paths and stores none; omit it, or --deepmimo"

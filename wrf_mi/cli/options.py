@@ -16,6 +16,7 @@ from ..models import MODELS
 Arguments = argparse.Namespace
 
 DATASET = "name of a data set (`wrf-mi data list`) or a folder"
+SCENE = "name of a scene, scene folder, Mitsuba XML, or mesh file"
 
 
 class Parser(argparse.ArgumentParser):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core import InputError
-from .options import DATASET, Arguments, add_antennas, add_command, add_n_train, antenna_options
+from .options import DATASET, SCENE, Arguments, add_antennas, add_command, add_n_train, antenna_options
 from .output import Watch, show
 
 if TYPE_CHECKING:
@@ -84,14 +84,17 @@ def _point(text: str) -> tuple[float, ...]:
 def _add_correct(commands: Any) -> None:
     parser = add_command(commands, "correct", correct_command, "correct a scene by measurements")
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
     add("dataset", metavar="DATASET", help=DATASET)
+    add("--scene", required=True, metavar="SCENE", help=SCENE)
     add("--out", required=True, metavar="SCENE2", help="scene folder to make")
     parts = "what is changed, from materials,planes,frame,hidden,gain,pose,patterns"
-    add("--fit", metavar="LIST", help=f"{parts} (default: the first four; for signal strengths materials and gain)")
+    add(
+        "--calibrate",
+        metavar="LIST",
+        help=f"{parts} (default: the first four; for signal strengths materials and gain)",
+    )
     add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3; strengths: 6)")
     add("--reflections", type=int, metavar="N", help="largest number of reflections (default: 3; strengths: 2)")
-    add("--rows", type=int, metavar="N", help="most training rows that are compared (default: 600)")
     add("--rays", type=int, metavar="N", help="number of rays from each receiver (default: 65536)")
     add("--shift-sd", type=float, metavar="M", help="standard deviation of a plane's stated position (default: 0.02 m)")
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
@@ -134,13 +137,16 @@ def _correction_options(a: Arguments, record: Record) -> CorrectionOptions:
     from ..correction.options import FRAME, PLANES
 
     options = default_options(record)
-    if a.fit is not None:
-        options = replace(options, parts=tuple(a.fit.split(",")))
-    names = ("depth", "reflections", "rows", "rays")
+    if a.n_train is not None:  # as many as stated, over all receivers
+        options = replace(options, rows=max(1, len(record) * len(record.receivers)))
+    if a.calibrate is not None:
+        options = replace(options, parts=tuple(a.calibrate.split(",")))
+    names = ("depth", "reflections", "rays")
     stated = {name: getattr(a, name) for name in names} | {"shift_sd_m": a.shift_sd}
     options = with_settings(options, [f"{key}={value}" for key, value in stated.items() if value is not None])
     if a.shift_sd is not None and not {PLANES, FRAME} & set(options.parts):
-        raise InputError(f"--shift-sd: of {PLANES} and {FRAME}, which --fit {','.join(options.parts)} leaves; omit it")
+        text = f"of {PLANES} and {FRAME}, which --calibrate {','.join(options.parts)} leaves; omit it"
+        raise InputError(f"--shift-sd: {text}")
     return options
 
 

@@ -13,6 +13,7 @@ from ..core import InputError
 from ..core.yaml_files import read_yaml
 from .options import (
     DATASET,
+    SCENE,
     Arguments,
     Parser,
     add_command,
@@ -172,8 +173,8 @@ def _add_trace(commands: Any) -> None:
     parser.set_defaults(model=RAY_TRACING, receiver=None, evaluation=None, preset=None, set=[])
     parser.set_defaults(deterministic=False, intervals=False, min_rows=None)
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, or mesh file")
     add("dataset", metavar="DATASET", help=DATASET)
+    add("--scene", required=True, metavar="SCENE", help=SCENE)
     add("--out", metavar="RUN", required=True, help="run folder to make")
     add_tracing(parser)
     target = "choose depth, rays, diffraction and scattering until power and spectra are converged to DB decibels"
