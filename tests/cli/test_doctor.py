@@ -208,3 +208,13 @@ def test_command_prints_the_report_and_the_error_of_an_installation(
     monkeypatch.setattr(doctor, "install_llvm", refuse)
     assert main(["doctor", "--install-llvm"]) == 1
     assert capsys.readouterr().err == "wrf-mi: LLVM is missing: run this\n"
+
+
+def test_packages_that_an_extra_lacks_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = doctor.installed_version
+    monkeypatch.setattr(doctor, "installed_version", lambda name: None if name in ("zarr", "numpy") else known(name))
+    state = doctor.report()
+    assert state["extras"]["maps"] == ["zarr"]
+    text = doctor.render(state)
+    assert "not installed: zarr (pip install '.[maps]')" in text
+    assert state["memory_gb"] > 0

@@ -7,16 +7,21 @@ import platform
 import shutil
 import subprocess
 import sys
+from importlib.metadata import requires
 from typing import Any
+
+from packaging.requirements import Requirement
 
 from ..backend import BackendError, choose, find_cuda, find_llvm
 from ..backend.libraries import install_commands, package_manager
 from ..backend.probe import installed_version, try_cuda, try_llvm
+from ..core.memory import free_bytes
 from ..parallel.threads import processors
 from .options import Arguments, add_command
 from .output import show
 
 _PACKAGES = ("wrf-mi", "mitsuba", "drjit", "sionna-rt", "numpy", "scipy", "scikit-image")
+EXTRAS = ("lidar", "meshes", "tables", "view", "cluster", "maps", "argos")  # what commands of users need
 _DATA_VARIABLE = "WRF_MI_DATA"
 
 
@@ -33,7 +38,8 @@ def report() -> dict[str, Any]:
 
     Returns:
         Values for JSON: ``ok`` (a backend works and all packages are installed), ``python``, ``system``, ``versions``
-        (package to version or None), ``threads`` (cores this process may use), ``backend`` (the fields of
+        (package to version or None), ``threads`` (cores this process may use), ``memory_gb`` (free memory, 1e9 bytes),
+        ``extras`` (packages of each of `EXTRAS` that are not installed), ``backend`` (the fields of
         `wrf_mi.backend.Backend`, or None), ``llvm`` (a list of path, version, usable, reason), ``gpu`` (driver,
         usable, reason, device), ``data`` (home, cache, sets: a list of name, task, folder or None) and ``problems`` (a
         list of problem, remedy).
@@ -63,6 +69,8 @@ def report() -> dict[str, Any]:
         "system": platform.platform(),
         "versions": versions,
         "threads": processors(),
+        "memory_gb": round(free_bytes() / 1e9, 1),
+        "extras": _missing_of_extras(),
         "backend": backend,
         "llvm": llvm,
         "gpu": gpu,
@@ -71,17 +79,34 @@ def report() -> dict[str, Any]:
     }
 
 
+def _missing_of_extras() -> dict[str, list[str]]:
+    """Packages of each extra of users that are not installed, by the requirements of the installed package."""
+    missing: dict[str, list[str]] = {}
+    for line in requires("wrf-mi") or ():
+        requirement = Requirement(line)
+        for extra in EXTRAS:
+            if requirement.marker and requirement.marker.evaluate({"extra": extra}):
+                known = missing.setdefault(extra, [])
+                if not requirement.marker.evaluate({"extra": ""}) and installed_version(requirement.name) is None:
+                    known.append(requirement.name)
+    return missing
+
+
 def render(state: dict[str, Any]) -> str:
     """Report as text."""
     backend = state["backend"]
     lines = [
         ("backend", f"{backend['name']} ({backend['variant']}) on {backend['device']}" if backend else "none"),
         ("threads", str(state["threads"])),
+        ("memory", f"{state['memory_gb']:.1f} GB free"),
         ("GPU", state["gpu"]["device"] or state["gpu"]["reason"]),
     ]
     lines += [("LLVM", _llvm_line(library, backend)) for library in state["llvm"]] or [("LLVM", "none found")]
     lines += [("Python", state["python"]), ("system", state["system"])]
     lines += [(name, text or "not installed") for name, text in state["versions"].items()]
+    for extra, missing in state["extras"].items():
+        text = f"not installed: {', '.join(missing)} (pip install '.[{extra}]')" if missing else "installed"
+        lines.append((f"extra {extra}", text))
     lines.append(("data", state["data"]["home"]))
     lines += [(f"  {entry['name']}", entry["folder"] or "not on this machine") for entry in state["data"]["sets"]]
     width = max(len(label) for label, _ in lines) + 2
