@@ -107,7 +107,7 @@ def test_phase_of_the_channel_turns_with_the_doppler_shifts(tmp_path: Path) -> N
 
 def test_velocities_that_are_none_are_refused(tmp_path: Path) -> None:
     scene = room(tmp_path)
-    with pytest.raises(InputError, match="transmitter 1: its velocity is .*; give finite"):
+    with pytest.raises(InputError, match=r"transmitter 1: its velocity is .*; give finite"):
         trace_paths(scene, TX_M[None], receiver(RX_M), tx_velocity_mps=[[np.nan, 0, 0]])
-    with pytest.raises(InputError, match="receiver 1: .* below 3e"):
+    with pytest.raises(InputError, match=r"receiver 1: .* below 3e"):
         trace_paths(scene, TX_M[None], receiver(RX_M), rx_velocity_mps=[[3e8, 0, 0]])

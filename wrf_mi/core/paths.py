@@ -89,7 +89,7 @@ class Paths:
         The shift -(dL/dt) f / c is that of ``sionna.rt.Paths.doppler``: the sum over the segments of a path of
         (v_i - v_(i+1)) . k_i / lambda, with velocities v of the segment's ends and its direction k.
         """
-        return np.asarray(-self.length_rate_mps * np.asarray(frequency_hz, float) / speed_of_light)
+        return np.asarray((0.0 - self.length_rate_mps) * np.asarray(frequency_hz, float) / speed_of_light)
 
     def after(self, seconds: float) -> Paths:
         """The paths with the lengths that they have after a short time, and unchanged gains."""
