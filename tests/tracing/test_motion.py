@@ -13,7 +13,9 @@ from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import InputError
 from wrf_mi.receivers import csi
+from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.tracing import TraceOptions, load_trace, save_trace, trace_paths
+from wrf_mi.tracing.paths.corrected_scene import write_corrected_scene
 from wrf_mi.tracing.sionna.path_solver import scattering_materials
 
 OF_SIONNA = 1e-4
@@ -103,6 +105,14 @@ def test_phase_of_the_channel_turns_with_the_doppler_shifts(tmp_path: Path) -> N
     save_trace(tmp_path / "paths.npz", before)
     read = load_trace(tmp_path / "paths.npz").of_transmitters(np.array([0, 0]))
     np.testing.assert_array_equal(read.paths.length_rate_mps, np.tile(before.paths.length_rate_mps, 2))
+
+
+def test_corrected_scene_moves_as_its_scene(tmp_path: Path) -> None:
+    folder = write_corrected_scene(tmp_path / "corrected", furnished(tmp_path), {})
+    moving = read_scene_folder(folder).materials.velocities_mps
+    assert all(name.startswith("box") for name in moving)
+    np.testing.assert_allclose(list(moving.values()), np.tile(BOX_MPS, (len(moving), 1)), rtol=1e-6)
+    assert len(moving) >= 1
 
 
 def test_velocities_that_are_none_are_refused(tmp_path: Path) -> None:

@@ -71,13 +71,13 @@ def _figure(spectrum: NDArray[np.float32], sampling: Sampling, names: list[str])
         numbers = np.arange(1, len(power) + 1)
         over_rows, mean = power.sum(axis=1), power.mean(axis=0)
         used = int(np.flatnonzero(mean.max(axis=1) > mean.max() * 10 ** (-RANGE_DB / 10)).max(initial=0)) + 2
-        for axes, values, down, label in (
-            (panels[0], over_rows, numbers, "row"),
-            (panels[1], mean[:used], delays_ns[:used], "delay (ns)"),
+        for axes, values, down, label, what in (
+            (panels[0], over_rows, numbers, "row", "each row"),
+            (panels[1], mean[:used], delays_ns[:used], "delay (ns)", "mean over rows"),
         ):
             decibel = 10 * np.log10(np.maximum(values, np.finfo(np.float32).tiny))
             shade = {"vmax": decibel.max(), "vmin": decibel.max() - RANGE_DB, "cmap": "viridis", "shading": "nearest"}
             image = axes.pcolormesh(dopplers_hz, down, decibel, rasterized=True, **shade)
-            axes.set(xlabel="Doppler shift (Hz)", ylabel=label, title=name[:40])
+            axes.set(xlabel="Doppler shift (Hz)", ylabel=label, title=f"{name[:40]}, {what}")
             figure.colorbar(image, ax=axes).set_label("power (dB)")
     return figure
