@@ -8,6 +8,7 @@ from random_paths import paths_of
 
 from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.paths import ARRAYS
 from wrf_mi.receivers.instruments import SpectrumInstrument
 
 CARRIER_HZ, SIZE = 2.4e9, (12, 36)
@@ -38,8 +39,7 @@ def made_paths(seed: int, n_tx: int = 5, each: int = 6) -> Paths:
 def test_spectra_are_the_mean_over_random_phases(phase_error: float) -> None:
     """Phases are independent and normal, of variance phase_error^2 for each reflection; transmissions add none."""
     paths, copies, rounds = made_paths(seed=1), 512, 2
-    names = ("tx", "rx", "gain", "length_m", "departure", "arrival", "interactions", "vertices_m", "objects")
-    many = replace(paths, **{name: np.concatenate([getattr(paths, name)] * copies) for name in names})
+    many = replace(paths, **{name: np.concatenate([getattr(paths, name)] * copies) for name in ARRAYS})
     first_tx = np.repeat(paths.n_tx * np.arange(copies), len(paths))
     many = replace(many, tx=many.tx + first_tx, n_tx=copies * paths.n_tx)
     deviation = phase_error * np.sqrt((many.interactions == 1).sum(axis=1))

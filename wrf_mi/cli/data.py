@@ -206,6 +206,7 @@ def summary(record: Record) -> dict[str, Any]:
         "std_db": _range(record.std, received),
         "positions": record.has_positions,
         "headings": record.tx_heading_rad is not None,
+        "velocities": record.tx_velocity_mps is not None,
         "uplink": record.uplink is not None,
         "truth": record.truth is not None,
     }
@@ -227,7 +228,8 @@ def render(facts: dict[str, Any]) -> str:
         "runs": "not stated" if facts["runs"] is None else _named(facts["runs"]),
         "readings per row": _shown(facts["n_readings"], ""),
         "noise": _shown(facts["std_db"], " dB"),
-        "known": ", ".join(filter(facts.get, ("positions", "headings", "uplink", "truth"))) or "observations alone",
+        "known": ", ".join(filter(facts.get, ("positions", "headings", "velocities", "uplink", "truth")))
+        or "observations alone",
     }
     return "\n".join(f"{label + ':':<18}{text}" for label, text in lines.items())
 

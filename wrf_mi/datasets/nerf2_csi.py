@@ -56,10 +56,10 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
             raise DataFault(station, f"{text}; give one for each")
     frequencies = attempt(_frequencies, station, info, channel, frequencies_hz)
     positions = folder / files.POSITIONS
-    stated = attempt(files.read_columns, positions, files.AXES) if positions.exists() else None
+    stated = attempt(files.read_positions, positions, ()) if positions.exists() else None
     with recoverable():
-        if stated is not None and len(stated.value) != n.value:
-            text = f"{len(stated.value)} rows, but {CHANNELS} has {n.value} samples; give one for each"
+        if stated is not None and len(stated.value.positions_m) != n.value:
+            text = f"{len(stated.value.positions_m)} rows, but {CHANNELS} has {n.value} samples; give one for each"
             raise DataFault(positions, text)
     truth = attempt(_read_truth, folder / TRUTH, channel)
     official = attempt(files.read_official, folder, n, 0, CHANNELS)
@@ -70,7 +70,8 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
         folder,
         name,
         "csi",
-        tx_pos_m=np.full((n.value, 3), np.nan) if stated is None else stated,
+        tx_pos_m=np.full((n.value, 3), np.nan) if stated is None else stated.value.positions_m,
+        tx_velocity_mps=None if stated is None else stated.value.velocities_mps,
         receivers=(receiver.value,),
         observation=channel.value[None, :, :, half:],
         official=official,
@@ -103,7 +104,8 @@ def write_nerf2_csi(
         text = yaml.safe_dump(_station_info(record, array_m), sort_keys=False, default_flow_style=None)
         (part / STATION).write_text(text, encoding="utf-8")
         if np.isfinite(record.tx_pos_m).all():
-            files.write_positions(part / files.POSITIONS, files.PositionTable(record.tx_pos_m))
+            table = files.PositionTable(record.tx_pos_m, velocities_mps=record.tx_velocity_mps)
+            files.write_positions(part / files.POSITIONS, table)
         if record.truth is not None:
             np.save(part / TRUTH, record.truth[0].astype(np.complex64))
         files.write_official(part, record.official, first=0)

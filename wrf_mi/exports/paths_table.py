@@ -33,16 +33,15 @@ SEPARATOR = ";"  # between the interactions, vertices and objects of a path
 def path_columns(traced: TraceResult) -> dict[str, Any]:
     """Columns of the table of a trace, [p] each, see ``docs/export.md``."""
     paths = traced.paths
-    hz = np.full(paths.n_tx, traced.frequency_hz) if traced.carriers_hz is None else traced.carriers_hz
     rx_pos_m = np.stack([receiver.position_m for receiver in traced.receivers])
     columns: dict[str, Any] = {"tx": paths.tx.tolist(), "rx": paths.rx.tolist()}
     columns["receiver"] = [traced.receivers[index].name for index in paths.rx]
-    of_receivers = np.array([np.nan if rx.frequency_hz is None else rx.frequency_hz for rx in traced.receivers])
-    columns["frequency_hz"] = np.where(np.isnan(of_receivers)[paths.rx], hz[paths.tx], of_receivers[paths.rx]).tolist()
+    columns["frequency_hz"] = traced.path_carriers_hz.tolist()
     for name, values in (("tx", traced.tx_pos_m[paths.tx]), ("rx", rx_pos_m[paths.rx])):
         columns |= {f"{name}_{axis}": column.tolist() for axis, column in zip("xyz", values.T, strict=True)}
     columns |= {"gain_re": paths.gain.real.tolist(), "gain_im": paths.gain.imag.tolist()}
     columns |= {"length_m": paths.length_m.tolist(), "delay_s": (paths.length_m / speed_of_light).tolist()}
+    columns["doppler_hz"] = paths.doppler_hz(traced.path_carriers_hz).tolist()
     for end in ("departure", "arrival"):
         for name, radians in zip(ANGLES, azimuth_elevation(getattr(paths, end)), strict=True):
             columns[f"{end}_{name}_deg"] = np.degrees(radians).tolist()
@@ -59,7 +58,7 @@ def path_columns(traced: TraceResult) -> dict[str, Any]:
     return columns
 
 
-def _traced(source: Source, options: ExportOptions) -> TraceResult:
+def traced_paths(source: Source, options: ExportOptions) -> TraceResult:
     """Stored paths of a run, or paths of a scene that are traced now."""
     ends = {"--tx": options.tx_pos_m, "--rx": options.rx_pos_m, "--frequency": options.frequency_hz}
     if source.kind == RUN:
@@ -76,7 +75,8 @@ def _traced_now(source: Source, ends: dict[str, Any], options: ExportOptions) ->
         raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {lacking}")
     scene = open_scene(source.name, options.frequency_hz, material=options.material)
     receivers = [Receiver(f"rx{k}", position, np.array(UPRIGHT)) for k, position in enumerate(options.rx_pos_m)]
-    return trace_paths(scene, options.tx_pos_m, receivers, _trace_options(options), options.progress)
+    moving: Any = {"tx_velocity_mps": options.tx_velocity_mps, "rx_velocity_mps": options.rx_velocity_mps}
+    return trace_paths(scene, options.tx_pos_m, receivers, _trace_options(options), options.progress, **moving)
 
 
 def _trace_options(options: ExportOptions) -> TraceOptions:
@@ -95,7 +95,7 @@ def write_paths(source: Source, out: Path, options: ExportOptions) -> dict[str, 
 
     `InputError`: a run without stored paths, a scene without transmitters, receivers or frequency.
     """
-    traced = _traced(source, options)
+    traced = traced_paths(source, options)
     if not len(traced.paths):
         raise InputError(f"{source.name}: no path from {traced.paths.n_tx} transmitters; nothing to write")
     columns = path_columns(traced)

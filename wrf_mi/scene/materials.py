@@ -13,6 +13,10 @@ the law of ITU-R P.2040; a scene file holds it at f0:
 
     surfaces: {wall_03: panel}
     constants: {panel: {relative_permittivity: 2.9, conductivity: 0.01, thickness: 0.08}}
+
+Surfaces that move have velocities, from which Doppler shifts of paths follow:
+
+    velocities_mps: {wall_03: [0.0, 1.5, 0.0]}
 """
 
 from __future__ import annotations
@@ -33,7 +37,8 @@ from ..datasets.folder_files import SINGLE_MAX, shown
 from .mesh.surfaces import KINDS
 
 FILE = "materials.yml"
-KEYS = ("rules", "surfaces", "thickness_m", "constants")
+KEYS = ("rules", "surfaces", "thickness_m", "constants", "velocities_mps")
+FASTEST_MPS = 3e6  # 1 % of the speed of light: Doppler shifts are those of first order in v / c
 EXPONENT, CARRIER = "conductivity_exponent", "carrier_hz"
 """Optional numbers of a material with constants; both or neither."""
 STEEPEST = 5.0  # largest exponent; ITU-R P.2040 has 0 to 2.4
@@ -63,12 +68,14 @@ class Materials:
         surfaces: kind, or material, of each surface by its name.
         thickness_m: slab thickness of each material of `THICKNESS_M` in metres; by default the one there.
         constants: materials of the scene's own.
+        velocities_mps: velocities [3] of moving surfaces by their names, m/s; others are at rest.
     """
 
     rules: Mapping[str, str] = field(default_factory=dict)
     surfaces: Mapping[str, str] = field(default_factory=dict)
     thickness_m: Mapping[str, float] = field(default_factory=dict)
     constants: Constants = field(default_factory=dict)
+    velocities_mps: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def of(self, name: str, kind: str) -> str:
         """Material of a surface, by its entry or else by its kind's rule."""
@@ -116,6 +123,10 @@ def read_materials(path: str | Path) -> Materials:
             raise InputError(f"{file}: surfaces: {shown(name)} names no mesh; use letters, digits, _, - and .")
         _check_material(f"{file}: surfaces: {name}", entry, (*KINDS, *known))
     thicknesses(file, parts["thickness_m"])
+    for name, velocity in parts["velocities_mps"].items():
+        if name not in parts["surfaces"]:
+            raise InputError(f"{file}: velocities_mps: no surface {shown(name)} among surfaces")
+        check_velocity(f"{file}: velocities_mps: {name}", velocity)
     return Materials(**parts)
 
 
@@ -150,6 +161,13 @@ def thicknesses(file: Path, stated: Any) -> dict[str, float]:
     return dict(stated)
 
 
+def check_velocity(where: str, velocity: Any) -> None:
+    """Refuse (`InputError`) what is not three numbers of m/s below `FASTEST_MPS`."""
+    numbers = velocity if isinstance(velocity, list | tuple) else ()
+    if len(numbers) != 3 or not all(_is_number(value) and abs(value) < FASTEST_MPS for value in numbers):
+        raise InputError(f"{where} is {shown(velocity)}; give three numbers of m/s below {FASTEST_MPS:g}")
+
+
 def _is_number(value: Any) -> bool:
     """Whether a value is a number that is finite in single precision."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= SINGLE_MAX
@@ -179,8 +197,8 @@ def materials_text(materials: Materials) -> str:
     head = (
         "# Radio materials of this scene (of ITU-R P.2040, perfect, or perfect_absorber). rules: of each kind of\n"
         "# surface; surfaces: the kind of each, or a material of its own; constants: relative permittivity,\n"
-        "# conductivity (S/m) and thickness (m) of further materials. Edit, then open the scene with wrf-mi:\n"
-        "# scene.xml follows.\n"
+        "# conductivity (S/m) and thickness (m) of further materials; velocities_mps: of moving surfaces,\n"
+        "# m/s. Edit, then open the scene with wrf-mi: scene.xml follows.\n"
     )
-    facts = {key: dict(part) for key, part in vars(materials).items() if part or key != "constants"}
+    facts = {key: dict(part) for key, part in vars(materials).items() if part or key not in KEYS[3:]}
     return head + yaml.safe_dump(facts, sort_keys=False, width=110)

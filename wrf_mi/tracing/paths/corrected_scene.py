@@ -151,7 +151,7 @@ def write_corrected_scene(
     carrier_hz = float(scene.frequency[0])
     parts, thickness = list[Surface](), dict[str, float]()
     entries, constants = dict[str, str](), dict[str, dict[str, float]]()
-    fitted_names = dict[str, str]()
+    fitted_names, moving = dict[str, str](), dict[str, list[float]]()
     together = ~changed & _facets(surfaces, slab_of_face, len(slabs.names))
     together[list(absent)] = False
     # Each object in pieces of one material each, which become objects of their own.
@@ -169,6 +169,8 @@ def write_corrected_scene(
             corners = triangles[piece].reshape(-1, 3)
             vertices, indices = np.unique(corners, axis=0, return_inverse=True)
             parts.append(Surface(part, kinds.get(name, "other"), vertices, indices.reshape(-1, 3)))
+            if any(velocity := np.ravel(scene.objects[name].velocity).tolist()):
+                moving[part] = velocity
             # Its material: absorbing, fitted, by constants where ITU-R P.2040 has none at the carrier, or by name.
             material = scene.objects[name].radio_material.name
             if slab < 0:
@@ -186,7 +188,7 @@ def write_corrected_scene(
             else:
                 thickness[material] = float(fitted[slab, 2])
             entries[part] = material
-    facts = Materials(surfaces=entries, thickness_m=thickness, constants=constants)
+    facts = Materials(surfaces=entries, thickness_m=thickness, constants=constants, velocities_mps=moving)
     source = f"a scene corrected by measurements at {carrier_hz / 1e9:.6g} GHz, for which its constants hold"
     frame, title = "that of the scene it was made from", "A scene corrected by measurements"
     return write_scene(folder, parts, frame=frame, source=source, materials=facts, description=title, replace=replace)

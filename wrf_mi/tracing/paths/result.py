@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored_receivers
 from ...core.antenna import ANTENNA
 from ...core.carriers import by_carrier
-from ...core.paths import read_paths_file, save_paths
+from ...core.paths import ARRAYS, read_paths_file, save_paths
 from ...core.settings import settings_from
 from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
@@ -56,6 +56,13 @@ class TraceResult:
     frequency_hz: float
     tx_antenna: Antenna = ANTENNA
     carriers_hz: FloatArray | None = None
+
+    @property
+    def path_carriers_hz(self) -> FloatArray:
+        """Carrier of each path's gain [p], Hz: that of its receiver if stated, else that of its transmitter."""
+        rows = np.full(self.paths.n_tx, self.frequency_hz) if self.carriers_hz is None else self.carriers_hz
+        own = np.array([np.nan if rx.frequency_hz is None else rx.frequency_hz for rx in self.receivers])[self.paths.rx]
+        return np.where(np.isnan(own), rows[self.paths.tx], own)
 
     def select(self, which: NDArray[Any]) -> TraceResult:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
@@ -174,8 +181,7 @@ def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
 
     # Stable: the paths of a pair of devices all come from one part and keep their order.
     order = np.lexsort((tx, joined("paths.rx")))
-    names = ("rx", "gain", "length_m", "departure", "arrival", "interactions", "vertices_m", "objects")
-    arrays: dict[str, Any] = {name: joined(f"paths.{name}")[order] for name in names}
+    arrays: dict[str, Any] = {name: joined(f"paths.{name}")[order] for name in ARRAYS if name != "tx"}
     return replace(
         first,
         paths=replace(first.paths, tx=tx[order], n_tx=int(starts[-1]), **arrays),

@@ -31,7 +31,7 @@ from ...core.yaml_files import read_yaml
 from ...scene.coordinates import require_near, warn_of_up
 from ...scene.folder import FACTS_FILE, read_scene_folder, scene_file
 from ...scene.materials import FILE as MATERIALS_FILE
-from ...scene.materials import thicknesses
+from ...scene.materials import Materials, thicknesses
 from ...scene.mesh.files import mesh_parts
 from ...scene.mesh.surfaces import sampled
 from ...scene.xml_file import FILES, named_shapes, read_scene_xml
@@ -323,11 +323,11 @@ def load_scene(
     Returns a ``sionna.rt.Scene``, and thicknesses and laws of its materials as `set_frequency` takes them.
     """
     backend.init()
-    path, stated_m, laws = Path(source), dict[str, float](), dict[str, tuple[float, float]]()
+    path, stated = Path(source), Materials()
     if not path.exists() and (known := scenes().get(str(source))):
-        path, stated_m = known.xml, known.thickness_m
+        path, stated = known.xml, Materials(thickness_m=known.thickness_m)
     elif path.is_dir():
-        path, stated_m, laws = _folder(path)
+        path, stated = _folder(path)
     if not path.is_file():
         ways = f"a name ({', '.join(scenes())}), a scene folder, a Mitsuba XML or a mesh ({', '.join(MESHES)})"
         raise InputError(f"{source}: no such scene file; give {ways}")
@@ -337,9 +337,12 @@ def load_scene(
         text = text if mesh else f"has radio materials of its own; leave out the material {material}"
         raise InputError(f"{source}: {text}")
     try:
-        return _checked(path, source, material), stated_m, laws
+        scene = _checked(path, source, material)
     except InputError as error:
         raise InputError(f"{error} (wrf-mi check {source} names every fault)") from None
+    for name, velocity_mps in stated.velocities_mps.items():
+        scene.objects[name].velocity = list(velocity_mps)
+    return scene, dict(stated.thickness_m), stated.laws
 
 
 def _checked(path: Path, source: str | Path, material: str | None) -> Any:
@@ -356,16 +359,17 @@ def _checked(path: Path, source: str | Path, material: str | None) -> Any:
     return scene
 
 
-def _folder(folder: Path) -> tuple[Path, dict[str, float], dict[str, tuple[float, float]]]:
-    """Scene file, thicknesses and laws of a scene folder, from a scan or like those that come with the package."""
+def _folder(folder: Path) -> tuple[Path, Materials]:
+    """Scene file and materials of a scene folder, from a scan or like those that come with the package."""
     if (folder / MATERIALS_FILE).is_file():
         read = read_scene_folder(folder)
-        return read.xml, dict(read.materials.thickness_m), read.materials.laws
+        return read.xml, read.materials
     file = folder / FACTS_FILE
     if not file.exists():
         raise InputError(f"{folder}: no {FACTS_FILE} in it, so not a scene folder; give one, or a file")
     facts = read_yaml(file)
-    return scene_file(folder, facts), thicknesses(file, facts.get("thickness_m") or {}), {}
+    stated_m = thicknesses(file, facts.get("thickness_m") or {})
+    return scene_file(folder, facts), Materials(thickness_m=stated_m)
 
 
 def _from_xml(path: Path) -> Any:
