@@ -1,7 +1,7 @@
 """Probability that a receiver receives a transmission at all, beside the strength that a model predicts for it.
 
 Rows in which a receiver received nothing have no value to interpolate, but they state where its signal is too weak. The
-probability of reception is a weighted mean of three, with weights by the distance to the nearest training row:
+probability of reception is a mean of three, with weights by the distance to the nearest training row (`Weights`):
 
 - rate: the share of the training rows that the receiver received;
 - strength: the probability that the signal exceeds the receiver's sensitivity (`Sensitivity`), by the latent variable
@@ -24,14 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
-from scipy.special import expit, logit, ndtr
+from scipy.special import expit, logit, ndtr, softmax
 
 from ..core import Prediction, Record
 from ..core.angles import FloatArray
 from ..core.array_files import keyed, under
 from ..core.types import IntArray
-from ..training.by_distance import HeldOutScores, Mixture, choose_weights
-from ..training.selection import HeldOut, groups_in_space
+from ..training.selection import HeldOut
 from .model import Arrays, field_arrays, from_field_arrays
 
 PREFIX, ROWS = "reception/", "rows"  # prefix of the arrays of a run file, and key of the training rows
@@ -42,7 +41,12 @@ LOG_WIDTH, LOGIT = 1.0, 2.0  # prior standard deviations of the width's logarith
 BETWEEN_DB, BETWEEN_LOGIT = 5.0, 1.0
 """Prior standard deviations between receivers of sensitivities and of ceilings' logits: a receiver with few missing
 rows takes those of the others."""
+LEVEL, SLOPE = 2.0, 1.0
+"""Prior standard deviations of the weights' logits, and of their slopes over the logarithm of the distance."""
+NEAREST = 0.05  # distance below which weights do not change, as a share of the median held-out distance
+FEWEST = 10  # held-out pairs that were not received, or were, below which the rate is used alone: fewer are chance
 LEAST = 1e-9  # least probability, so that logarithms are finite
+NO_WEIGHT = -50.0  # logit of parts without weight
 
 
 @dataclass(frozen=True)
@@ -127,18 +131,64 @@ class ReceivedShares:
 
 
 @dataclass(frozen=True)
+class Weights:
+    """Weights of `PARTS`: softmax of level + slope log(d / scale + `NEAREST`) at the distance d to the nearest row.
+
+    Neighbours say most near the training rows, the strength beyond.
+
+    Attributes:
+        scale_m: unit of the distance, metres.
+        level: logits at the unit [3]; that of the rate is 0.
+        slope: slopes of the logits [3].
+    """
+
+    scale_m: float
+    level: FloatArray
+    slope: FloatArray
+
+    def __call__(self, distance_m: FloatArray) -> FloatArray:
+        """Weights [m, 3] at distances [m], of sum 1."""
+        x = np.log(distance_m / self.scale_m + NEAREST)[:, None]
+        return np.asarray(softmax(self.level + self.slope * x, axis=1))
+
+    @classmethod
+    def fit(cls, parts: FloatArray, distance_m: FloatArray, received: NDArray[np.bool_]) -> Weights:
+        """The weights of the greatest posterior density, by probabilities [q, 3] of pairs, received or not [q]."""
+        scale_m = float(np.median(distance_m)) or 1.0
+        if min(received.sum(), (~received).sum()) < FEWEST:
+            return cls(scale_m, np.array([0, NO_WEIGHT, NO_WEIGHT]), np.zeros(3))
+        # The rate and the strength need no row nearby.
+        first, prior = np.array([0, 0, 0, -1.0]), np.repeat([LEVEL, SLOPE], 2)
+        x = np.log(distance_m / scale_m + NEAREST)
+
+        def of(values: FloatArray) -> Weights:
+            return cls(scale_m, np.concatenate([[0.0], values[:2]]), np.concatenate([[0.0], values[2:]]))
+
+        def cost(values: FloatArray) -> tuple[float, FloatArray]:
+            """Minus the logarithm of the posterior density, and its gradient."""
+            weights, away = of(values)(distance_m), (values - first) / prior
+            p = np.clip((weights * parts).sum(axis=1), LEAST, 1 - LEAST)
+            by_p = np.where(received, -1 / p, 1 / (1 - p))
+            by_logit = (by_p[:, None] * weights * (parts - p[:, None]))[:, 1:]
+            value = -np.log(np.where(received, p, 1 - p)).sum() + np.square(away).sum() / 2
+            return float(value), np.concatenate([by_logit.sum(axis=0), x @ by_logit]) + away / prior
+
+        return of(minimize(cost, first, jac=True, method="L-BFGS-B").x)
+
+
+@dataclass(frozen=True)
 class Reception:
     """Probability of reception, fitted to a model's held-out predictions.
 
     Attributes:
         shares: shares of the training rows that were received.
         sensitivity: reception by the predicted strength.
-        mixture: weights of `PARTS` by the distance to the nearest training row.
+        weights: weights of `PARTS` by the distance to the nearest training row.
     """
 
     shares: ReceivedShares
     sensitivity: Sensitivity
-    mixture: Mixture
+    weights: Weights
 
     @classmethod
     def fit(
@@ -155,41 +205,24 @@ class Reception:
         """
         receiver, row = held_out.every.T
         received = ~np.isnan(record.observation[receiver, row])
-        predicted = Prediction(predicted.mean.astype(float), predicted.stated_std)
-        of_receivers = receiver, received, len(record.receivers)
-        sensitivity = Sensitivity.fit(predicted.mean, predicted.stated_std, *of_receivers)
-        trial = cls(ReceivedShares(record, remaining), sensitivity, Mixture(np.zeros(1), np.eye(3)[:1]))
+        mean, std = predicted.mean.astype(float), predicted.stated_std
+        sensitivity = Sensitivity.fit(mean, std, receiver, received, len(record.receivers))
+        shares = ReceivedShares(record, remaining)
         parts, distance_m = np.empty((len(row), len(PARTS))), np.empty(len(row))
         for number in np.unique(receiver):
             pairs = receiver == number
-            of_pairs = Prediction(predicted.mean[pairs], predicted.stated_std[pairs])
-            parts[pairs], distance_m[pairs] = trial.parts(of_pairs, record.tx_pos_m[row[pairs]], int(number))
-
-        def score(weights: FloatArray, chosen: IntArray) -> FloatArray:
-            mixed = np.clip((weights * parts[chosen]).sum(axis=1), LEAST, 1 - LEAST)
-            return np.asarray(np.log(np.where(received[chosen], mixed, 1 - mixed)))
-
-        scores = HeldOutScores(score, distance_m, row, len(PARTS))
-        # Losses by chance, which no position tells, have the rate: others are mixed in for a clear gain.
-        groups = groups_in_space(record.tx_pos_m[row], 0)
-        _, mixture = choose_weights(scores, groups, lambda share: None, trusted=PARTS.index("rate"))
-        return cls(ReceivedShares(record, rows), sensitivity, mixture)
-
-    def parts(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> tuple[FloatArray, FloatArray]:
-        """Probabilities [m, 3] by `PARTS`, and distances [m] to the nearest training row in metres."""
-        near, distance_m = self.shares.near(tx_pos_m, receiver)
-        of_strength = self.sensitivity(prediction.mean, prediction.stated_std, receiver)
-        rate = np.full(len(near), self.shares.rate[receiver])
-        return np.stack([rate, of_strength, near], axis=1), distance_m
+            at = Prediction(mean[pairs], std[pairs]), record.tx_pos_m[row[pairs]], int(number)
+            parts[pairs], distance_m[pairs] = _parts(shares, sensitivity, *at)
+        return cls(ReceivedShares(record, rows), sensitivity, Weights.fit(parts, distance_m, received))
 
     def __call__(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
         """A receiver's predictions at positions [m, 3] in metres with their probability of reception."""
-        parts, distance_m = self.parts(prediction, tx_pos_m, receiver)
-        return replace(prediction, reception=(self.mixture(distance_m) * parts).sum(axis=1))
+        parts, distance_m = _parts(self.shares, self.sensitivity, prediction, tx_pos_m, receiver)
+        return replace(prediction, reception=(self.weights(distance_m) * parts).sum(axis=1))
 
     def arrays(self) -> Arrays:
         """Arrays of a run file."""
-        of_parts = field_arrays(self.sensitivity) | field_arrays(self.mixture) | {ROWS: self.shares.rows}
+        of_parts = field_arrays(self.sensitivity) | field_arrays(self.weights) | {ROWS: self.shares.rows}
         return keyed(PREFIX, of_parts)
 
     @classmethod
@@ -198,7 +231,7 @@ class Reception:
         stored = under(PREFIX, arrays)
         if not stored:
             return None
-        fitted = from_field_arrays(Sensitivity, stored), from_field_arrays(Mixture, stored)
+        fitted = from_field_arrays(Sensitivity, stored), from_field_arrays(Weights, stored)
         return cls(ReceivedShares(record, stored[ROWS]), *fitted)
 
     def facts(self, record: Record) -> dict[str, Any]:
@@ -206,6 +239,16 @@ class Reception:
         fitted = self.sensitivity
         limits = zip(record.receivers, fitted.sensitivity_dbm, fitted.ceiling, strict=True)
         of_receivers = {receiver.name: {"dbm": float(dbm), "ceiling": float(c)} for receiver, dbm, c in limits}
-        table = np.column_stack([self.mixture.distance_m, self.mixture.weights])
-        weights = [dict(zip(("distance_m", *PARTS), map(float, row), strict=True)) for row in table]
+        # At the median distance of the held-out rows.
+        weights = dict(zip(PARTS, map(float, self.weights(np.array([self.weights.scale_m]))[0]), strict=True))
+        weights["distance_m"] = self.weights.scale_m
         return {"sensitivity": {"width_db": fitted.width_db, "receivers": of_receivers, "weights": weights}}
+
+
+def _parts(
+    shares: ReceivedShares, sensitivity: Sensitivity, prediction: Prediction, tx_pos_m: FloatArray, receiver: int
+) -> tuple[FloatArray, FloatArray]:
+    """Probabilities [m, 3] by `PARTS` at positions [m, 3], and distances [m] to the nearest training row, metres."""
+    near, distance_m = shares.near(tx_pos_m, receiver)
+    of_strength = sensitivity(prediction.mean, prediction.stated_std, receiver)
+    return np.stack([np.full(len(near), shares.rate[receiver]), of_strength, near], axis=1), distance_m

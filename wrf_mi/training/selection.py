@@ -88,14 +88,6 @@ def clusters(positions_m: FloatArray, count: int, rng: np.random.Generator) -> I
         return np.asarray(kmeans2(positions_m, count, iter=50, minit="++", missing="warn", rng=rng)[1], np.int64)
 
 
-def groups_in_space(positions_m: FloatArray, seed: int) -> IntArray:
-    """Group of each position [n, 3], at most `FOLDS`, between which errors are independent."""
-    count = min(FOLDS, len(np.unique(positions_m, axis=0)))
-    if count < 2:
-        return np.zeros(len(positions_m), np.int64)
-    return clusters(positions_m, count, np.random.default_rng([seed, 6]))
-
-
 def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:
     """The split with clusters of its training rows moved to the validation rows, seeded by the split.
 
@@ -273,9 +265,11 @@ class HeldOut:
         if len(row) > most:
             drawn = np.sort(np.random.default_rng([seed, 5]).permutation(len(row))[:most])
             receiver, row, away = receiver[drawn], row[drawn], away[drawn]
+        group = np.zeros(len(row), np.int64)
         if fold.held_receivers:
-            return cls(receiver, row, away, np.unique(receiver, return_inverse=True)[1].reshape(-1) % FOLDS)
-        group = groups_in_space(record.tx_pos_m[row], seed)
+            group = np.unique(receiver, return_inverse=True)[1].reshape(-1) % FOLDS
+        elif (count := min(FOLDS, len(np.unique(record.tx_pos_m[row], axis=0)))) > 1:
+            group = clusters(record.tx_pos_m[row], count, np.random.default_rng([seed, 6]))
         return cls(receiver, row, away, group, _received_or_not(record, fold, seed))
 
     def __len__(self) -> int:
@@ -290,8 +284,12 @@ class HeldOut:
 def _received_or_not(record: Record, fold: Split, seed: int) -> IntArray:
     """Pairs of a receiver and a held-out row [p, 2], or some of them, drawn with a seed; see `HeldOut`."""
     numbers = fitted_receivers(record, [fold])[0]
-    missing = np.isnan(record.observation[numbers][:, fold.test]) if task_of(record).in_decibel else np.zeros((0, 0))
-    if not missing.any() or missing.all():
+    trained = np.concatenate([fold.all_train, fold.test])
+    if (
+        fold.held_receivers
+        or not task_of(record).in_decibel
+        or not np.isnan(record.observation[numbers][:, trained]).any()
+    ):
         return np.zeros((0, 2), np.int64)
     pairs = np.stack([values.ravel() for values in np.meshgrid(numbers, fold.test, indexing="ij")], axis=1)
     return pairs[np.sort(np.random.default_rng([seed, 12]).permutation(len(pairs))[:MOST_PAIRS])]
