@@ -36,9 +36,9 @@ from .model import Arrays, field_arrays, from_field_arrays
 PREFIX, ROWS = "reception/", "rows"  # prefix of the arrays of a run file, and key of the training rows
 PARTS = ("rate", "strength", "neighbours")  # probabilities that are mixed
 NEIGHBOURS, SOFTENING_M = 16, 0.4  # training rows of the neighbours' share, and addend of their distances, metres
-WIDTH_DB, CEILING = 6.0, 0.95  # prior medians of the width of the threshold and of the ceiling
+WIDTH_DB = 6.0  # prior median of the width of the threshold
 LOG_WIDTH, LOGIT = 1.0, 2.0  # prior standard deviations of the width's logarithm and of the ceiling's logit
-BETWEEN_DB, BETWEEN_LOGIT = 5.0, 1.0
+BETWEEN_DB, BETWEEN_LOGIT = 5.0, 0.5
 """Prior standard deviations between receivers of sensitivities and of ceilings' logits: a receiver with few missing
 rows takes those of the others."""
 LEVEL, SLOPE = 2.0, 1.0
@@ -70,23 +70,25 @@ class Sensitivity:
 
     @classmethod
     def fit(
-        cls, mean_dbm: FloatArray, std_db: FloatArray, receiver: IntArray, received: NDArray[np.bool_], count: int
+        cls, mean_dbm: FloatArray, std_db: FloatArray, receiver: IntArray, received: NDArray[np.bool_], rate: FloatArray
     ) -> Sensitivity:
-        """The sensitivities of ``count`` receivers of the greatest posterior density.
+        """The sensitivities of the greatest posterior density.
 
         Args:
             mean_dbm: strengths predicted for rows, received or not [q], dBm.
             std_db: their standard deviations [q].
             receiver: number of the receiver of each [q].
             received: whether it was received [q].
-            count: number of receivers.
+            rate: share of all training rows that each receiver received [n_rx].
         """
-        # Width, common ceiling and sensitivity, then differences of the receivers from these.
-        first = np.concatenate([[np.log(WIDTH_DB), logit(CEILING), np.quantile(mean_dbm, 0.05)], np.zeros(2 * count)])
+        # Width, common sensitivity and ceiling above the rate, then differences of the receivers from these: if losses
+        # are by chance, ceilings are the rates, of which the training rows say more than the held-out ones.
+        count, of_rate = len(rate), logit(rate)
+        first = np.concatenate([[np.log(WIDTH_DB), 0, np.quantile(mean_dbm, 0.05)], np.zeros(2 * count)])
         prior = np.repeat([LOG_WIDTH, LOGIT, np.inf, BETWEEN_DB, BETWEEN_LOGIT], [1, 1, 1, count, count])
 
         def of(x: FloatArray) -> Sensitivity:
-            return cls(x[2] + x[3 : 3 + count], expit(x[1] + x[3 + count :]), float(np.exp(x[0])))
+            return cls(x[2] + x[3 : 3 + count], expit(of_rate + x[1] + x[3 + count :]), float(np.exp(x[0])))
 
         def cost(x: FloatArray) -> tuple[float, FloatArray]:
             """Minus the logarithm of the posterior density, and its gradient."""
@@ -206,8 +208,8 @@ class Reception:
         receiver, row = held_out.every.T
         received = ~np.isnan(record.observation[receiver, row])
         mean, std = predicted.mean.astype(float), predicted.stated_std
-        sensitivity = Sensitivity.fit(mean, std, receiver, received, len(record.receivers))
         shares = ReceivedShares(record, remaining)
+        sensitivity = Sensitivity.fit(mean, std, receiver, received, shares.rate)
         parts, distance_m = np.empty((len(row), len(PARTS))), np.empty(len(row))
         for number in np.unique(receiver):
             pairs = receiver == number
