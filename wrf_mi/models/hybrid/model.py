@@ -177,10 +177,11 @@ class _Fit:
         residuals = self.residuals if RESIDUAL in used else None
         rows = self.problem.rows(self.split)
         hybrid = FittedHybrid(self.problem, rows, parts, mixture, residuals, intervals, stated)
-        every = {name: self.predictions[name].every for name in parts if name in self.predictions}
-        pairs = {name: predicted for name, predicted in every.items() if predicted is not None}
-        if self.fold is not None and self.held_out is not None and len(pairs) == len(parts):
-            hybrid.fit_reception(self.fold, self.held_out, pairs)
+        if intervals is not None and self.fold is not None and self.held_out is not None:
+            every = {name: self.predictions[name].every for name in parts}
+            pairs = {name: predicted for name, predicted in every.items() if predicted is not None}
+            if len(pairs) == len(parts):
+                hybrid.fit_reception(self.fold, self.held_out, pairs)
         return hybrid
 
     def _mixture(self, count: int) -> tuple[Mixture, Intervals | None, dict[str, Any]]:
