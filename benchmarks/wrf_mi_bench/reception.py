@@ -1,4 +1,4 @@
-"""Probability of reception of four models beside the constant rate of each receiver and the nearest training rows.
+"""Probability of reception of three models beside the constant rate of each receiver and the nearest training rows.
 
 Every cell is a run of ``wrf-mi train`` on a data set as it was measured, or with a sensitivity at which a third of its
 values is missing: weaker ones are removed before anything is fitted. Each run is stored when it is measured
@@ -26,13 +26,13 @@ from wrf_mi.tasks.scores import bootstrap
 from .bench import FLAT
 from .comparison import data_folder, line, measured_on, say, stored_part
 from .sources import fit_key, source_files
-from .stages import ALONE, HYBRID, run_of_cell
+from .stages import ALONE, run_of_cell
 from .stages import Cell as Rows
 from .tables import scene_of_data
 
 RUNS = Path("runs/bench/reception")
 MISSING = 1 / 3  # share of missing values
-MODELS = ("idw", "kriging", "ray-tracing", HYBRID)  # in the order of their duration
+MODELS = ("idw", "kriging", "ray-tracing")
 WORSE = 0.02  # largest loss against a reference that is allowed, nats
 SCORES = ("log_loss", "brier", "calibration_error")
 
@@ -73,10 +73,8 @@ CELLS = (
 def measure(cell: Cell, model: str, place: Path) -> dict[str, Any]:
     """Block ``reception`` of a run, gains in log loss on both references by row, and the error of received rows."""
     scene = scene_of_data(cell.dataset, place)
-    more: dict[str, Any] = {"scene": scene}
-    if model != HYBRID:
-        alone = ALONE[model]
-        more = {"scene": scene if alone.scene else None, "settings": alone.settings, "intervals": True}
+    alone = ALONE[model]
+    more: dict[str, Any] = {"scene": scene if alone.scene else None, "settings": alone.settings, "intervals": True}
     folder = place / cell.name / model
     run = run_of_cell(cell, cell.record(), folder, model, **more)
     arrays = stored_arrays(folder / PREDICTIONS)
@@ -107,15 +105,14 @@ def main() -> dict[str, Any]:
     ``failed`` is there where a log loss exceeds that of a reference clearly and by more than `WORSE`.
     """
     data_folder(FLAT)
-    place, parts = RUNS / fit_key(source_files()), dict[tuple[Cell, str], dict[str, Any]]()
-    for model in MODELS:
-        for cell in CELLS:
+    place, rows, parts = RUNS / fit_key(source_files()), list[dict[str, Any]](), list[dict[str, Any]]()
+    for cell in CELLS:
+        for model in MODELS:
             say("reception", f"{cell.title}: {model}")
-            part = stored_part("reception", f"{cell.name}-{model}", partial(measure, cell, model, place))
-            parts[cell, model] = part
-            say("reception", row_of(cell, model, part)["value"])
-    rows = [row_of(cell, model, parts[cell, model]) for cell in CELLS for model in MODELS]
-    result: dict[str, Any] = {"rows": rows, "measured": measured_on(parts.values())}
+            parts.append(stored_part("reception", f"{cell.name}-{model}", partial(measure, cell, model, place)))
+            rows.append(row_of(cell, model, parts[-1]))
+            say("reception", rows[-1]["value"])
+    result: dict[str, Any] = {"rows": rows, "measured": measured_on(parts)}
     worse = [row["what"] for row in rows if any(gain < -WORSE and high < 0 for gain, _, high in row["gain"])]
     return result | ({"failed": f"clearly worse than a reference: {', '.join(worse)}"} if worse else {})
 
