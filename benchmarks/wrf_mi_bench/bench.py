@@ -119,6 +119,7 @@ _OWN: Mapping[str, Check] = {
     ),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
+    "reception": _here("reception", "reception:main", FLAT, resumes=True, table="reception:table"),
     "phase-error": _here("spectra from scans", "rooms:phase_errors", resumes=True, table="rooms:phase_table"),
     "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),
     "gpu": _here("a GPU beside the CPU", "gpu:main", table="gpu:table", gpu=True),

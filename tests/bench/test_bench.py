@@ -28,6 +28,7 @@ ON_PAGE = {
     **dict.fromkeys(("pareto", "scaling", "operator", "training"), "speed.md"),
     **dict.fromkeys(("stages", "intervals"), "hybrid.md"),
     **{"elsewhere": "numerics.md", "rooms": "correction.md", "locate": "locate.md", "phase-error": "scenes.md"},
+    "reception": "maps.md",
 }
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
 NOT_LISTED = ("stress", "robustness", "sentinels", "new-carriers", "new-receivers")

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from wrf_mi_bench import bench, comparison, stages
+from wrf_mi_bench import bench, comparison, reception, stages
 from wrf_mi_bench.comparison import MEASURED, STORED, measured_on, stored_part
 from wrf_mi_bench.locate import CELLS as LOCATE_CELLS
 from wrf_mi_bench.locate import STRETCH, stretches, summary
@@ -178,3 +178,24 @@ def test_seeds_that_score_the_same_rows_do_not_narrow_an_interval():
     assert once[2].value == pytest.approx((errors[1] - errors[0]).mean())
     assert (thrice[2].low, thrice[2].high) == pytest.approx((once[2].low, once[2].high))
     assert thrice[:2] == pytest.approx(once[:2])
+
+
+def test_weakest_values_are_missing_and_reception_is_tabulated(monkeypatch):
+    observed = np.arange(12, dtype=np.float32).reshape(2, 6)
+    observed[0, 0] = np.nan  # counts among the missing third
+    monkeypatch.setattr(reception, "load_record", lambda _: strengths(observed))
+    cell = reception.Cell("flat-ble", "blocked", 400, True)
+    np.testing.assert_array_equal(np.isnan(cell.record().observation), [[True] * 4 + [False] * 2, [False] * 6])
+    scores = {"log_loss": 0.25, "brier": 0.1, "calibration_error": 0.01}
+    block = {"received": 2 / 3, **scores, "reference": {name: scores for name in reception.REFERENCES}}
+    row = reception.row_of(cell, "idw", {"reception": block, "gain": [], "score": {"median": 3.0}})
+    cells = (
+        "flat-ble, blocked, 400 rows, a third missing (67% received) | idw | **0.250** | 0.250 | 0.250 | 0.100 | 0.010"
+    )
+    assert reception.table([row]).splitlines()[2] == f"| {cells} | 3.00 |"
+
+
+def strengths(observed: np.ndarray) -> Record:
+    """Strengths of receivers at one place."""
+    places = [Receiver(str(k), np.zeros(3), np.array([0.0, 0, 0, 1])) for k in range(len(observed))]
+    return Record("made-up", "rssi", np.zeros((observed.shape[1], 3)), tuple(places), observed)

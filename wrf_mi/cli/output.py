@@ -59,6 +59,8 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     if "inside_90" in metrics:
         share = f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals"
         print(f"{share}, CRPS {metrics['crps']:.3g}")
+    if "reception" in metrics:
+        _show_reception(metrics["reception"])
     costs = {"train_seconds": "trained {:.0f} s", "ms_per_sample": "{:.3g} ms per sample"}
     costs |= {"peak_memory_mb": "peak memory {:.0f} MB"}
     # Models of other programs need not state theirs.
@@ -74,6 +76,18 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     if folder is not None:
         print(f"results: {folder}")
     return 0
+
+
+def _show_reception(block: dict[str, Any]) -> None:
+    """Print the scores of probabilities of reception beside those of both references."""
+    names = {"log_loss": "log loss", "brier": "Brier score", "calibration_error": "calibration error"}
+    reference = block["reference"]
+    values = (
+        f"{words} {block[key]:.3f} (rate of each receiver {reference['reception_rate'][key]:.3f}, "
+        f"nearest rows {reference['reception_neighbours'][key]:.3f})"
+        for key, words in names.items()
+    )
+    print(f"reception of {block['received']:.0%} of the test values: " + ", ".join(values))
 
 
 def _show_receivers(metrics: dict[str, Any]) -> None:

@@ -91,7 +91,8 @@ def _add_predict(commands: Any) -> None:
     source.add_argument("--tx", metavar="FILE.csv", help=text)
     text = "array tx_pos [m, 3] in metres (and heading_rad [m], frequency_hz [m]), or uplink [m, antennas, subcarriers]"
     source.add_argument("--input", metavar="FILE.npz", help=text)
-    text = "file to write: FILE.npz, or FILE.csv (signal strengths; columns x, y, z in metres, NAME_dbm, NAME_std_db)"
+    text = "file to write: FILE.npz, or FILE.csv (signal strengths; columns x, y, z in metres, NAME_dbm, NAME_std_db, "
+    text += "NAME_received)"
     parser.add_argument("--out", required=True, metavar="FILE", help=text)
     add_operator(parser)
     add_scheduler(parser)

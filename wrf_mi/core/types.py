@@ -22,6 +22,8 @@ class Prediction:
         mean: [m, *shape of an observation], as in `wrf_mi.core.Record`: grey in 0..1, dBm, or complex coefficients.
         std: standard deviation of observation minus mean, real, of the mean's shape and unit; for a complex coefficient
             sqrt(E |h - mean|^2). None: the model states none.
+        reception: probability that the receiver receives anything [m], of signal strengths; mean and std are those of
+            what is received. None: the model states none.
 
     Raises:
         ValueError: shapes that differ.
@@ -29,6 +31,7 @@ class Prediction:
 
     mean: NDArray[Any]
     std: FloatArray | None = None
+    reception: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.std is not None and np.shape(self.mean) != np.shape(self.std):

@@ -49,6 +49,7 @@ from ..core.carriers import FREQUENCY
 from ..core.receivers import receiver_index
 from ..models import Inputs
 from ..receivers.spreads import PathStatistics
+from ..runs.results import RECEPTION
 from ..runs.run import Run, open_run
 from ..tasks import Task, task_of
 from ..training.session import OnProgress, quiet
@@ -239,8 +240,12 @@ def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Cond
         # The law of total variance: within a heading, and between headings.
         std_db = np.sqrt(np.square(of_headings(level.std)).mean(axis=1) + means.var(axis=1))
         variables["power_std_db"] = std_db
+        reception = parts.prediction.reception
+        received = None if reception is None else of_headings(reception).mean(axis=1)
+        if received is not None:
+            variables[RECEPTION] = received
         if (limit := conditions.threshold_db) is not None:
-            variables["coverage_probability"] = coverage_probability(variables["power_dbm"], std_db, limit)
+            variables["coverage_probability"] = coverage_probability(variables["power_dbm"], std_db, limit, received)
     if parts.traced is not None and parts.learned is not None:
         sides = parts.traced, parts.learned
         traced, learned = (of_headings(task.level(Prediction(side)).mean).mean(axis=1) + added for side in sides)

@@ -16,21 +16,28 @@ from ..core import InputError, Prediction
 from ..core.angles import FloatArray
 from ..runs.results import read_run
 from ..tasks import TASKS
+from ..tasks.scores import calibration_bins, probability_scores
 
-BINS = 10  # number of bins of the predicted probability
 QUANTILES = np.linspace(0.1, 0.9, 9)  # quantiles of the measured levels that are thresholds where none is stated
 FEWEST = 20  # least number of pairs in a bin that is drawn
 
 
-def coverage_probability(level_db: ArrayLike, std_db: ArrayLike, threshold_db: float) -> FloatArray:
+def coverage_probability(
+    level_db: ArrayLike, std_db: ArrayLike, threshold_db: float, reception: ArrayLike | None = None
+) -> FloatArray:
     """Probability that a normal level with a mean and a standard deviation exceeds a threshold, in any shape.
+
+    With the probability of ``reception``, of which mean and deviation are conditional: that it is received and exceeds.
 
     >>> coverage_probability([-90.0, -80.0], [5.0, 5.0], -90.0).round(3).tolist()
     [0.5, 0.977]
+    >>> coverage_probability(-80.0, 5.0, -90.0, reception=0.5).round(3).tolist()
+    0.489
     """
     above = np.asarray(level_db, float) - threshold_db
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(ndtr(above / np.asarray(std_db, float)))
+        exceeds = np.asarray(ndtr(above / np.asarray(std_db, float)))
+    return exceeds if reception is None else np.asarray(exceeds * reception)
 
 
 @dataclass(frozen=True)
@@ -48,27 +55,30 @@ class Reliability:
 
 
 def reliability(
-    level_db: FloatArray, std_db: FloatArray, measured_db: FloatArray, threshold_db: FloatArray | None = None
+    level_db: FloatArray,
+    std_db: FloatArray,
+    measured_db: FloatArray,
+    threshold_db: FloatArray | None = None,
+    reception: FloatArray | None = None,
 ) -> Reliability:
     """Reliability of probabilities of coverage from predicted levels, their deviations and measured levels, any shape.
 
-    Measured levels are NaN where nothing was received. Thresholds [t] are by default `QUANTILES` of the measured
-    levels. `InputError` where nothing was measured.
+    Measured levels are NaN where nothing was received, which counts as not covered where the probability of
+    ``reception`` is stated and else not at all. Thresholds [t] are by default `QUANTILES` of the measured levels.
+    `InputError` where nothing was measured.
     """
     known = np.isfinite(measured_db)
-    level, std, measured = (np.asarray(values, float)[known] for values in (level_db, std_db, measured_db))
-    if not len(measured):
+    if not known.any():
         raise InputError("coverage: no measured level to compare with; give a run whose test rows were received")
-    thresholds = np.quantile(measured, QUANTILES) if threshold_db is None else np.atleast_1d(threshold_db).astype(float)
-    probability = np.concatenate([coverage_probability(level, std, threshold) for threshold in thresholds])
+    thresholds = np.quantile(measured_db[known], QUANTILES) if threshold_db is None else np.atleast_1d(threshold_db)
+    counted = known if reception is None else np.isfinite(reception)
+    received = None if reception is None else reception[counted]
+    level, std, measured = (np.asarray(values, float)[counted] for values in (level_db, std_db, measured_db))
+    probability = np.concatenate([coverage_probability(level, std, float(limit), received) for limit in thresholds])
     exceeded = np.concatenate([measured > threshold for threshold in thresholds])
-    place = np.minimum((probability * BINS).astype(int), BINS - 1)
-    count = np.bincount(place, minlength=BINS)
-    with np.errstate(invalid="ignore"):
-        predicted, observed = (np.bincount(place, values, BINS) / count for values in (probability, exceeded))
-    error = float(np.nansum(np.abs(observed - predicted) * count) / count.sum())
-    brier = float(np.square(probability - exceeded).mean())
-    return Reliability(predicted, observed, count, error, brier, thresholds)
+    scores = probability_scores(probability, exceeded)
+    bins = calibration_bins(probability, exceeded)
+    return Reliability(*bins, scores["calibration_error"], scores["brier"], thresholds)
 
 
 def run_reliability(folder: str | Path, threshold_db: FloatArray | None = None) -> Reliability:
@@ -88,7 +98,8 @@ def run_reliability(folder: str | Path, threshold_db: FloatArray | None = None) 
         return task.level(Prediction(values.reshape(rows, *values.shape[2:]), deviations))
 
     stated = levels(results.prediction, results.std)
-    return reliability(stated.mean, stated.stated_std, levels(results.truth).mean, threshold_db)
+    received = None if results.reception is None else results.reception.astype(float).ravel()
+    return reliability(stated.mean, stated.stated_std, levels(results.truth).mean, threshold_db, received)
 
 
 def reliability_figure(results: Mapping[str, Reliability]) -> Figure:

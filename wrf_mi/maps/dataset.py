@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Receiver
 from ..core.files import atomic_file, atomic_folder, os_failure
+from ..runs.results import RECEPTION
 from .grid import Grid, SurfaceMesh
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ POWER, BEST = "power_dbm", "best_receiver"
 VARIABLES = {
     POWER: ("dBm", "expected received power"),
     "power_std_db": ("dB", "standard deviation of the received power"),
+    RECEPTION: ("1", "probability that a transmission is received"),
     "coverage_probability": ("1", "probability that the received power exceeds the threshold"),
     "path_gain_db": ("dB", "path gain, gains of both antennas included"),
     "traced_share": ("dBm", "received power that the traced side of the model states alone"),

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
-from ..core.array_files import under
+from ..core.array_files import keyed, under
 from ..core.types import IntArray
 from ..tasks import task_of
 from ..training.by_distance import GAPS, Intervals, expected_size, fit_intervals
@@ -31,21 +31,29 @@ from .model import (
     from_field_arrays,
     known_positions,
 )
+from .reception import Reception
 
 INTERVALS, ROWS = "intervals/", "intervals_rows"  # prefix of the arrays of intervals, and key of the training rows
 
 
 class FittedWithIntervals(Fitted):
-    """A fitted model whose standard deviations are those of held-out errors, by the distance to training rows [n]."""
+    """A fitted model whose standard deviations are those of held-out errors, by the distance to training rows [n].
 
-    def __init__(self, fitted: Fitted, record: Record, rows: IntArray, intervals: Intervals) -> None:
+    Of signal strengths with rows that were not received it states the probability of reception, too.
+    """
+
+    def __init__(
+        self, fitted: Fitted, record: Record, rows: IntArray, intervals: Intervals, reception: Reception | None
+    ) -> None:
         self.fitted, self._record, self._rows, self._intervals = fitted, record, rows, intervals
+        self._reception = reception
         self._distance = RowDistance.of_rows(record, rows)
         self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
 
     def _stated(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
         distance_m = self._distance(tx_pos_m, receiver)
-        return self._intervals(prediction.mean, expected_size(task_of(self._record), prediction), distance_m)
+        stated = self._intervals(prediction.mean, expected_size(task_of(self._record), prediction), distance_m)
+        return stated if self._reception is None else self._reception(stated, tx_pos_m, receiver)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Prediction of the model with calibrated standard deviations, [m, ...]."""
@@ -71,12 +79,13 @@ class FittedWithIntervals(Fitted):
         return self.fitted.depends_on_heading
 
     def arrays(self) -> Arrays:
-        """Arrays of the model and of the intervals."""
-        return self.fitted.arrays() | field_arrays(self._intervals, INTERVALS) | {ROWS: self._rows}
+        """Arrays of the model, of the intervals and of the reception."""
+        reception = {} if self._reception is None else keyed(INTERVALS, self._reception.arrays())
+        return self.fitted.arrays() | field_arrays(self._intervals, INTERVALS) | reception | {ROWS: self._rows}
 
     def facts(self) -> dict[str, object]:
-        """Facts of the model."""
-        return self.fitted.facts()
+        """Facts of the model and of the reception."""
+        return self.fitted.facts() | ({} if self._reception is None else self._reception.facts(self._record))
 
 
 class WithIntervals(Model):
@@ -97,14 +106,20 @@ class WithIntervals(Model):
         shutil.rmtree(place.folder)
         size = expected_size(task_of(record), predicted)
         intervals = fit_intervals(predicted.mean, held_out.observed(record), size, held_out.distance_m, held_out.row)
-        return FittedWithIntervals(fitted, record, problem.rows(split), intervals)
+        reception, every, rows = None, predicted.every, problem.rows(split)
+        if every is not None:
+            distance_m = RowDistance.of_rows(record, fold.all_train).of_pairs(record, *held_out.every.T)
+            stated = intervals(every.mean, expected_size(task_of(record), every), distance_m)
+            reception = Reception.fit(record, rows, fold.all_train, held_out, stated)
+        return FittedWithIntervals(fitted, record, rows, intervals, reception)
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedWithIntervals:
         """The model and its intervals."""
         intervals = from_field_arrays(Intervals, under(INTERVALS, arrays))
         of_model = {key: values for key, values in arrays.items() if not key.startswith("intervals")}
         fitted = self.model.load(of_model, problem, folder)
-        return FittedWithIntervals(fitted, problem.record, arrays[ROWS], intervals)
+        reception = Reception.from_arrays(under(INTERVALS, arrays), problem.record)
+        return FittedWithIntervals(fitted, problem.record, arrays[ROWS], intervals, reception)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse rows that are too few to hold some out, and what the model refuses."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,14 +10,23 @@ from numpy.typing import NDArray
 
 from ..core import Prediction, Record, Split
 from ..core.antenna import AS_STATED
-from ..core.array_files import stored_arrays, write_arrays
+from ..core.array_files import keyed, stored_arrays, under, write_arrays
 from ..core.types import IntArray
 from ..datasets.observations import fitted_receivers
 from ..scene.correction_data import read_correction_data
 from ..tasks import task_of
 from ..training.selection import HeldOut
-from .model import Fitted, Model, Problem, Session, inputs_of
+from .model import Arrays, Fitted, Model, Problem, Session, inputs_of
 from .receiver_places import placed_problem
+
+EVERY = "every/"  # prefix of the arrays of `HeldOut.every`
+
+
+@dataclass(frozen=True)
+class HeldOutPrediction(Prediction):
+    """Predictions of held-out observations, and of all pairs of `HeldOut.every`; None: of no pairs."""
+
+    every: Prediction | None = None
 
 
 def labelled(session: Session, label: str) -> Session:
@@ -66,7 +75,7 @@ def as_unseen(mean: NDArray[Any], problem: Problem, held_out: HeldOut) -> NDArra
 
 def held_out_predictions(
     entry: Model, problem: Problem, fold: Split, held_out: HeldOut, session: Session, name: str
-) -> Prediction:
+) -> HeldOutPrediction:
     """Predictions [q, ...] of held-out observations of a fold by a model that is fitted to the other rows.
 
     They are kept in the session's folder; a stopped fit goes on with them. ``name`` is for the progress callback.
@@ -78,16 +87,26 @@ def held_out_predictions(
     if not path.exists():
         session.folder.mkdir(parents=True, exist_ok=True)
         fitted, numbers = fit_fold(entry, problem, fold, labelled(session, f"{name}, held-out rows"))
-        predictions = [
-            predicted_rows(fitted, record, held_out.row[held_out.receiver == receiver], place)
-            for place, receiver in enumerate(numbers)
-            if (held_out.receiver == receiver).any()
-        ]
-        # Predicted receiver by receiver, while a fold may hold receivers out in any order.
-        order = np.argsort(np.argsort(held_out.receiver, kind="stable"), kind="stable")
-        arrays = {"mean": np.concatenate([prediction.mean for prediction in predictions])[order]}
-        if predictions[0].std is not None:
-            arrays["std"] = np.concatenate([prediction.stated_std for prediction in predictions])[order]
+        arrays = _of_pairs(fitted, record, numbers, held_out.receiver, held_out.row)
+        if len(held_out.every):
+            arrays |= keyed(EVERY, _of_pairs(fitted, record, numbers, *held_out.every.T))
         write_arrays(path, arrays)
     arrays = stored_arrays(path)
-    return Prediction(as_unseen(arrays["mean"], problem, held_out), arrays.get("std"))
+    every = under(EVERY, arrays)
+    pairs = Prediction(every["mean"], every.get("std")) if every else None
+    return HeldOutPrediction(as_unseen(arrays["mean"], problem, held_out), arrays.get("std"), every=pairs)
+
+
+def _of_pairs(fitted: Fitted, record: Record, numbers: IntArray, receiver: IntArray, row: IntArray) -> Arrays:
+    """Arrays ``mean`` and, if stated, ``std`` of pairs [q] by a model of the receivers of some numbers."""
+    predictions = [
+        predicted_rows(fitted, record, row[receiver == number], place)
+        for place, number in enumerate(numbers)
+        if (receiver == number).any()
+    ]
+    # Predicted receiver by receiver, while a fold may hold receivers out in any order.
+    order = np.argsort(np.argsort(receiver, kind="stable"), kind="stable")
+    arrays = {"mean": np.concatenate([prediction.mean for prediction in predictions])[order]}
+    if predictions[0].std is not None:
+        arrays["std"] = np.concatenate([prediction.stated_std for prediction in predictions])[order]
+    return arrays

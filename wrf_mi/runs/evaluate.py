@@ -29,7 +29,8 @@ from ..models.receiver_places import stored_places
 from ..tasks import CARRIER, LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
 from .folder import METRICS, PREDICTIONS, RunConfig
-from .results import CONSTANT, SCORES, Observations, against_constant, constant_scores, reference_key
+from .reception import reception_arrays, reception_block
+from .results import CONSTANT, RECEPTION, SCORES, Observations, against_constant, constant_scores, reference_key
 
 Predict = Callable[[IntArray, int], "NDArray[Any] | Prediction"]
 """Predicts what the receiver of an index observes in rows [m] of the record: spectra [m, H, W], powers [m] in dBm or
@@ -82,9 +83,9 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     Returns:
         The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, ``constant``
         (`wrf_mi.runs.results.against_constant`), for several receivers ``receivers``, with standard deviations
-        ``inside_90`` and ``crps``, ``n_train``, ``n_test``, ``n_not_scored``, ``ms_per_sample``), and the arrays of
-        ``predictions.npz``. An observation that is not finite is not scored: its truth is NaN; so are all of the
-        trained receivers in a split that holds out others.
+        ``inside_90`` and ``crps``, with probabilities of reception ``reception``, ``n_train``, ``n_test``,
+        ``n_not_scored``, ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is not finite
+        is not scored: its truth is NaN; so are all of the trained receivers in a split that holds out others.
 
     Raises:
         InputError: no test rows or none that is finite, predictions of another shape or not finite, or a receiver that
@@ -109,6 +110,8 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     if stated[0].std is not None:
         arrays["std"] = np.full(prediction.shape, np.nan, np.float32)
         arrays["std"][scored] = [p.stated_std for p in stated]
+    if stated[0].reception is not None:
+        arrays |= reception_arrays(record, split, truth, dict(zip(scored, stated, strict=True)))
     metrics = score(arrays, record.task) | {
         NOT_SCORED: broken,
         **_few_rows(record, split),
@@ -166,6 +169,8 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
     if "std" in arrays:
         stated = arrays["prediction"], arrays["std"], arrays["truth"]
         metrics["inside_90"], metrics["crps"] = inside_interval(*stated), crps(*stated)
+    if RECEPTION in arrays:
+        metrics["reception"] = reception_block(arrays)
     return metrics
 
 
@@ -297,7 +302,9 @@ def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
     ``receiver_name`` [n_rx]. ``prediction`` and, if known, ``truth`` and ``reference_<name>`` are grey values in 0..1
     [n_rx, m, H, W] float32, power in dBm [n_rx, m] float32 (NaN: not received), or channel coefficients
     [n_rx, m, subcarriers] or [n_rx, m, antennas, subcarriers] complex64. ``std``, if stated, is the predicted standard
-    deviation of the same shape, real.
+    deviation of the same shape, real. ``probability_of_reception`` [n_rx, m], if stated, is the probability that
+    anything is received, with the references ``reception_rate``, the receiver's share of received training rows, and
+    ``reception_neighbours``, that of the nearest ones.
     """
     written = without_single_axis(arrays)
     write_arrays(path, written, compressed=True)

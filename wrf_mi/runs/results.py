@@ -27,6 +27,7 @@ Observations = NDArray[np.float32] | NDArray[np.complex64]
 
 REMEDY = "run evaluate to write it anew"
 CONSTANT = "constant"  # key of the block in ``metrics.json``
+RECEPTION = "probability_of_reception"  # key in ``predictions.npz`` and variable of a map
 SCORES = "constant_score"
 """Key of the constant prediction's scores [n_rx, m] among the arrays of an evaluation; they are not stored."""
 
@@ -57,6 +58,8 @@ class Results:
     references: dict[str, Observations]
     # stated standard deviations of the predictions, of the same shape and real; None: none are stated
     std: NDArray[np.float32] | None
+    # stated probabilities of reception [n_rx, m]; None: none are stated
+    reception: NDArray[np.float32] | None
     # pairs (seconds, score on validation rows while they were held out) by name of the fold, "" without folds
     validation: dict[str, list[tuple[float, float]]]
 
@@ -119,6 +122,7 @@ def read_run(path: str | Path, name: str | None = None) -> Results:
         truth=arrays["truth"],
         references={key: arrays[reference_key(key)] for key in references},
         std=arrays.get("std"),
+        reception=arrays.get(RECEPTION),
         validation=_read_logs(folder),
     )
 
@@ -168,7 +172,7 @@ def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict
     with readable(path, f"{path}: missing; run evaluate to write it", REMEDY):
         stored = stored_arrays(path)
     _require(path, stored, ("row", "tx_pos", "receiver_name", *observed))
-    observed += {"std"} & stored.keys()
+    observed += {"std", RECEPTION} & stored.keys()
     arrays: dict[str, Any] = {key: stored[key] for key in ("row", "tx_pos", *observed)}
     names = stored["receiver_name"]
     shapes = ", ".join(f"{key} {value.shape}" for key, value in arrays.items())

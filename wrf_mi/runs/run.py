@@ -30,6 +30,7 @@ from ..parallel import PartsProgress, Scheduler, row_parts
 from ..training.predictor import Predictor
 from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
 from .prediction_file import check_prediction_file, spooled, write_prediction_file
+from .results import RECEPTION
 
 PREDICTED_PER_CHUNK = 256  # positions that are predicted at a time: 33 MB of spectra of 90 x 360 for each receiver
 MOST_PER_CHUNK, CHUNK_BYTES = 4096, 1 << 25
@@ -186,7 +187,7 @@ class Run:
     def predict_inputs(self, inputs: Inputs, receiver: int) -> Prediction:
         """Predict the observations of the receiver of an index; errors as those of `predict`."""
         self.check_inputs(inputs)
-        means, stds = list[NDArray[Any]](), list[FloatArray | None]()
+        chunks = list[Prediction]()
         for rows, chunk in self.predicted_parts(inputs, receiver):
             if not rows.start:
                 chunk_bytes = chunk.mean.nbytes + (0 if chunk.std is None else chunk.std.nbytes)
@@ -194,12 +195,15 @@ class Run:
                 needed = 2 * chunk_bytes * len(inputs) / max(len(chunk.mean), 1)
                 what = f"{self.folder}: predictions at {len(inputs)} positions at once"
                 require_memory(needed, what, "predict fewer at a time, or into a file (predict_to_file)")
-            means.append(chunk.mean)
-            stds.append(chunk.std)
-        if len(means) == 1:
-            return Prediction(means[0], stds[0])
-        std = None if stds[0] is None else np.concatenate([part for part in stds if part is not None])
-        return Prediction(np.concatenate(means), std)
+            chunks.append(chunk)
+        if len(chunks) == 1:
+            return chunks[0]
+
+        def joined(name: str) -> Any:
+            parts = [getattr(chunk, name) for chunk in chunks]
+            return None if parts[0] is None else np.concatenate(parts)
+
+        return Prediction(joined("mean"), joined("std"), joined("reception"))
 
     def predicted_parts(self, inputs: Inputs, receiver: int) -> Iterator[tuple[slice, Prediction]]:
         """Predictions of the receiver of an index in chunks, with the rows of each: memory for a chunk at a time.
@@ -263,9 +267,9 @@ class Run:
         shape, arrays = (len(self.receivers), len(inputs)), dict[str, NDArray[Any]]()
 
         def collect(rows: slice, receiver: int, chunk: Prediction) -> None:
-            std = None if chunk.std is None else chunk.std.astype(np.float32)
-            for name, values in (("prediction", chunk.mean), ("std", std)):
+            for name, values in (("prediction", chunk.mean), ("std", chunk.std), (RECEPTION, chunk.reception)):
                 if values is not None:
+                    values = values if name == "prediction" else values.astype(np.float32)
                     if name not in arrays:
                         arrays[name] = spooled(out.parent, (*shape, *values.shape[1:]), values.dtype)
                     arrays[name][receiver, rows] = values

@@ -22,6 +22,7 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2  # Stabilising constants of Wang et al. (200
 SSIM_SAMPLE = WINDOW**2 / (WINDOW**2 - 1)  # Sample variance of a window over its variance
 RESAMPLES = 2000
 """Number of bootstrap resamples: ends of a 95 % interval are then exact to a few hundredths of its width."""
+BINS = 10  # Bins of predicted probabilities
 REAL_90, COMPLEX_90 = 1.6449, 1.5174
 """Standard deviations within which 90 % of a normal and of a circular complex normal variable lie."""
 MixtureScores = Callable[[FloatArray, IntArray], FloatArray]
@@ -109,6 +110,40 @@ def crps(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> float:
     z = error / spread
     density = np.exp(-np.square(z) / 2) / np.sqrt(2 * np.pi)
     return float((spread * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))).mean())
+
+
+def calibration_bins(probability: FloatArray, happened: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Mean predicted probability, observed share and number of events [n] in bins of the probability.
+
+    Means of empty bins are NaN.
+    """
+    place = np.minimum((probability * BINS).astype(int), BINS - 1)
+    count = np.bincount(place, minlength=BINS)
+    with np.errstate(invalid="ignore"):
+        predicted, observed = (np.bincount(place, values, BINS) / count for values in (probability, happened))
+    return predicted, observed, count
+
+
+def probability_scores(probability: FloatArray, happened: NDArray[np.bool_]) -> dict[str, float]:
+    """Scores of predicted probabilities of events [n], the lower the better.
+
+    ``log_loss`` in nats and ``brier`` are proper scores (Gneiting and Raftery, "Strictly proper scoring rules,
+    prediction, and estimation" (2007), JASA 102); ``calibration_error`` is the mean distance of the observed shares
+    from the predicted probabilities in `calibration_bins`, which a constant may have small.
+
+    >>> scores = probability_scores(np.array([0.25, 0.25, 0.25, 0.25]), np.array([True, False, False, False]))
+    >>> {name: round(value, 4) for name, value in scores.items()}
+    {'log_loss': 0.5623, 'brier': 0.1875, 'calibration_error': 0.0}
+    """
+    predicted, observed, count = calibration_bins(probability, happened)
+    with np.errstate(divide="ignore"):  # infinite where something certain does not happen
+        log_loss = -np.log(np.where(happened, probability, 1 - probability)).mean()
+    error = np.nansum(np.abs(observed - predicted) * count) / count.sum()
+    return {
+        "log_loss": float(log_loss),
+        "brier": float(np.square(probability - happened).mean()),
+        "calibration_error": float(error),
+    }
 
 
 def _check(prediction: NDArray[Any], truth: NDArray[Any]) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,6 +25,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..datasets.observations import LEAST_ROWS, fitted_receivers, rows_received
 from ..datasets.splits import rows_left
+from ..tasks import task_of
 
 Option = TypeVar("Option")
 
@@ -38,6 +39,7 @@ number of groups of held-out observations."""
 MOST_OBSERVATIONS, MOST_VALUES = (200, 600), 20_000
 """Largest number of held-out observations that weights and intervals are chosen from: 600 single numbers, fewer of many
 values, but 200."""
+MOST_PAIRS = 3000  # largest number of held-out pairs of a receiver and a row, received or not
 
 
 def improves(score: FloatArray, before: FloatArray, higher_is_better: bool, errors: float = 1.0) -> bool:
@@ -221,6 +223,13 @@ class RowDistance:
             self._trees[receiver] = cKDTree(np.reshape(self._known_m(receiver), (-1, 3)))
         return np.asarray(self._trees[receiver].query(tx_pos_m)[0])
 
+    def of_pairs(self, record: Record, receiver: IntArray, row: IntArray) -> FloatArray:
+        """Distances [q] in metres of pairs of a receiver and a row of a record."""
+        distance_m = np.empty(len(row))
+        for number in np.unique(receiver):
+            distance_m[receiver == number] = self(record.tx_pos_m[row[receiver == number]], int(number))
+        return distance_m
+
 
 @dataclass(frozen=True)
 class HeldOut:
@@ -231,12 +240,15 @@ class HeldOut:
         row: row of the record [q].
         distance_m: distance to the nearest row that remained and that the receiver received [q], metres.
         group: group of independent errors [q], fewer than `FOLDS`: clusters of positions, or receivers.
+        every: pairs of a receiver and a row of signal strengths, received or not [p, 2], by which the probability of
+            reception is fitted; none where nothing is missing, or the split holds out receivers.
     """
 
     receiver: IntArray
     row: IntArray
     distance_m: FloatArray
     group: IntArray
+    every: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
     @classmethod
     def of(cls, record: Record, fold: Split, seed: int) -> HeldOut:
@@ -258,7 +270,7 @@ class HeldOut:
             group = np.unique(receiver, return_inverse=True)[1].reshape(-1) % FOLDS
         elif (count := min(FOLDS, len(np.unique(record.tx_pos_m[row], axis=0)))) > 1:
             group = clusters(record.tx_pos_m[row], count, np.random.default_rng([seed, 6]))
-        return cls(receiver, row, away, group)
+        return cls(receiver, row, away, group, _received_or_not(record, fold, seed))
 
     def __len__(self) -> int:
         """Number of held-out observations."""
@@ -267,3 +279,17 @@ class HeldOut:
     def observed(self, record: Record) -> NDArray[Any]:
         """Observations [q, ...]."""
         return record.observation[self.receiver, self.row]
+
+
+def _received_or_not(record: Record, fold: Split, seed: int) -> IntArray:
+    """Pairs of a receiver and a held-out row [p, 2], or some of them, drawn with a seed; see `HeldOut`."""
+    numbers = fitted_receivers(record, [fold])[0]
+    trained = np.concatenate([fold.all_train, fold.test])
+    if (
+        fold.held_receivers
+        or not task_of(record).in_decibel
+        or not np.isnan(record.observation[numbers][:, trained]).any()
+    ):
+        return np.zeros((0, 2), np.int64)
+    pairs = np.stack([values.ravel() for values in np.meshgrid(numbers, fold.test, indexing="ij")], axis=1)
+    return pairs[np.sort(np.random.default_rng([seed, 12]).permutation(len(pairs))[:MOST_PAIRS])]

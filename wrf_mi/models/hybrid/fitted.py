@@ -16,11 +16,12 @@ from ...core.array_files import keyed, under
 from ...core.types import IntArray
 from ...tasks import task_of
 from ...training.by_distance import LEAST, Intervals, Mixture, expected_size
-from ...training.selection import RowDistance, rows_at_receiver
+from ...training.selection import HeldOut, RowDistance, rows_at_receiver
 from ..error_prior import ErrorPrior
 from ..held_out import predicted_rows
 from ..interpolation.kriging import Kriged, Kriging
 from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays
+from ..reception import Reception
 from .scene_side import SceneSide, by_stage
 
 LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
@@ -102,6 +103,7 @@ class FittedHybrid(Fitted):
     residuals: Residuals | None  # what the scene's side leaves; None: it has no weight
     intervals: Intervals | None  # standard deviations; None: none are stated
     stated: dict[str, Any]  # further entries of ``metrics.json``
+    reception: Reception | None = None  # probability of reception; None: not fitted
 
     def __post_init__(self) -> None:
         self._distance = RowDistance.of_rows(self.problem.record, self.known)
@@ -185,6 +187,8 @@ class FittedHybrid(Fitted):
         if task_of(self.problem.record).image:
             mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
         prediction = self._with_intervals(mean, size, distance_m) if std else Prediction(mean)
+        if std and self.reception is not None:
+            prediction = self.reception(prediction, tx_pos_m, receiver)
         if not totals.any(axis=1).all():
             return Decomposition(prediction, paths=paths)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -206,6 +210,18 @@ class FittedHybrid(Fitted):
             return Prediction(mean, np.maximum(size * factor, LEAST))
         return self.intervals(mean, expected_size(task_of(self.problem.record), Prediction(mean)), distance_m)
 
+    def fit_reception(self, fold: Split, held_out: HeldOut, every: Mapping[str, Prediction]) -> None:
+        """Fit the probability of reception by predictions of `HeldOut.every` of the parts of a fold, by name."""
+        record, (receiver, row) = self.problem.record, held_out.every.T
+        distance_m = RowDistance.of_rows(record, fold.all_train).of_pairs(record, receiver, row)
+        weights, parts = self._weights(distance_m), [every[name] for name in self.parts]
+        mean = np.einsum("qk,kq->q", weights, [part.mean for part in parts])
+        size = np.zeros(len(mean))
+        if self._states_sizes:
+            size = np.einsum("qk,kq->q", weights, [part.stated_std for part in parts])
+        stated = self._with_intervals(mean, size, distance_m)
+        self.reception = Reception.fit(record, self.known, fold.all_train, held_out, stated)
+
     def error_prior(self, receiver: int) -> ErrorPrior | None:
         """That of what the scene's side leaves, or else of the first part that states one."""
         kriged = None if self.residuals is None else self.residuals.by_receiver.get(receiver)
@@ -221,6 +237,8 @@ class FittedHybrid(Fitted):
         arrays |= field_arrays(self.mixture, "mixture/")
         if self.intervals is not None:
             arrays |= field_arrays(self.intervals, "intervals/")
+        if self.reception is not None:
+            arrays |= self.reception.arrays()
         if self.residuals is not None:
             arrays |= keyed("residuals/", self.residuals.arrays())
         for name, fitted in self.parts.items():
@@ -234,7 +252,7 @@ class FittedHybrid(Fitted):
 
     def facts(self) -> dict[str, Any]:
         """Stages with their held-out scores, form and weights of the mixture, and held-out scores of its parts."""
-        return self.stated
+        return self.stated | ({} if self.reception is None else self.reception.facts(self.problem.record))
 
 
 def _spread(values: FloatArray, shape: tuple[int, ...]) -> FloatArray:

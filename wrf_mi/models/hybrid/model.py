@@ -33,8 +33,9 @@ from ...training.selection import HeldOut, hold_out
 from .. import MODELS
 from ..checks import check_held_receivers, check_record
 from ..few_rows import with_few_rows
-from ..held_out import fit_model, held_out_predictions, labelled
+from ..held_out import HeldOutPrediction, fit_model, held_out_predictions, labelled
 from ..model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions
+from ..reception import Reception
 from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
 from .scene_side import (
     FAST,
@@ -147,7 +148,7 @@ class _Fit:
         self.held_out = None if self.fold is None else HeldOut.of(self.record, self.fold, problem.seed)
         self.parts = parts_of(problem, split)
         self.fitted: dict[str, Fitted] = {}
-        self.predictions: dict[str, Prediction] = {}
+        self.predictions: dict[str, HeldOutPrediction] = {}
         self.reports: list[StageReport] = []
         self.residuals: Residuals | None = None
         self.scene_seconds = 0.0
@@ -174,7 +175,14 @@ class _Fit:
         stated = {"stages": stated_reports(self.reports), **chosen, "weights": weights}
         parts = {name: self._part(name) for name in used if name != RESIDUAL}
         residuals = self.residuals if RESIDUAL in used else None
-        return FittedHybrid(self.problem, self.problem.rows(self.split), parts, mixture, residuals, intervals, stated)
+        rows = self.problem.rows(self.split)
+        hybrid = FittedHybrid(self.problem, rows, parts, mixture, residuals, intervals, stated)
+        if intervals is not None and self.fold is not None and self.held_out is not None:
+            every = {name: self.predictions[name].every for name in parts}
+            pairs = {name: predicted for name, predicted in every.items() if predicted is not None}
+            if len(pairs) == len(parts):
+                hybrid.fit_reception(self.fold, self.held_out, pairs)
+        return hybrid
 
     def _mixture(self, count: int) -> tuple[Mixture, Intervals | None, dict[str, Any]]:
         """Weights of so many predictions, intervals, and how both were chosen; the first where no rows are held out."""
@@ -232,7 +240,7 @@ class _Fit:
             places = held_out.receiver == receiver
             mean[places] += among_known(record.tx_pos_m[held_out.row[places]], int(receiver), mean.shape[1:])
         del among_known  # as large as those of all rows
-        self.predictions[RESIDUAL] = Prediction(np.clip(mean, 0, 1) if self.task.image else mean)
+        self.predictions[RESIDUAL] = HeldOutPrediction(np.clip(mean, 0, 1) if self.task.image else mean)
         self.residuals = Residuals.of(left, record, self.split, seed)
 
     def _weights(self, held_out: HeldOut) -> tuple[str, Mixture, dict[str, float]]:
@@ -324,7 +332,8 @@ class Hybrid(Model):
         stored, left = under("intervals/", arrays), under("residuals/", arrays)
         residuals = Residuals.from_arrays(left, problem.record) if left else None
         intervals = from_field_arrays(Intervals, stored) if stored else None
-        return FittedHybrid(problem, arrays["known"], parts, mixture, residuals, intervals, facts)
+        reception = Reception.from_arrays(arrays, problem.record)
+        return FittedHybrid(problem, arrays["known"], parts, mixture, residuals, intervals, facts, reception)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse unknown positions, and data that no part can be fitted to."""

@@ -32,7 +32,7 @@ from ...training.selection import HeldOut, hold_out_groups
 from .. import model
 from ..error_prior import ErrorPrior
 from ..gaussian.model import WRF_GS_PLUS, FittedField
-from ..held_out import as_unseen, labelled
+from ..held_out import HeldOutPrediction, as_unseen, labelled
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, PredictAll, Problem, Session
 
 logger = logging.getLogger(__name__)
@@ -85,7 +85,7 @@ class SceneSide(Fitted):
         """Arrays of the fitted model."""
         return self.fitted.arrays()
 
-    def held_out_at(self, held_out: HeldOut) -> Prediction | None:
+    def held_out_at(self, held_out: HeldOut) -> HeldOutPrediction | None:
         """Predictions of held-out rows, with errors as of rows that the scene has not seen; None: not available."""
         return None
 
@@ -204,14 +204,14 @@ class FittedPaths(SceneSide):
         """Arrays of the graph, and its settings."""
         return super().arrays() | {"settings": model.settings_array(self.fitted.config)}
 
-    def held_out_at(self, held_out: HeldOut) -> Prediction | None:
+    def held_out_at(self, held_out: HeldOut) -> HeldOutPrediction | None:
         """Reports of the rows that the stages were chosen by; None: not all held-out rows are among these."""
         reports = self.fitted.held_out
         if reports is None:
             return None
         place = {pair: number for number, pair in enumerate(zip(reports.receiver, reports.row, strict=True))}
         numbers = [place.get(pair, -1) for pair in zip(held_out.receiver, held_out.row, strict=True)]
-        return None if -1 in numbers else Prediction(as_unseen(reports.report[numbers], self.problem, held_out))
+        return None if -1 in numbers else HeldOutPrediction(as_unseen(reports.report[numbers], self.problem, held_out))
 
 
 class InScene(Model):

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import InputError, Prediction, Receiver, Split
+from ...core import InputError, Receiver, Split
 from ...core.files import write_atomically
 from ...correction.options import STRENGTHS
 from ...tasks import task_of
@@ -27,7 +27,7 @@ from ...tracing.power_map import PowerMap, TracedPower, Tracer, power_tracer, tr
 from ...tracing.tracer import check_polarization
 from ...training.by_distance import unit_means
 from ...training.selection import HeldOut, hold_out
-from ..held_out import held_out_predictions
+from ..held_out import HeldOutPrediction, held_out_predictions
 from ..interpolation.by_task import STOPS, StrengthKriging
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from ..model import Arrays, Model, Problem, Session
@@ -48,9 +48,9 @@ class FittedStrengths(SceneSide):
     """The scene's side for strengths: kriging about traced power."""
 
     fitted: Strengths
-    unseen: Prediction | None = None  # predictions of held-out rows
+    unseen: HeldOutPrediction | None = None  # predictions of held-out rows
 
-    def held_out_at(self, held_out: HeldOut) -> Prediction | None:
+    def held_out_at(self, held_out: HeldOut) -> HeldOutPrediction | None:
         """Predictions of the rows that were held out, see `SceneSide`."""
         return self.unseen
 
@@ -59,13 +59,13 @@ def _chosen(
     stated: Problem, inner: Problem, split: Split, fold: Split, held_out: HeldOut, session: Session
 ) -> dict[str, Any]:
     """Scene, mean and hyperparameters, by rows that a fold holds out and, the last, those that it trains on."""
-    record = stated.record
+    record, received = stated.record, replace(held_out, every=held_out.every[:0])
     unit = held_out.receiver if split.held_receivers else held_out.row
 
     def score(problem: Problem, mean: ExactMean | None = None) -> float:
         # Which mean is better does not depend on a search for hyperparameters.
         model, place = StrengthsInScene(StrengthSettings(search_rows=NEVER), mean), inside(session, "tried")
-        means = held_out_predictions(model, problem, fold, held_out, place, "mean").mean
+        means = held_out_predictions(model, problem, fold, received, place, "mean").mean
         shutil.rmtree(place.folder)
         of_row = task_of(record).mixtures(means[None], held_out.observed(record))
         return float(unit_means(of_row(np.ones((len(held_out), 1)), np.arange(len(held_out))), unit).mean())

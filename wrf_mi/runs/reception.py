@@ -1,0 +1,49 @@
+"""Scores of probabilities of reception beside those of two references."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import Prediction, Record, Split
+from ..models.reception import ReceivedShares
+from ..tasks.scores import calibration_bins, probability_scores
+from .results import RECEPTION
+
+REFERENCES = ("reception_rate", "reception_neighbours")
+"""Arrays of ``predictions.npz``: the share of the training rows that a receiver received, and of the nearest ones."""
+
+
+def reception_arrays(
+    record: Record, split: Split, truth: NDArray[Any], stated: Mapping[int, Prediction]
+) -> dict[str, NDArray[np.float32]]:
+    """Probabilities of reception [n_rx, m] by a model and by two references; NaN where the truth is not scored."""
+    shares, rows = ReceivedShares(record, split.all_train), split.test
+    arrays = {key: np.full(truth.shape, np.nan, np.float32) for key in (RECEPTION, *REFERENCES)}
+    for receiver, prediction in stated.items():
+        near = shares.near(record.tx_pos_m[rows], receiver)[0]
+        known = np.isfinite(truth[receiver]) | np.isnan(record.scored[receiver, rows])
+        for values, probability in zip(
+            arrays.values(), (prediction.reception, shares.rate[receiver], near), strict=True
+        ):
+            values[receiver] = np.where(known, probability, np.nan)
+    return arrays
+
+
+def reception_block(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Block ``reception`` of ``metrics.json``: scores, those of the references, and the reliability in bins."""
+    known = np.isfinite(arrays[RECEPTION])
+    received = np.isfinite(arrays["truth"][known])
+    probability, *others = (arrays[key][known].astype(float) for key in (RECEPTION, *REFERENCES))
+    bins = [list(map(float, row)) for row in zip(*calibration_bins(probability, received), strict=True) if row[2]]
+    return {
+        "received": float(received.mean()),
+        **probability_scores(probability, received),
+        "reference": {
+            key: probability_scores(values, received) for key, values in zip(REFERENCES, others, strict=True)
+        },
+        "bins": bins,
+    }
