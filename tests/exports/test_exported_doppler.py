@@ -134,7 +134,7 @@ def test_data_sets_state_velocities(flat_folder: Path, room: Path, tmp_path: Pat
     file = write_record_file(tmp_path / "flat.npz", flat)
     assert "velocities" in command.done(["data", "info", file])
     command.refused(["export", file, "--format", "ble", "--out", tmp_path / "ble"], "has tx_velocity_mps, which")
-    run = train(file, tmp_path / "run", "ray-tracing", scene=room, settings=TraceOptions(depth=1)).folder
+    run = train(file, "ray-tracing", out=tmp_path / "run", scene=room, settings=TraceOptions(depth=1)).folder
     out = tmp_path / "run.npz"
     facts = command.json(["export", run, "--format", "doppler", "--bandwidth", "20e6", "--out", out])
     assert (facts["rows"], facts["receivers"]) == (30, 2)

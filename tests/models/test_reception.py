@@ -10,6 +10,8 @@ import pytest
 
 import wrf_mi
 from wrf_mi.core import Prediction, Record
+from wrf_mi.maps.api import radio_map
+from wrf_mi.maps.coverage import run_reliability
 from wrf_mi.models.reception import Sensitivity
 from wrf_mi.tasks.scores import probability_scores
 from wrf_mi.training.selection import HeldOut, hold_out
@@ -63,7 +65,7 @@ def test_reception_is_calibrated_better_than_both_references_and_changes_no_stre
     model: str, intervals: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     record, options = weak_missing(field()), {"split": "blocked", "intervals": intervals}
-    run = wrf_mi.train(record, tmp_path / "run", model, **options)
+    run = wrf_mi.train(record, model, out=tmp_path / "run", **options)
     block = run.metrics["reception"]
     for reference in block["reference"].values():
         assert all(block[name] < value for name, value in reference.items())
@@ -72,7 +74,7 @@ def test_reception_is_calibrated_better_than_both_references_and_changes_no_stre
     sensitivity = wrf_mi.open_run(run.folder / "fold0", record).metrics["sensitivity"]["receivers"].values()
     np.testing.assert_allclose([of["dbm"] for of in sensitivity], np.nanmin(record.observation), atol=STD_DB)
     monkeypatch.setattr(HeldOut, "of", classmethod(without_pairs(HeldOut.of)))
-    plain = wrf_mi.train(record, tmp_path / "plain", model, **options)
+    plain = wrf_mi.train(record, model, out=tmp_path / "plain", **options)
     assert "reception" not in plain.metrics
     assert plain.metrics["abs_error_db"] == run.metrics["abs_error_db"]
 
@@ -83,7 +85,7 @@ def without_pairs(of: object) -> object:
 
 
 def test_reception_is_in_files_and_maps_and_coverage_is_received_and_strong(tmp_path: Path) -> None:
-    run = wrf_mi.train(weak_missing(field()), tmp_path / "run", "kriging", intervals=True)
+    run = wrf_mi.train(weak_missing(field()), "kriging", out=tmp_path / "run", intervals=True)
     at_m = np.array([[1.0, 1, 1.5], [19, 1, 1.5]])
     stated = run.predict(at_m, 0)
     with np.load(run.folder / "predictions.npz") as arrays:
@@ -94,14 +96,14 @@ def test_reception_is_in_files_and_maps_and_coverage_is_received_and_strong(tmp_
     with np.load(tmp_path / "new.npz") as arrays:
         np.testing.assert_allclose(arrays["probability_of_reception"][0], stated.reception, rtol=FLOAT32)
     assert "rx0_received" in (tmp_path / "new.csv").read_text().splitlines()[0].split(",")
-    always = wrf_mi.radio_map(run, step_m=2.0, threshold_dbm=-300)
+    always = radio_map(run, step_m=2.0, threshold_dbm=-300)
     np.testing.assert_allclose(always["coverage_probability"], always["probability_of_reception"], rtol=FLOAT32)
-    strong = wrf_mi.radio_map(run, step_m=2.0, threshold_dbm=-60)
+    strong = radio_map(run, step_m=2.0, threshold_dbm=-60)
     fewer = always["coverage_probability"] - strong["coverage_probability"]
     assert bool((fewer >= 0).all())
     assert float(fewer.max()) > 0.3
     # Values that were not received are not covered at any threshold.
-    everything = wrf_mi.run_reliability(run.folder, np.array([-300.0]))
+    everything = run_reliability(run.folder, np.array([-300.0]))
     assert everything.count.sum() == 2 * run.metrics["n_test"]
     assert everything.brier == pytest.approx(run.metrics["reception"]["brier"], rel=1e-5)
 
@@ -111,7 +113,7 @@ def test_losses_by_chance_have_the_rate_of_each_receiver(tmp_path: Path) -> None
     assert record.official is not None
     lost = rng.uniform(size=(2, ROWS)) < [[0.1], [0.3]]
     record = replace(record, observation=np.where(lost, np.nan, record.observation))
-    run = wrf_mi.train(record, tmp_path / "run", "idw", intervals=True)
+    run = wrf_mi.train(record, "idw", out=tmp_path / "run", intervals=True)
     rows = record.official[0][~lost[:, record.official[0]].all(axis=0)]  # others are in no split
     rate = 1 - lost[:, rows].mean(axis=1)
     for receiver in range(2):
@@ -127,7 +129,7 @@ def test_nothing_is_stated_where_everything_was_received(tmp_path: Path) -> None
     fold = hold_out(record, split)
     assert fold is not None
     assert not len(HeldOut.of(record, fold, 0).every)
-    run = wrf_mi.train(record, tmp_path / "run", "kriging", intervals=True)
+    run = wrf_mi.train(record, "kriging", out=tmp_path / "run", intervals=True)
     assert "reception" not in run.metrics
     assert run.predict(record.tx_pos_m[:2], 0).reception is None
     assert Prediction(np.zeros(1)).reception is None
