@@ -121,6 +121,7 @@ _OWN: Mapping[str, Check] = {
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
     "reception": _here("reception", "reception:main", FLAT, resumes=True, table="reception:table"),
     "phase-error": _here("spectra from scans", "rooms:phase_errors", resumes=True, table="rooms:phase_table"),
+    "closed-forms": _here("traced channels against closed forms", "closed_forms:main", table="closed_forms:table"),
     "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),
     "gpu": _here("a GPU beside the CPU", "gpu:main", table="gpu:table", gpu=True),
     "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),

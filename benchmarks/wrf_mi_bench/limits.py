@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import trimesh
 from scipy.constants import speed_of_light
-from scipy.special import fresnel
 
 from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+
+from .wave_formulas import wedge
 
 HZ = 2.44e9
 DIFFRACTED = TraceOptions(transmission=False, line_of_sight=False, reflection=False, diffraction=True, depth=1)
@@ -52,23 +53,11 @@ def free_space_db(distance_m: float) -> float:
 
 
 def half_plane_db() -> float:
-    """Gain from `BEFORE` to `BEHIND` by a conducting half plane, relative to free space; field across the edge.
-
-    Kouyoumjian and Pathak, "A uniform geometrical theory of diffraction" (1974), eq. 25 with n = 2, which is
-    Sommerfeld's solution there.
-    """
-    k = 2 * np.pi * HZ / speed_of_light
+    """Gain from `BEFORE` to `BEHIND` by a conducting half plane, relative to free space; field across the edge."""
     s = float(np.hypot(BEFORE[0], BEFORE[2]))
-    angle = float(np.arctan2(abs(BEFORE[0]), abs(BEFORE[2])))  # from the screen; that of the other side is its mirror
-
-    def term(difference: float) -> complex:
-        x = k * (s / 2) * 2 * np.cos(difference / 2) ** 2
-        sine, cosine = fresnel(np.sqrt(2 * x / np.pi))
-        transition = 2j * np.sqrt(x) * np.exp(1j * x) * np.sqrt(np.pi / 2) * ((0.5 - cosine) - 1j * (0.5 - sine))
-        return complex(transition / np.cos(difference / 2))
-
-    coefficient = abs(term(2 * np.pi - 2 * angle) + term(2 * np.pi)) / (2 * np.sqrt(2 * np.pi * k))
-    return float(20 * np.log10(coefficient * np.sqrt(1 / (s * s * 2 * s)) * abs(BEHIND[0] - BEFORE[0])))
+    angle = np.arctan2(abs(BEFORE[0]), abs(BEFORE[2]))  # from the screen; that of the other side is its mirror
+    _, across = wedge(2, 2 * np.pi * HZ / speed_of_light, s, s, angle, np.array([2 * np.pi - angle]))
+    return float(20 * np.log10(abs(across[0]) * abs(BEHIND[0] - BEFORE[0])))
 
 
 def sheet(halvings: int = 0) -> trimesh.Trimesh:

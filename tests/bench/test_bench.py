@@ -21,14 +21,14 @@ from wrf_mi.core.registry import resolve
 RESULTS = CHECKOUT / "benchmarks" / "results"
 NEEDS_NO_DATA = {
     *("damaged-scenes", "traced-and-splatted", "scaling", "operator", "stress", "pareto", "rooms", "phase-error"),
-    *("elsewhere", "gpu", "robustness", "sentinels", "new-carriers"),
+    *("closed-forms", "elsewhere", "gpu", "robustness", "sentinels", "new-carriers"),
 }
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
     **dict.fromkeys(("pareto", "scaling", "operator", "training"), "speed.md"),
     **dict.fromkeys(("stages", "intervals"), "hybrid.md"),
     **{"elsewhere": "numerics.md", "rooms": "correction.md", "locate": "locate.md", "phase-error": "scenes.md"},
-    "reception": "maps.md",
+    **{"reception": "maps.md", "closed-forms": "closed-forms.md"},
 }
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
 NOT_LISTED = ("stress", "robustness", "sentinels", "new-carriers", "new-receivers")

@@ -5,9 +5,8 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.constants import epsilon_0, speed_of_light
+from scipy.constants import epsilon_0
 from scipy.optimize import linear_sum_assignment
-from sionna_reference import sionna_paths
 from traced_rooms import (
     FREQUENCY_HZ,
     HEIGHT,
@@ -20,6 +19,8 @@ from traced_rooms import (
     receiver,
     room,
 )
+from wrf_mi_bench.sionna_reference import sionna_paths
+from wrf_mi_bench.stress_oracle import slab
 from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 
@@ -109,17 +110,6 @@ def test_gains_over_a_perfect_ground_are_those_of_two_rays(tmp_path):
     np.testing.assert_allclose(paths.gain, WAVELENGTH_M / (4 * np.pi * lengths), rtol=10 * SINGLE)
 
 
-def slab(thickness_m, permittivity, conductivity):
-    """Reflection at and transmission through a slab in air at normal incidence.
-
-    Source: ITU-R P.2040-3, equations 37, 43 and 44.
-    """
-    eta = permittivity - 1j * conductivity / (2 * np.pi * FREQUENCY_HZ * epsilon_0)
-    r = (1 - np.sqrt(eta)) / (1 + np.sqrt(eta))
-    through = np.exp(-2j * np.pi * FREQUENCY_HZ / speed_of_light * thickness_m * np.sqrt(eta))
-    return r * (1 - through**2) / (1 - r**2 * through**2), (1 - r**2) * through / (1 - r**2 * through**2)
-
-
 def test_gains_at_a_slab_at_normal_incidence(tmp_path):
     """A vertical field is parallel to the wall: the phase is that of the coefficient."""
     scene = room(tmp_path, {"wall": ("itu_brick", sheet(0, 0.0, (-50.0, 50.0), (-50.0, 50.0)))})
@@ -129,7 +119,9 @@ def test_gains_at_a_slab_at_normal_incidence(tmp_path):
     beside, behind = (traced(scene, [[x, 0.0, 0.0]], receiver([2.0, 0, 0]), **options) for x in (4.0, -4.0))
     assert beside.interactions.tolist() == [[0], [1]]
     assert behind.interactions.tolist() == [[4]]
-    for gain, factor in zip((beside.gain[1], behind.gain[0]), slab(THICKNESS_M["itu_brick"], *constants), strict=True):
+    eta = constants[0] - 1j * constants[1] / (2 * np.pi * FREQUENCY_HZ * epsilon_0)
+    across, _ = slab(np.ones(1), eta, THICKNESS_M["itu_brick"], FREQUENCY_HZ)
+    for gain, (factor,) in zip((beside.gain[1], behind.gain[0]), across, strict=True):
         assert abs(gain) == pytest.approx(WAVELENGTH_M / (4 * np.pi * 6) * abs(factor), rel=SINGLE)
         assert np.angle(gain / factor) == pytest.approx(0, abs=SINGLE)
 
@@ -233,14 +225,14 @@ def all_found(paths, length, gain, tolerance):
 @pytest.mark.parametrize("transmission", [False, True])
 def test_every_path_of_sionna_rt_is_found(divided, transmission):
     tx, rx = np.array([1.1, 2.3, 1.2]), np.array([4.6, 1.7, 1.9])
-    length, gain = sionna_paths(divided, tx, rx, refraction=transmission)
+    _, gain, length, _ = sionna_paths(divided, tx, rx, replace(UPRIGHT, transmission=transmission, rays=30_000))
     all_found(traced(divided, tx[None], receiver(rx), transmission=transmission), length, gain, OFF_SURFACE)
 
 
 def test_diffraction_is_that_of_sionna_rt(divided):
     tx, rx = np.array([1.1, 1.3, 1.2]), np.array([4.6, 1.7, 1.9])
-    length, gain = sionna_paths(divided, tx, rx, refraction=False, diffraction=True, edge_diffraction=True)
     options = replace(UPRIGHT, diffraction=True, rays=30_000)
+    _, gain, length, _ = sionna_paths(divided, tx, rx, options)
     found = trace_paths(divided, np.array([tx, [2.0, 2.0, 1.0]]), receiver(rx), options)
     paths = found.paths.select(found.paths.tx == 0)
     assert (paths.interactions == 8).any(axis=1).sum() > 10

@@ -1,0 +1,67 @@
+"""Paths of Sionna RT's own solver, as a reference."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.constants import speed_of_light
+
+from wrf_mi.core.types import FloatArray, IntArray
+from wrf_mi.tracing import TraceOptions
+
+MOST_PATHS = 100_000  # least room for the paths of a transmitter; Sionna RT drops paths beyond it silently
+
+
+def sionna_paths(
+    scene: Any,
+    tx_m: ArrayLike,
+    rx_m: ArrayLike,
+    options: TraceOptions,
+    polarization: str = "V",
+    pattern: str = "iso",
+    turn_rad: Sequence[float] = (0, 0, 0),
+) -> tuple[IntArray, NDArray[np.complex128], FloatArray, FloatArray]:
+    """Paths from isotropic transmitters [n, 3] or [3] to a receiver [3] with a pattern, turned by yaw, pitch and roll.
+
+    Returns:
+        Of p paths: row of the transmitter, gain without the phase exp(-j k length), length in metres from Sionna RT's
+        delay in single precision, and point of the first interaction [p, 3], NaN for none.
+    """
+    import mitsuba as mi
+    from sionna import rt
+
+    assert isinstance(options.rays, int), "a number of rays, not auto"
+    rays = options.rays
+    one: dict[str, Any] = {"num_rows": 1, "num_cols": 1, "polarization": polarization}
+    scene.tx_array, scene.rx_array = rt.PlanarArray(pattern="iso", **one), rt.PlanarArray(pattern=pattern, **one)
+    places = np.atleast_2d(np.asarray(tx_m, float))
+    names = [f"tx{row}" for row in range(len(places))]
+    rx, turn = (mi.Point3f(*np.asarray(values, float).tolist()) for values in (rx_m, turn_rad))
+    for name, place in zip(names, places.tolist(), strict=True):
+        scene.add(rt.Transmitter(name, mi.Point3f(*place)))
+    scene.add(rt.Receiver("rx", rx, orientation=turn))
+    try:
+        paths = rt.PathSolver(deterministic=True)(
+            scene,
+            max_depth=options.depth,
+            los=options.line_of_sight,
+            specular_reflection=options.reflection,
+            diffuse_reflection=options.scattering,
+            refraction=options.transmission,
+            diffraction=options.diffraction,
+            edge_diffraction=options.diffraction,
+            samples_per_src=rays,
+            max_num_paths_per_src=max(MOST_PATHS, rays * options.depth),
+            seed=options.seed,
+        )
+    finally:
+        scene.remove([*names, "rx"])
+    valid = paths.valid.numpy()[0]
+    real, imaginary = (part.numpy()[0, 0, :, 0] for part in paths.a)
+    length = paths.tau.numpy()[0].astype(float) * speed_of_light
+    point = np.full((*valid.shape, 3), np.nan)
+    if options.depth:
+        met = paths.interactions.numpy()[0, 0] != 0
+        point[met] = paths.vertices.numpy()[0, 0][met]
+    return np.nonzero(valid)[0], (real + 1j * imaginary)[valid], length[valid], point[valid]
