@@ -31,6 +31,7 @@ from wrf_mi.tracing.search import chains as search_module
 from wrf_mi.tracing.search import images as images_module
 from wrf_mi.tracing.search.images import image_sources, meeting_point
 from wrf_mi.tracing.sionna.materials import perfect_reflector
+from wrf_mi.tracing.sionna.path_solver import corrected
 
 SINGLE = 2e-4  # Relative; Sionna RT's gains are single precision
 EXACT_M = 1e-12  # Lengths are float64 where the planes are: those of the shoebox are whole numbers
@@ -229,10 +230,12 @@ def test_every_path_of_sionna_rt_is_found(divided, transmission):
     all_found(traced(divided, tx[None], receiver(rx), transmission=transmission), length, gain, OFF_SURFACE)
 
 
-def test_diffraction_is_that_of_sionna_rt(divided):
+def test_diffracted_paths_are_those_of_sionna_rt(divided):
+    """With the corrected fields."""
     tx, rx = np.array([1.1, 1.3, 1.2]), np.array([4.6, 1.7, 1.9])
     options = replace(UPRIGHT, diffraction=True, rays=30_000)
-    _, gain, length, _ = sionna_paths(divided, tx, rx, options)
+    with corrected():
+        _, gain, length, _ = sionna_paths(divided, tx, rx, options)
     found = trace_paths(divided, np.array([tx, [2.0, 2.0, 1.0]]), receiver(rx), options)
     paths = found.paths.select(found.paths.tx == 0)
     assert (paths.interactions == 8).any(axis=1).sum() > 10

@@ -23,6 +23,7 @@ from ..options import TraceOptions
 from ..search.chains import SPECULAR, TRANSMISSION, Legs, join
 from ..search.images import image_sources
 from ..search.surfaces import Surfaces
+from .diffraction import diffraction_matrix
 
 SLOTS_PER_CHUNK = 1 << 22
 """Rays x targets x interactions of one search. Sionna RT takes 8 bytes for each to find duplicates, and some 70 bytes
@@ -197,7 +198,7 @@ def field_of(
     buffer.valid = dr.full(mi.Bool, True, buffer.buffer_size)
     points = (values for end in ends for values in (end.position_m, end.angles))
     source_m, source_angles, target_m, target_angles = (to_vectors(rows, mi.Point3f) for rows in points)
-    with _accurate_roots():
+    with corrected():
         evaluated = calculator(
             wavelength=scene.wavelength,
             paths=buffer,
@@ -215,19 +216,20 @@ def field_of(
 
 
 @contextmanager
-def _accurate_roots() -> Iterator[None]:
-    """Let Sionna RT compute square roots of complex permittivities by Dr.Jit while the block lasts."""
+def corrected() -> Iterator[None]:
+    """Correct Sionna RT's fields while the block lasts: diffraction, and square roots of complex permittivities."""
     import drjit as dr
+    from sionna.rt import RadioMaterial
     from sionna.rt.utils import electromagnetics
 
     # Sionna RT 2.2 takes the imaginary part, the attenuation in a slab, from the difference of modulus and real part:
     # of 6.31 - 0.0026j single precision leaves it 35 % off. Dr.Jit's root has no such difference.
-    stated = electromagnetics.complex_sqrt
-    electromagnetics.complex_sqrt = dr.sqrt
+    stated: Any = electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix
+    electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix = dr.sqrt, diffraction_matrix
     try:
         yield
     finally:
-        electromagnetics.complex_sqrt = stated
+        electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix = stated
 
 
 def _pattern(devices: Devices, index: Any, receives: bool = False) -> Any:
