@@ -29,6 +29,7 @@ from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks import TASKS, instrument_of, task_of
 from wrf_mi.tracing import TraceResult
 from wrf_mi.tracing.options import TraceOptions
+from wrf_mi.tracing.sionna.path_solver import sionna_diffraction
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi_bench.random_room import CARRIER_HZ, DEFAULT, OPTIONS, Survey, random_room_record
 
@@ -157,7 +158,8 @@ def measure_phase_errors(seed: int, folder: Path) -> list[list[float]]:
     for hz in CARRIERS_HZ:
         instrument = SpectrumInstrument((array_at(record.receivers[0], hz),), np.array([hz]), size=SIZE)
         tracer = RayTracer(true, instrument, TRUTH)
-        truth = tracer.observe(tracer.trace(record.tx_pos_m))[0]
+        with sionna_diffraction():
+            truth = tracer.observe(tracer.trace(record.tx_pos_m))[0]
         paths = RayTracer(scan, instrument, PREDICTION).trace(record.tx_pos_m).paths
         spectra = [replace(instrument, phase_error=rad).observe(paths)[0] for rad in PHASE_ERRORS_RAD]
         means.append([float(np.mean(TASKS["spectrum"].score(predicted, truth))) for predicted in spectra])

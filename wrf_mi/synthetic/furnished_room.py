@@ -36,6 +36,7 @@ from ..receivers.channel import array_channels
 from ..receivers.reports import minmax_scale
 from ..tracing.options import TraceOptions
 from ..tracing.paths.result import recompute
+from ..tracing.sionna.path_solver import sionna_diffraction
 from ..tracing.sionna.scenes import open_scene
 from .laboratory import ARRAY_FACTS, FREQUENCY_HZ, RECEIVER, SCANNER_M, SPACING_M
 from .searches import Searches, free_positions, searched_paths, set_scattering
@@ -203,7 +204,8 @@ def _spectra(
     for index, receiver in enumerate(receivers):
         assert receiver.array_m is not None
         text = "tracing the furnished room" + (f" to the {receiver.name}" if len(receivers) > 1 else "")
-        signals = channels_at_carriers([*scenes.values()], receiver, *how, progress=text if progress else None)
+        with sionna_diffraction():
+            signals = channels_at_carriers([*scenes.values()], receiver, *how, progress=text if progress else None)
         for number, hz in enumerate(scenes):
             for row, signal in enumerate(signals[..., number]):
                 spectra[index, row, number] = minmax_scale(bartlett_spectrum(signal, receiver.array_m, hz, *size))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -215,6 +216,19 @@ def field_of(
     return gain.real, gain.imag
 
 
+_AS_SIONNA = ContextVar("diffracted fields of Sionna RT", default=False)
+
+
+@contextmanager
+def sionna_diffraction() -> Iterator[None]:
+    """Diffracted fields of Sionna RT 2.2 while the block lasts, with which data sets were made that stay as they are."""
+    token = _AS_SIONNA.set(True)
+    try:
+        yield
+    finally:
+        _AS_SIONNA.reset(token)
+
+
 @contextmanager
 def corrected() -> Iterator[None]:
     """Correct Sionna RT's fields while the block lasts: diffraction, and square roots of complex permittivities."""
@@ -225,7 +239,8 @@ def corrected() -> Iterator[None]:
     # Sionna RT 2.2 takes the imaginary part, the attenuation in a slab, from the difference of modulus and real part:
     # of 6.31 - 0.0026j single precision leaves it 35 % off. Dr.Jit's root has no such difference.
     stated: Any = electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix
-    electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix = dr.sqrt, diffraction_matrix
+    diffracted = stated[1] if _AS_SIONNA.get() else diffraction_matrix
+    electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix = dr.sqrt, diffracted
     try:
         yield
     finally:
