@@ -239,7 +239,7 @@ def test_carrier_decides_materials_and_phase(tmp_path):
 
 
 def test_kinds_are_those_of_the_page():
-    page = (Path(__file__).parents[2] / "docs" / "howto" / "check.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "mesh.md").read_text("utf-8")
     for kind, (level, description) in KINDS.items():
         assert level in LEVELS
         assert f"| `{kind}` | {description} |" in page, kind
