@@ -101,7 +101,7 @@ _OWN: Mapping[str, Check] = {
     "flat-plan": _here("mesh of a flat", "scene:flat_plan", FLAT),
     "stress": _here("numbers under stress", "stress:main", quick="stress:quick"),
     "pareto": _here("run time against error", "table_pages:pareto", resumes=True, table="table_pages:front_table"),
-    "scaling": _here("cost against work", "scaling:main", table="page_tables:scaling"),
+    "scaling": _here("cost against work", "scaling:main"),
     "operator": _here("prediction by operator", "operator:main", table="page_tables:operator"),
     "training": _here("training", "training:main", RFID, table="page_tables:training"),
     "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="stages:table"),

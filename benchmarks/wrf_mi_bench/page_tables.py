@@ -10,16 +10,6 @@ FIT, STEP = ", fit to its final accuracy", ", a step of "
 SPECTRUM = "ms of one spectrum, "
 
 
-def scaling(rows: Sequence[Row]) -> str:
-    """Exponent of the time over the size, and time and memory at the largest size."""
-    lines = []
-    for row in rows:
-        exponent, times, memory = row["value"].split("; ")
-        growth = exponent.removeprefix("exponent ").partition(" from ")[0]
-        lines.append([row["what"], f"**{growth}**", times.rpartition(", ")[2], memory.rpartition(", ")[2]])
-    return markdown_table(["work", "exponent", "time", "memory"], lines)
-
-
 def operator(rows: Sequence[Row]) -> str:
     """Milliseconds of a spectrum by splatting and by operator."""
     lines = []

@@ -82,7 +82,8 @@ def test_table_names_the_kept_stages_and_the_best_part():
         measured(JOINT, 0.91, (-0.01, -0.03, 0.01)),
     ]
     assert table(rows_of(CELLS[0], results)).splitlines()[2] == (
-        "| rfid-lab, official, 5 rows | **0.9** (0.89) | 88% | mean, field | kriging 0.92 (0.91) | -0.02 (-0.03 to -0.01) |"
+        "| rfid-lab, official, 5 rows | **0.9** (0.89) | 88% | mean, field "
+        "| kriging 0.92 (0.91) | -0.02 (-0.03 to -0.01) |"
     )
 
 
