@@ -100,10 +100,10 @@ _OWN: Mapping[str, Check] = {
     "large-scan": _here("mesh from a scan", "scene:large_scan", OFFICE),
     "flat-plan": _here("mesh of a flat", "scene:flat_plan", FLAT),
     "stress": _here("numbers under stress", "stress:main", quick="stress:quick"),
-    "pareto": _here("run time against error", "table_pages:pareto", resumes=True),
+    "pareto": _here("run time against error", "table_pages:pareto", resumes=True, table="table_pages:front_table"),
     "scaling": _here("cost against work", "scaling:main"),
-    "operator": _here("prediction by operator", "operator:main"),
-    "training": _here("training", "training:main", RFID),
+    "operator": _here("prediction by operator", "operator:main", table="page_tables:operator"),
+    "training": _here("training", "training:main", RFID, table="page_tables:training"),
     "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="stages:table"),
     "intervals": _here(
         "intervals of three models", "stages:intervals", RFID, FLAT, resumes=True, table="stages:interval_table"

@@ -174,9 +174,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         "error, median (mean), m": lambda row: f"**{row['median_m']:.2f}** ({row['mean_m']:.2f})",
         "kNN, median (mean), m": lambda row: f"{row['neighbours_median_m']:.2f} ({row['neighbours_mean_m']:.2f})",
         "gain on kNN, m": lambda row: "{:.2f} ({:.2f} to {:.2f})".format(*row["gain_m"]),
-        "gain on kNN of the best k, m": lambda row: "{:.2f} ({:.2f} to {:.2f})".format(*row["gain_over_best_m"]),
         "inside 90 % regions": lambda row: "{:.0%} ({:.0%} to {:.0%})".format(*row["inside"]),
-        "region, m²": lambda row: f"{row['area_m2']:.1f}",
         "radius, m": lambda row: f"{row['radius_m']:.1f}",
     }
     return markdown_table(list(columns), ([cell(row) for cell in columns.values()] for row in rows))

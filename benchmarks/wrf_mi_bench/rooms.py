@@ -115,18 +115,16 @@ def main() -> dict[str, Any]:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of the accuracy in each room, its scan's errors and the duration of the correction."""
+    """Markdown table of the accuracy in each room, and the duration of the correction."""
     columns = [column for column in COLUMNS if all(column in row["cea_db"] for row in rows)]
-    head = [*columns, "paths missing", "wrong", "phase error", "correction"]
+    head = [*columns, "correction"]
     lines = [f"| room | {' | '.join(head)} |", "| --- |" + " ---: |" * len(head)]
     for row in rows:
-        name, more = f"**median**; {row['what']}: {row['value']}", [""] * 4
-        if "scan" in row:
-            name, scan = row["what"], row["scan"]
-            more = [f"{100 * scan[share]:.0f} %" for share in ("missing", "wrong")]
-            more += [f"{scan['phase_error_rad']:.1f} rad", f"{row['correction']['seconds']:.0f} s"]
+        of_room = "correction" in row
+        name = row["what"] if of_room else f"**median**; {row['what']}: {row['value']}"
         cells = [f"{row['cea_db'][column]:.1f}" for column in columns]
-        lines.append(f"| {' | '.join([name, *cells, *more])} |")
+        seconds = f"{row['correction']['seconds']:.0f} s" if of_room else ""
+        lines.append(f"| {' | '.join([name, *cells, seconds])} |")
     return "\n".join(lines)
 
 

@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from wrf_mi.core.files import write_figure
 from wrf_mi.runs.api import train
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
@@ -26,8 +24,7 @@ from .stages import LAB, Cell
 from .table_plan import SEEDS
 from .tables import scene_of_data
 
-RUNS, PICTURE = Path("runs/bench/rows-saved"), Path("docs/images/rows-saved.png")
-"""Kept results, and the picture, which is written only in a checkout of the project."""
+RUNS = Path("runs/bench/rows-saved")  # kept results
 ROWS: Mapping[str, Sequence[int]] = {LAB: (20, 40, 80, 160), ROOM: (50, 100, 200, 400), FLAT: (50, 100, 200, 400)}
 STEPS = 3000
 RANDOM, MESH, JOINT = "random start", "start from the mesh", "joint with its paths"
@@ -97,26 +94,8 @@ def _task(scores: Sequence[Mapping[str, Any]], dataset: str) -> Task:
     return TASKS[next(entry["task"] for entry in scores if entry["dataset"] == dataset)]
 
 
-def picture(measured: Sequence[Mapping[str, Any]]) -> Figure:
-    """Scores over the number of rows, a panel for each data set: mean and range over seeds."""
-    figure = Figure(figsize=(3.4 * len(ROWS), 3.4), layout="constrained", facecolor="white")
-    panels = figure.subplots(1, len(ROWS), squeeze=False)[0]
-    for axes, (dataset, rows) in zip(panels, ROWS.items(), strict=True):
-        for name in CURVES:
-            scores = curves(measured, dataset, name)
-            (drawn,) = axes.plot(rows, scores.mean(axis=1), marker="o", label=name)
-            axes.fill_between(rows, scores.min(axis=1), scores.max(axis=1), alpha=0.2, color=drawn.get_color())
-        axes.plot(rows, curves(measured, dataset, IDW).mean(axis=1), "k--", label=IDW)
-        label = _task(measured, dataset).label
-        axes.set(xscale="log", xticks=rows, xticklabels=rows, xlabel="training rows", ylabel=label, title=dataset)
-        axes.minorticks_off()
-        axes.grid(alpha=0.3)
-    panels[0].legend(fontsize=8)
-    return figure
-
-
 def main() -> dict[str, Any]:
-    """Measure all data sets, sizes and seeds, what this code has measured before excepted, and draw the picture.
+    """Measure all data sets, sizes and seeds, what this code has measured before excepted.
 
     `InputError` for signal strengths that are not on this machine; the other data are made here.
     """
@@ -128,6 +107,4 @@ def main() -> dict[str, Any]:
                 cell, name = Cell(dataset, "official", n), f"{dataset}-{n}-{seed}"
                 entry = kept(place / f"{name}.json", partial(measure, cell, seed, place / name))
                 scores.append({"dataset": dataset, "rows": n, "seed": seed, **entry})
-    if PICTURE.parent.is_dir():
-        write_figure(PICTURE, picture(scores))
     return {"rows": saved(scores), "scores": scores}

@@ -208,38 +208,24 @@ def main() -> dict[str, Any]:
     return {"rows": rows, "measured": measured_on(parts), **_verdict(rows)}
 
 
-def stages_text(stages: Sequence[Mapping[str, Any]]) -> str:
-    """Stages of a hybrid with the scores of held-out training rows by the stages up to each; those not kept struck."""
-    texts = []
-    for stage in stages:
-        score = "" if stage["held_out"] is None else f" {stage['held_out']:.3g}"
-        texts.append(f"{stage['stage']}{score}" if stage["kept"] else f"~~{stage['stage']}{score}~~")
-    return ", ".join(texts)
-
-
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table, a line for each cell: the hybrid, its stages, its best part by mean score, kriging and IDW."""
-    head = ["data", "hybrid", "inside", "CRPS", "stages, held-out score", "best part alone", "gain over it"]
+    """Markdown table, a line for each cell: the hybrid, its kept stages and its best part by mean score."""
+    head = ["data", "hybrid", "inside", "kept stages", "best part alone", "gain over it"]
     lines = []
     for cell in dict.fromkeys(row["cell"] for row in rows):
         hybrid, *others = (row for row in rows if row["cell"] == cell)
-        medians = {row["model"]: f"{row['score']['median']:.3g}" for row in others}
         best = min(others, key=lambda row: row["gain"])
-        worse = [row["model"] for row in others if row["gain_high"] < 0]
-        inside, crps = hybrid["inside_90"], hybrid["crps"]
+        inside = hybrid["inside_90"]
         cells = [
             hybrid["what"].rpartition(":")[0],
             f"**{hybrid['score']['median']:.3g}** ({hybrid['score']['mean']:.3g})",
             "" if inside is None else f"{inside:.0%}",
-            "" if crps is None else f"{crps:.3g}",
-            stages_text(hybrid["stages"]),
-            f"{best['model']} {medians[best['model']]} ({best['score']['mean']:.3g})",
+            ", ".join(stage["stage"] for stage in hybrid["stages"] if stage["kept"]),
+            f"{best['model']} {best['score']['median']:.3g} ({best['score']['mean']:.3g})",
             f"{best['gain']:.2g} ({best['gain_low']:.2g} to {best['gain_high']:.2g})",
-            *(medians.get(name, "") for name in ("kriging", "idw")),
-            ", ".join(worse),
         ]
         lines.append(cells)
-    return markdown_table([*head, "kriging", "IDW", "clearly worse than"], lines)
+    return markdown_table(head, lines)
 
 
 def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -235,11 +235,18 @@ def fronts(by_part: Mapping[TablePart, Points]) -> list[Row]:
         task = TASKS[part.task]
         for cost, (title, unit) in COSTS.items():
             shown = [
-                f"{name} {points[name]['score']:.{task.digits}f} in {points[name][cost]:.3g} {unit}"
+                f"{name} {points[name]['score']:.{task.digits}f} ({points[name][cost]:.3g} {unit})"
                 for name in front(points, cost, task.higher_is_better)
             ]
             rows.append(line(f"{title_of(part)}, {task.label}, {title}", ", ".join(shown)))
     return rows
+
+
+def front_table(rows: Sequence[Row]) -> str:
+    """Markdown table of the fronts of `fronts` in the time of a prediction."""
+    title, _ = COSTS["ms_per_sample"]
+    lines = [[row["what"].removesuffix(f", {title}"), row["value"]] for row in rows if row["what"].endswith(title)]
+    return markdown_table(["data, score", f"Pareto-optimal methods: score ({title})"], lines)
 
 
 def pareto_figure(by_part: Mapping[TablePart, Points]) -> Figure:

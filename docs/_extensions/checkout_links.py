@@ -47,7 +47,7 @@ def on_site(text: str, docs: Path, folder: Path) -> str:
             return f"[{shown}](/{path.relative_to(docs)}{anchor})"
         checkout = docs.parent
         tables = checkout / "benchmarks/results/tables"
-        pages = {checkout / "README.md": "/index.md", tables: "/all-tables.md", tables / "README.md": "/all-tables.md"}
+        pages = {checkout / "README.md": "/index.md", tables: "/results.md", tables / "README.md": "/results.md"}
         if path in pages:
             return f"[{label}]({pages[path]})"
         if path.parent == checkout / "notebooks":

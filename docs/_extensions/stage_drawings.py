@@ -1,4 +1,4 @@
-"""Drawings of ``docs/pipeline.md``: the graph of the stages with one stage marked, and the steps of that stage.
+"""Drawings of the documents: the graph of the stages with one stage marked, and the steps of that stage.
 
 ``python docs/_extensions/stage_drawings.py`` writes ``docs/images/stages/*.svg``; a test compares them with this file.
 """

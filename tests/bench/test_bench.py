@@ -13,7 +13,7 @@ from wrf_mi_bench import sources
 from wrf_mi_bench.bench import CASES, CHECKS, BenchFailed, bench, case_folder, check_table, read_results
 from wrf_mi_bench.check import main
 from wrf_mi_bench.stress_rows import FITS, STAGES, stages
-from wrf_mi_bench.table_pages import fronts, read_points
+from wrf_mi_bench.table_pages import front_table, fronts, read_points
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
@@ -25,14 +25,14 @@ NEEDS_NO_DATA = {
 }
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
-    **dict.fromkeys(("pareto", "scaling", "operator", "training"), "speed.md"),
+    **dict.fromkeys(("pareto", "operator", "training"), "speed.md"),
     **dict.fromkeys(("stages", "intervals"), "hybrid.md"),
     **{"elsewhere": "numerics.md", "rooms": "correction.md", "locate": "locate.md", "phase-error": "scenes.md"},
-    **{"reception": "maps.md", "closed-forms": "closed-forms.md"},
+    **{"reception": "maps.md", "closed-forms": "numerics.md"},
 }
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
-NOT_LISTED = ("stress", "robustness", "sentinels", "new-carriers", "new-receivers")
-"""Checks of many rows or of a former hybrid; `docs/numerics.md` summarises the first two."""
+NOT_LISTED = ("scaling", "stress", "robustness", "sentinels", "new-carriers", "new-receivers")
+"""Checks of many rows or of a former hybrid; `docs/numerics.md` summarises stress and robustness."""
 OTHER_BLOCKS = ("checks", "figures", "pareto", "ratios")
 """Blocks of pages that are made from several results."""
 FIGURES = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
@@ -133,8 +133,7 @@ def test_documents_show_the_stored_results():
     for name, text in (("figures", bench_module.table(trained)), ("checks", check_table(others))):
         assert text in marked("docs/results.md", name)
     rows = fronts(read_points(RESULTS / "tables"))
-    shown = check_table([{"title": CHECKS["pareto"].title, "figures": {"rows": rows}}])
-    assert marked("docs/speed.md", "pareto") == shown
+    assert marked("docs/speed.md", "pareto") == front_table(rows)
 
 
 def test_documents_show_no_check_without_a_stored_result():

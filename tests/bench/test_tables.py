@@ -9,7 +9,7 @@ import pytest
 from documents import CHECKOUT, marked
 from wrf_mi_bench import bench, sources, table_pages, tables
 from wrf_mi_bench.bench import BenchFailed
-from wrf_mi_bench.table_pages import LEAST, Points, front, fronts, pareto_figure, points_of, read_points
+from wrf_mi_bench.table_pages import LEAST, Points, front, front_table, fronts, pareto_figure, points_of, read_points
 from wrf_mi_bench.table_plan import PARTS, QUICK_PARTS, Row, TablePart, plan
 
 from wrf_mi.core import InputError
@@ -289,8 +289,9 @@ def test_points_are_means_of_medians_over_seeds_of_all_training_rows():
 def test_text_and_picture_show_both_fronts():
     rows = fronts({RFID: POINTS})
     assert [row["what"] for row in rows] == ["rfid-lab, SSIM, prediction of a sample", "rfid-lab, SSIM, training"]
-    assert rows[0]["value"] == "fast 0.700 in 1 ms, middle 0.900 in 3 ms, slow 0.990 in 10 ms"
-    assert rows[1]["value"] == "slow 0.990 in 0 s"
+    assert rows[0]["value"] == "fast 0.700 (1 ms), middle 0.900 (3 ms), slow 0.990 (10 ms)"
+    assert rows[1]["value"] == "slow 0.990 (0 s)"
+    assert front_table(rows).splitlines()[2:] == [f"| rfid-lab, SSIM | {rows[0]['value']} |"]
     figure = pareto_figure({RFID: POINTS, PARTS[1]: POINTS})
     assert len(figure.axes) == 4
     assert {axes.get_xscale() for axes in figure.axes} == {"log"}
