@@ -221,7 +221,7 @@ _AS_SIONNA = ContextVar("diffracted fields of Sionna RT", default=False)
 
 @contextmanager
 def sionna_diffraction() -> Iterator[None]:
-    """Diffracted fields of Sionna RT 2.2 while the block lasts, with which data sets were made that stay as they are."""
+    """Diffracted fields of Sionna RT 2.2 while the block lasts: data that were made with them stay as they are."""
     token = _AS_SIONNA.set(True)
     try:
         yield
