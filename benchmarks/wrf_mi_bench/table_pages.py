@@ -61,7 +61,7 @@ OVERVIEWS = {
     "uplink": "downlink channels from the uplink",
 }
 """Headings of the overviews, by `wrf_mi_bench.table_plan.Part.table`."""
-IN_README = ("spectrum", "rssi", "uplink")  # overviews that the project's README shows
+IN_RESULTS = ("spectrum", "rssi", "uplink")  # overviews that docs/results.md shows
 NOTE = (
     "Written by `wrf-mi bench tables`; each row's JSON file has its command (a scene in braces is made by it), "
     "machine, versions and date. Scores are over test rows: SSIM and channel estimation accuracy (CEA, dB) are "

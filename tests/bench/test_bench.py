@@ -13,7 +13,7 @@ from wrf_mi_bench import sources
 from wrf_mi_bench.bench import CASES, CHECKS, BenchFailed, bench, case_folder, check_table, read_results
 from wrf_mi_bench.check import main
 from wrf_mi_bench.stress_rows import FITS, STAGES, stages
-from wrf_mi_bench.table_pages import front_table, fronts, read_points
+from wrf_mi_bench.table_pages import IN_RESULTS, front_table, fronts, read_points
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
@@ -33,7 +33,7 @@ ON_PAGE = {
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
 NOT_LISTED = ("scaling", "stress", "robustness", "sentinels", "new-carriers", "new-receivers")
 """Checks of many rows or of a former hybrid; `docs/numerics.md` summarises stress and robustness."""
-OTHER_BLOCKS = ("checks", "figures", "pareto", "ratios")
+OTHER_BLOCKS = ("checks", "figures", "pareto", "ratios", *IN_RESULTS)
 """Blocks of pages that are made from several results."""
 FIGURES = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
 

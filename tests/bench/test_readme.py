@@ -11,10 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from documents import CHECKOUT, DOCS, PAGE_NAMES, PAGES, README, blocks
+from documents import CHECKOUT, DOCS, PAGE_NAMES, PAGES, README, blocks, marked
 from PIL import Image
 from wrf_mi_bench.bench import CASES, CHECKS
 from wrf_mi_bench.command import TABLES
+from wrf_mi_bench.front_page import OF_STAGES, OF_TABLES, QUESTIONS, SCENE, question_table
+from wrf_mi_bench.stages import ALONE
+from wrf_mi_bench.table_plan import PARTS
 
 from wrf_mi.cli.main import build_parser
 from wrf_mi.core import Receiver, Record
@@ -53,7 +56,7 @@ def test_scripts_of_the_readme_run(tmp_path, monkeypatch, capsys):
     record = Record("tiny", "spectrum", rng.uniform(-0.5, 1.0, (ROWS, 3)), (receiver,), spectra, official)
     folder = write_spectrum_folder(tmp_path / "tiny", record)
     script = "\n".join(blocks(README, "python"))
-    for shown, tiny in (('"rfid-lab"', repr(str(folder))), ('"steps=6000"', '"steps=2"')):
+    for shown, tiny in (('"rfid-lab"', repr(str(folder))), ('"steps": 6000', '"steps": 2')):
         assert script.count(shown) == 1
         script = script.replace(shown, tiny)
     script += "\n".join(blocks(DOCS / "gaussians.md", "python"))
@@ -94,10 +97,23 @@ def test_commands_parse(path):
             assert name in {*CASES, *CHECKS, TABLES}, line
 
 
-def test_readme_shows_all_main_commands():
-    shown = {shlex.split(line, comments=True)[1] for line in commands(README) if line.startswith("wrf-mi")}
-    assert shown >= {"doctor", "data", "train", "evaluate", "predict", "compare", "demo", "mesh", "trace", "sweep"}
-    assert {"make demo", "make test"} <= {line.partition("#")[0].strip() for line in commands(README)}
+def test_readme_is_short_and_leads_from_a_scan_to_a_map():
+    shown = [shlex.split(line, comments=True)[1] for block in blocks(README, "sh") for line in block.splitlines()]
+    assert shown == ["demo", "test", "mesh", "data", "train", "predict", "map"]
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_questions_of_the_readme_are_answered_by_stored_results():
+    assert marked("README.md", "questions") == question_table(CHECKOUT / "benchmarks" / "results")
+
+
+def test_columns_of_the_readme_separate_methods_with_a_scene():
+    asked = {question.data.strip("`").split(" ")[0] for question in QUESTIONS if question.columns is OF_TABLES}
+    entries = {name: entry for part in PARTS if part.dataset in asked for name, entry in part.entries.items()}
+    scenes = [(OF_TABLES[name], entry.scene) for name, entry in entries.items() if name in OF_TABLES]
+    scenes += [(column, ALONE[name].scene) for name, column in OF_STAGES.items() if name in ALONE]
+    assert len(scenes) == 12
+    assert all((column < SCENE) == bool(scene) for column, scene in scenes)
 
 
 @pytest.mark.parametrize("path", PAGES, ids=PAGE_NAMES)

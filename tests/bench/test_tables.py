@@ -225,11 +225,11 @@ def test_rows_of_data_as_they_were_made_before_are_marked(monkeypatch, tmp_path)
     assert "†" not in table_pages.overview("rssi", stored)
 
 
-@pytest.mark.parametrize("name", table_pages.IN_README)
-def test_readme_shows_the_stored_overviews(name):
+@pytest.mark.parametrize("name", table_pages.IN_RESULTS)
+def test_results_page_shows_the_stored_overviews(name):
     stored = table_pages.read_rows(CHECKOUT / "benchmarks" / "results" / "tables")
     overview = table_pages.overview(name, {row["row"]: row for row in stored})
-    assert marked("README.md", name).strip() == overview
+    assert marked("docs/results.md", name).strip() == overview
 
 
 def test_a_corrected_scene_is_made_once_and_its_time_counts(flat_folder, monkeypatch, tmp_path):

@@ -19,7 +19,7 @@ PARALLEL = 0.02
 """Relative difference of figures after a fit whose parallel sums differ in the last digits: 1.4 % was seen."""
 CONTINUED = {"gaussians.md": README}
 """Pages whose code goes on from that of another one."""
-WRITES = {"train": 1, "plan_sweep": 0, "make_scene": 1, "edit_scene": 1, "compare": 1}
+WRITES = {"plan_sweep": 0, "make_scene": 1, "edit_scene": 1, "compare": 1}
 """Functions that write a folder, and the place of its name among their arguments."""
 
 
@@ -71,6 +71,8 @@ def written(page: Path) -> Iterator[str]:
             place = WRITES.get(ast.unparse(call.func).rpartition(".")[2], len(call.args))
             if place < len(call.args) and isinstance(call.args[place], ast.Constant):
                 yield str(ast.literal_eval(call.args[place]))
+            named = (word.value for word in call.keywords if word.arg == "out")
+            yield from (str(value.value) for value in named if isinstance(value, ast.Constant))
 
 
 def test_no_folder_is_written_twice():

@@ -1,0 +1,259 @@
+"""Table and picture of the project's README: ``python -m wrf_mi_bench.front_page`` prints the one, writes the other.
+
+The table has a line for each question, from stored results. Columns with a scene and without one are apart. The picture
+shows a floor whose signal strengths are known everywhere: scan and measurements, prediction, standard deviation, truth.
+"""
+
+import json
+import tempfile
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from wrf_mi_scenes.floor_plans import office
+from wrf_mi_scenes.mitsuba_xml import write_scene
+
+import wrf_mi
+from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.files import write_figure
+from wrf_mi.core.receivers import receiver_index
+from wrf_mi.datasets.ble_folder import CARRIER_HZ
+from wrf_mi.maps.picture import scene_cuts
+from wrf_mi.receivers.channel import received_power
+from wrf_mi.receivers.reports import strength_db
+from wrf_mi.runs.folder import load_rows
+from wrf_mi.runs.sweep import markdown_table
+from wrf_mi.synthetic.floor_receivers import DEFAULT, NAME
+from wrf_mi.synthetic.searches import SCATTERING, set_scattering
+from wrf_mi.synthetic.stored import SCAN
+from wrf_mi.tasks import TASKS
+from wrf_mi.tracing import open_scene, trace_paths
+
+from .comparison import STORED, data_folder
+from .sources import fit_key, source_files
+from .stages import CALIBRATED, HYBRID, JOINT, Cell, run_of_cell
+from .table_pages import FORMER, grouped, read_rows
+from .table_plan import PARTS, SHARES
+from .tables import scene_of_data
+from .unmeasured import CORRECTED, IDW, KRIGING, LAW, TRACED, gains
+
+COLUMNS = ("hybrid", "ray tracing", "WRF-GS+", "WRF-GS+", "kriging", "IDW")
+SCENE = 3
+"""Number of columns whose methods have a scene; the others have none."""
+HEAD = ("question", "data", *(f"{name}, {'scan' if k < SCENE else 'no scan'}" for k, name in enumerate(COLUMNS)))
+TRACING, ALONE, INTERPOLATION = 1, 3, 5
+"""Columns by number: ray tracing, WRF-GS+ without a scene, IDW."""
+OF_STAGES = {HYBRID: 0, "ray-tracing": TRACING, CALIBRATED: TRACING, JOINT: 2, "kriging": 4, "idw": INTERPOLATION}
+OF_TABLES = {HYBRID: 0, "ray-tracing": TRACING, "ray-tracing-corrected": TRACING, "wrf-gs+-joint": 2}
+OF_TABLES |= {"wrf-gs+": ALONE, "kriging": 4, "idw": INTERPOLATION}
+OF_PARTS = {HYBRID: 0, TRACED: TRACING, CORRECTED: TRACING, KRIGING: 4, IDW: INTERPOLATION, LAW: INTERPOLATION}
+"""Column of each method of the benchmark ``stages``, of the tables, and of held-out carriers and receivers."""
+Medians = Mapping[str, float]  # by method
+
+
+class Question(NamedTuple):
+    """Line of the table: question, arguments of ``wrf-mi train``, task, column of each method, and its medians."""
+
+    text: str
+    data: str
+    task: str
+    columns: Mapping[str, int]
+    medians: Callable[[Path], Medians]
+    former: bool = False  # whether an earlier version was measured
+
+
+def of_stages(cell: str, results: Path) -> Medians:
+    rows = json.loads((results / "stages.json").read_text(encoding="utf-8"))["figures"]["rows"]
+    return {row["model"]: row["score"]["median"] for row in rows if row["cell"] == cell}
+
+
+def of_tables(dataset: str, results: Path) -> Medians:
+    part = next(part for part in PARTS if part.dataset == dataset and part.split == "official")
+    groups = grouped(part, {row["row"]: row for row in read_rows(results / "tables")})
+    return {
+        method: float(np.mean([row["score"]["median"] for row in rows]))
+        for (share, method), rows in groups.items()
+        # Without a mesh the paths of free space are no ray tracing in a scan.
+        if share == SHARES[0] and not (part.scene == "open" and method == "ray-tracing")
+    }
+
+
+def of_parts(pattern: str, results: Path) -> Medians:
+    parts = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(results.glob(pattern))]
+    return {name: median for name, (median, _, _) in gains(parts).items()}
+
+
+QUESTIONS = (
+    Question(
+        "spectra in a region without measurements, scanned room",
+        "`laboratory --split blocked`",
+        "spectrum",
+        OF_STAGES,
+        partial(of_stages, "laboratory-blocked-all"),
+    ),
+    Question(
+        "spectra at held-out positions, furnished room",
+        "`traced-room`",
+        "spectrum",
+        OF_TABLES,
+        partial(of_tables, "traced-room"),
+        True,
+    ),
+    Question(
+        "power in a region without measurements, flat with a plan",
+        "`flat-ble --split blocked --n-train 400`",
+        "rssi",
+        OF_STAGES,
+        partial(of_stages, "flat-ble-blocked-400"),
+    ),
+    Question(
+        "power in the flat from five measured positions",
+        "`flat-ble --n-train 5`",
+        "rssi",
+        OF_STAGES,
+        partial(of_stages, "flat-ble-official-5"),
+    ),
+    Question(
+        "power at a receiver without any measurement, same flat",
+        "`flat-ble --split receiver --n-train 400`",
+        "rssi",
+        OF_PARTS,
+        partial(of_parts, "new-receivers/flat-ble-0-*.json"),
+        True,
+    ),
+    Question(
+        "spectra at a carrier without measurements, furnished room",
+        "`traced-room-bands --split frequency`",
+        "spectrum",
+        OF_PARTS,
+        partial(of_parts, "new-carriers/*.json"),
+        True,
+    ),
+    Question(
+        "channels from 100 measured ones, scanned room",
+        "made by `wrf-mi bench stages`",
+        "csi",
+        OF_STAGES,
+        partial(of_stages, "random-room-official-100"),
+    ),
+    Question(
+        "measurements a few millimetres apart",
+        "`rfid-lab`",
+        "spectrum",
+        OF_TABLES,
+        partial(of_tables, "rfid-lab"),
+    ),
+)
+
+
+def question_table(results: Path = STORED) -> str:
+    """Markdown table of medians over test rows, the best of each line bold.
+
+    Ray tracing is the better of the paths in the scene as stated, and calibrated or corrected by the measurements.
+    """
+    lines = []
+    for question in QUESTIONS:
+        task, columns = TASKS[question.task], dict[int, tuple[float, str]]()
+        better = max if task.higher_is_better else min
+        for method, median in question.medians(results).items():
+            if (column := question.columns.get(method)) is not None:
+                prefix = "MRI " if method == LAW else ""
+                columns[column] = better(columns.get(column, (median, prefix)), (median, prefix))
+        best = better(columns.values())
+        cells = [""] * len(COLUMNS)
+        for column, (median, prefix) in columns.items():
+            text = f"{prefix}{median:.{task.digits}f}"
+            cells[column] = f"**{text}**" if median == best[0] else text
+        mark = f" {FORMER}" if question.former else ""
+        lines.append([f"{question.text}, {task.label}{mark}", question.data, *cells])
+    return markdown_table(HEAD, lines)
+
+
+RUNS, PICTURE = Path("runs/bench/front-page"), Path("docs/images/front-page.png")
+"""Run of the picture, and the picture."""
+N_TRAIN, RECEIVER, HEIGHT_M, STEP_M = 40, "anchor1", 1.2, 0.25
+"""Measured positions; receiver shown; height and spacing of the map, metres."""
+SLICE_M = (0.3, 2.4)  # heights of the scan's points that are drawn: no floor, no ceiling
+
+
+def true_power(receiver: wrf_mi.Receiver, positions_m: FloatArray) -> FloatArray:
+    """Power in dBm [n] that a receiver of the floor gets from positions [n, 3] for 0 dBm sent, without its offset.
+
+    Paths are searched as for the data set: specular and scattered ones apart, powers added.
+    """
+    plan, total = office(), np.zeros(len(positions_m))
+    with tempfile.TemporaryDirectory() as work:
+        write_scene(Path(work), plan.parts, "A floor of several rooms", __name__)
+        scene = open_scene(Path(work), CARRIER_HZ)
+        set_scattering(scene, DEFAULT.scattering)
+        for options in DEFAULT.options():
+            # Points of a grid may lie in bodies, where no path arrives.
+            paths = trace_paths(scene, positions_m, receiver, options, progress=True, check=False).paths
+            scattered = (paths.interactions == SCATTERING).any(axis=1)
+            total += received_power(paths.select(scattered == options.scattering))[0]
+    return np.asarray(strength_db(total))
+
+
+def picture(folder: Path) -> Figure:
+    """Scan and measurements, predicted map, its standard deviation, and the traced truth; runs are kept in a folder."""
+    cell = Cell(NAME, "official", N_TRAIN)
+    run_of_cell(cell, NAME, folder / HYBRID, HYBRID, scene=scene_of_data(NAME, folder))
+    run_of_cell(cell, NAME, folder / "idw", "idw")
+    run, idw = (wrf_mi.open_run(folder / name) for name in (HYBRID, "idw"))
+    dataset = run.map(height_m=HEIGHT_M, step_m=STEP_M, receivers=[RECEIVER])
+    power, std_db = (dataset[name].values[0] for name in ("power_dbm", "power_std_db"))
+    record = run.problem.record
+    number = receiver_index(record.receivers, RECEIVER)
+
+    # Truth at the free points of the map.
+    x, y = np.meshgrid(dataset["x"].values, dataset["y"].values)
+    grid_m, free = np.stack([x, y, np.full(x.shape, HEIGHT_M)], axis=-1), np.isfinite(power)
+    # Known rows follow the grid: their median residual is the receiver's offset, which every measurement has.
+    receiver = record.receivers[number]
+    powers = true_power(receiver, np.concatenate([grid_m[free], record.tx_pos_m]))
+    powers += np.nanmedian(record.observation[number] - powers[free.sum() :])
+    truth = np.full(x.shape, np.nan)
+    truth[free] = powers[: free.sum()]
+    train = load_rows(run.folder, record).all_train
+    errors = [np.nanmedian(np.abs(of - truth[free])) for of in (power[free], idw.predict(grid_m[free], RECEIVER).mean)]
+    points = np.load(data_folder(NAME) / SCAN)["points"]
+
+    shades: Any = {"cmap": "viridis", "norm": Normalize(*np.nanpercentile(truth, [2, 98]))}
+    figure = Figure(figsize=(10, 5.4), layout="constrained", facecolor="white")
+    (given, predicted), (spread, true) = panels = figure.subplots(2, 2, sharex=True, sharey=True)
+    scan = points[(points[:, 2] > SLICE_M[0]) & (points[:, 2] < SLICE_M[1])]
+    given.scatter(*scan[:, :2].T, s=0.05, color="0.65", linewidths=0, rasterized=True)
+    levels = record.observation[number][train]
+    given.scatter(*record.tx_pos_m[train, :2].T, c=levels, s=42, edgecolors="black", linewidths=0.6, **shades)
+    given.set_title(f"Given: LiDAR scan and power at {len(train)} positions (circles)")
+    predicted.pcolormesh(x, y, power, shading="nearest", rasterized=True, **shades)
+    predicted.set_title(f"Predicted power: median error {errors[0]:.1f} dB (IDW: {errors[1]:.1f} dB)")
+    true.pcolormesh(x, y, truth, shading="nearest", rasterized=True, **shades)
+    true.set_title("True power")
+    bar = spread.pcolormesh(x, y, std_db, shading="nearest", cmap="magma", rasterized=True)
+    spread.set_title(f"Predicted standard deviation, {DEFAULT.noise_db:g} dB of noise included")
+    for axes in panels.flat:
+        for lines in scene_cuts(run, HEIGHT_M) if axes is not given else ():
+            axes.add_collection(LineCollection(list(lines), colors="black", linewidths=0.8))
+        axes.plot(*receiver.position_m[:2], "*", markersize=15, color="#c1121f", markeredgecolor="white")
+        axes.set(aspect="equal", xlim=(x.min() - 0.3, x.max() + 0.3), ylim=(y.min() - 0.3, y.max() + 0.3))
+        axes.title.set_fontsize(9.5)
+    for axes in panels[1]:
+        axes.set_xlabel("x (m)")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("y (m)")
+    figure.colorbar(ScalarMappable(**shades), ax=panels[:, 1], label="received power (dBm)", extend="both")
+    how: Any = {"location": "left", "shrink": 0.44, "anchor": (0.0, 0.0), "panchor": False}
+    figure.colorbar(bar, ax=panels[:, 0], label="standard deviation (dB)", **how)
+    return figure
+
+
+if __name__ == "__main__":
+    print(question_table())
+    write_figure(PICTURE, picture(RUNS / fit_key(source_files())))
