@@ -14,7 +14,7 @@ import pytest
 from scipy.io import savemat
 
 CARRIER_HZ = 3.5e9
-LACKING = "the package deepmimo is not installed (pip install 'wrf-mi[deepmimo]')"
+LACKING = "the package deepmimo is not installed (pip install '.[deepmimo]')"
 CHOSEN: dict[str, dict[str, Any]] = {
     "default": {},
     "array": {

@@ -67,7 +67,7 @@ def test_models_of_one_carrier_refuse_several(name: str, flat: Record, one_gatew
         model = MODELS[name]
         if model.serves(record.task) and model.uplink != "required":
             message = rf"rows at 2 carriers, .* Hz; {re.escape(name)} serves one carrier"
-            refusal(train, record, tmp_path / "run", name, message, seed=1)
+            refusal(train, record, name, message, out=tmp_path / "run", seed=1)
             assert not (tmp_path / "run").exists()
 
 
@@ -110,7 +110,8 @@ def test_predictions_of_several_carriers(flat: Record, flat_folder: Path, tmp_pa
     low, high = (run.predict(place, carriers_hz=[carrier] * 2).mean for carrier in (LOW, HIGH))
     between = run.predict(place, carriers_hz=[np.sqrt(LOW * HIGH)] * 2).mean
     np.testing.assert_allclose(between, (low + high) / 2, rtol=1e-6)
-    np.testing.assert_array_equal(run.predict(place, carriers_hz=[0.1 * LOW, 10 * HIGH]).mean, [low[0], high[1]])
+    beyond = run.predict(place, carriers_hz=[0.1 * LOW, 10 * HIGH]).mean
+    np.testing.assert_array_equal(beyond, np.stack([low[:, 0], high[:, 1]], axis=1))
     one = train(flat_folder, "idw", out=tmp_path / "one")
     refusal(one.predict, place, "its data have one carrier; omit frequency_hz", carriers_hz=[LOW, LOW])
 
@@ -226,9 +227,9 @@ def test_stored_paths_keep_the_carriers(flat: Record, room: Path, tmp_path: Path
 def test_one_target_error_and_unknown_materials_are_refused(flat: Record, room: Path, tmp_path: Path) -> None:
     message = r"rows at 2 carriers, .* target_error_db serves one carrier"
     options = {"scene": room, "settings": ["target_error_db=1"]}
-    refusal(train, flat, tmp_path / "run", "ray-tracing", message, **options)
+    refusal(train, flat, "ray-tracing", message, out=tmp_path / "run", **options)
     unknown = flat.at_carriers(np.where(np.arange(len(flat)) % 2, LOW, 1e8))
-    refusal(train, unknown, tmp_path / "run", "ray-tracing", r"not known at 0\.1 GHz", scene=room)
+    refusal(train, unknown, "ray-tracing", r"not known at 0\.1 GHz", out=tmp_path / "run", scene=room)
     assert not (tmp_path / "run").exists()
 
 

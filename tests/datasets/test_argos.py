@@ -206,4 +206,4 @@ def test_several_captures_or_no_h5py_are_refused(tmp_path: Path, monkeypatch: py
     argos(tmp_path / "b.h5")
     refusal(load, tmp_path, r"one capture in HDF5 is read at a time, found a.hdf5, b.h5")
     monkeypatch.setitem(sys.modules, "h5py", None)
-    refusal(load, tmp_path / "a.hdf5", r"reading HDF5 needs h5py; install it: pip install 'wrf-mi\[argos\]'")
+    refusal(load, tmp_path / "a.hdf5", r"reading HDF5 needs h5py; install it: pip install '\.\[argos\]'")

@@ -53,7 +53,7 @@ def test_rows_that_train_are_refused(train: Any, value: float, part: str, two_ga
     name = two_gateways.receivers[1].name
     message = f"made-here, receiver {name}, row {row}: 1 of 800 values are not finite; correct or remove the row"
     broken = changed(two_gateways, ((1, row, 4, 5), value))
-    assert error_line(train, broken, tmp_path / "run", re.escape(message)) == message
+    assert error_line(train, broken, re.escape(message), out=tmp_path / "run") == message
     assert not (tmp_path / "run").exists()
 
 
@@ -139,7 +139,7 @@ def test_data_without_a_received_training_row_are_refused_first(silent: Record, 
     message = r"nothing was received in the training rows by any receiver \(anchor1, anchor2\); use another split"
     for model, options in (("ray-tracing", {"scene": room, "settings": DIRECT}), ("kriging", {})):
         options |= {"split": split, "on_progress": lambda *said: stages.append(said[0])}
-        refusal(train, record, tmp_path / "run", model, message, **options)
+        refusal(train, record, model, message, out=tmp_path / "run", **options)
         assert not (tmp_path / "run").exists()
     assert stages == []
 
@@ -149,7 +149,7 @@ def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(flat_folder: Path,
     nothing = TraceOptions(line_of_sight=False, reflection=False, transmission=True, depth=1)
     (tmp_path / "run").mkdir()
     message, options = "no training row is both received and reached by a path", {"scene": room, "settings": nothing}
-    refusal(train, flat_folder, tmp_path / "run", "ray-tracing", message, **options)
+    refusal(train, flat_folder, "ray-tracing", message, out=tmp_path / "run", **options)
     assert not (tmp_path / "run").exists()
 
 

@@ -305,7 +305,7 @@ def test_missing_package_is_named(
     suffix: str, package: str, mapped: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(InputError, match=rf"need {package}: pip install 'wrf-mi\[maps\]'"):
+    with pytest.raises(InputError, match=rf"need {package}: pip install '\.\[maps\]'"):
         write_map(mapped, tmp_path / f"map{suffix}")
 
 

@@ -120,7 +120,7 @@ def test_invalid_scheduler_ends_with_one_line(
     ):
         command.refused([*words, wrong], message)
     monkeypatch.setitem(sys.modules, "distributed", None)
-    command.refused([*words, "local:2"], r"pip install 'wrf-mi\[cluster\]'")
+    command.refused([*words, "local:2"], r"pip install '\.\[cluster\]'")
     assert not (tmp_path / "p.npz").exists()
 
 

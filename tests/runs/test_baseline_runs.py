@@ -225,7 +225,7 @@ def test_bad_calls_are_refused(flat_folder: Path, tmp_path: Path, command: Comma
         (
             flat_folder,
             "mri --preset fast",
-            "mri on .*no preset, which belongs to fields of spectra; use --set",
+            "--preset fast: mri for such data has no presets; use --set",
         ),
     ):
         command.refused(["train", data, "--out", tmp_path / "out", "--model", *options.split()], message)

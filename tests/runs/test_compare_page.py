@@ -49,7 +49,7 @@ def strengths(
     metrics = {"abs_error_db": block, "split": "official", "model": name}
     names, nowhere = tuple(f"anchor{k}" for k in range(receivers)), np.zeros((len(rows), 3))
     stated = (Path(path) / name, name, "rssi", "flat", metrics, seed, names)
-    return Results(*stated, rows, nowhere, prediction, truth, {"idw100": truth + idw_db}, None, {})
+    return Results(*stated, rows, nowhere, prediction, truth, {"idw100": truth + idw_db}, None, None, {})
 
 
 def verdicts(runs: list[Results]) -> dict[tuple[str, str], str]:

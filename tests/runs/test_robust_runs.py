@@ -80,7 +80,7 @@ def test_a_run_that_ctrl_c_ends_before_its_configuration_is_begun_again(
 
 def test_two_threads_do_not_fit_at_a_time(flat_folder: Path, tmp_path: Path) -> None:
     with alone_in_process(), ThreadPoolExecutor(1) as other:
-        error = other.submit(train, flat_folder, tmp_path / "run", "idw").exception()
+        error = other.submit(train, flat_folder, "idw", out=tmp_path / "run").exception()
     assert isinstance(error, InputError)
     assert str(error).startswith("another thread of this process fits or scores a model; wait for its end")
     assert not (tmp_path / "run").exists()

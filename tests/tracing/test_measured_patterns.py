@@ -7,7 +7,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from box_room import receiver, transmitters
-from sionna_reference import sionna_paths
+from wrf_mi_bench.sionna_reference import sionna_paths
 
 from wrf_mi.backend.device import Recorded
 from wrf_mi.backend.vectors import Float64

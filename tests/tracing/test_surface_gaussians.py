@@ -136,7 +136,7 @@ def test_other_search_of_paths_keeps_the_gaussians(scene, tmp_path):
     moved = gain(side, factor)
     assert gaussians.parameters()[DISC].shape == (6, len(gaussians))
     assert np.abs(moved - gain(side, {})).max() > 0.05 * np.abs(moved).max()
-    assert side.arrays[-1].each % NEAREST == 0
+    assert side.form[-1] % NEAREST == 0
 
 
 @pytest.mark.slow

@@ -149,5 +149,5 @@ def test_pages_have_a_largest_size(monkeypatch):
 def test_missing_plotly_is_named(monkeypatch):
     page_module.plotly_js.cache_clear()
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    with pytest.raises(InputError, match=r"views need plotly; install it: pip install 'wrf-mi\[view\]'"):
+    with pytest.raises(InputError, match=r"views need plotly; install it: pip install '\.\[view\]'"):
         plotly_js()

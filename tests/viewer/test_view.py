@@ -255,7 +255,7 @@ def test_command_refuses_in_one_line(traced, tmp_path, capsys, monkeypatch):
     (tmp_path / "bad.zarr").mkdir()
     for file, package in (("bad.nc", "h5py"), ("bad.zarr", "zarr"), ("bad.nc", "xarray")):
         monkeypatch.setitem(sys.modules, package, None)
-        refused(["view", tmp_path / file, "--out", out], rf"need {package}: pip install 'wrf-mi\[view\]'", capsys)
+        refused(["view", tmp_path / file, "--out", out], rf"need {package}: pip install '\.\[view\]'", capsys)
 
 
 def test_options_have_the_documented_defaults():

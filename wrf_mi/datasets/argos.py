@@ -83,7 +83,7 @@ def read_argos(
     try:
         import h5py
     except ModuleNotFoundError:
-        raise InputError(f"{file}: reading HDF5 needs h5py; install it: pip install 'wrf-mi[argos]'") from None
+        raise InputError(f"{file}: reading HDF5 needs h5py; install it: pip install '.[argos]'") from None
     try:
         with h5py.File(file, "r") as stored:
             pilots, attributes = _pilots(file, stored)

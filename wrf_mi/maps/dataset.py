@@ -49,7 +49,7 @@ def maps_package(name: str, extra: str = "maps") -> Any:
     try:
         return import_module(name)
     except ModuleNotFoundError:
-        raise InputError(f"radio maps need {name}: pip install 'wrf-mi[{extra}]'") from None
+        raise InputError(f"radio maps need {name}: pip install '.[{extra}]'") from None
 
 
 def require_packages(path: Path, extra: str = "maps") -> None:

@@ -219,7 +219,7 @@ def open_scheduler(text: str | None) -> Scheduler:
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise InputError("--scheduler: needs Dask; install it with: pip install 'wrf-mi[cluster]'") from None
+        raise InputError("--scheduler: needs Dask; install it with: pip install '.[cluster]'") from None
     worker_environment()  # fails before anything is started where nothing can compute
     _silence_dask()
     if count is None:

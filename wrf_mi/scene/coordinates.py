@@ -195,7 +195,7 @@ def extra_package(name: str) -> Any:
     try:
         return import_module(name)
     except ModuleNotFoundError:
-        raise InputError(f"scenes from such files need {name}: pip install 'wrf-mi[{EXTRAS[name]}]'") from None
+        raise InputError(f"scenes from such files need {name}: pip install '.[{EXTRAS[name]}]'") from None
     except ImportError as error:
         text = one_line(error)
         raise InputError(f"{name} cannot be loaded ({text}); install that library, on Debian: {SYSTEM}") from None

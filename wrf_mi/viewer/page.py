@@ -51,7 +51,7 @@ def plotly_js() -> str:
     try:
         return str(import_module("plotly.offline").get_plotlyjs())
     except ModuleNotFoundError:
-        raise InputError("views need plotly; install it: pip install 'wrf-mi[view]'") from None
+        raise InputError("views need plotly; install it: pip install '.[view]'") from None
 
 
 def page(content: ViewContent) -> str:

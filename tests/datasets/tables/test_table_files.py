@@ -107,5 +107,5 @@ def test_missing_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.Mon
         raise ImportError(name)
 
     monkeypatch.setattr(files, "import_module", absent)
-    error_line(read_table, tmp_path / "t.csv", r"data import needs pandas: pip install 'wrf-mi\[tables\]'")
+    error_line(read_table, tmp_path / "t.csv", r"data import needs pandas: pip install '\.\[tables\]'")
     assert importlib.import_module("pandas") is pandas

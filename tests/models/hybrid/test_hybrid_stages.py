@@ -109,7 +109,7 @@ def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(scenes: dict[str, Path],
     data, out = str(write_spectrum_folder(tmp_path / "room", record)), tmp_path / "stopped"
     how = {"scene": scenes["thought"], "settings": ("steps=20",), "deterministic": True}
     uninterrupted = wrf_mi.train(data, out=tmp_path / "whole", **how)
-    sitting = partial(wrf_mi.train, data, out, **how)
+    sitting = partial(wrf_mi.train, data, out=out, **how)
     for stage, share in (("paths: choices", 0.0), ("paths: training", 0.5), ("kriging, held-out rows: signals", 0.0)):
         reports = [("", 0.0)]
         with pytest.raises(Interrupted):

@@ -38,7 +38,7 @@ def package(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise InputError(f"data import needs {name}: pip install 'wrf-mi[tables]'") from None
+        raise InputError(f"data import needs {name}: pip install '.[tables]'") from None
 
 
 @dataclass(frozen=True)
