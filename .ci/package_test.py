@@ -100,7 +100,7 @@ receiver = wrf_mi.Receiver("anchor1", np.array([1.0, 1.0, 1.5]), np.array([0.0, 
 positions_m = np.random.default_rng(0).uniform([2, 1, 1], [4, 3, 2], (9, 3))
 known = {"frequencies_hz": np.array([2.44e9]), "official": (np.arange(6), np.arange(6, 9))}
 write_ble_folder("inside", wrf_mi.Record("inside", "rssi", positions_m, (receiver,), np.full((1, 9), -50.0), **known))
-wrf_mi.train("inside", "traced", "ray-tracing", scene="xyz", settings=["depth=1", "rays=1024"])
+wrf_mi.train("inside", "ray-tracing", "xyz", out="traced", settings=["depth=1", "rays=1024"])
 wrf_mi.tracing.write_deepmimo("scenario", wrf_mi.tracing.load_trace("traced/paths.npz"))
 deepmimo.config.set("scenarios_folder", str(Path.cwd()))
 assert len(deepmimo.load("scenario").compute_channels())

@@ -25,7 +25,7 @@ NEEDS_NO_DATA = {
 }
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
-    **dict.fromkeys(("pareto", "operator", "training"), "speed.md"),
+    **dict.fromkeys(("pareto", "operator", "training", "waits"), "speed.md"),
     **dict.fromkeys(("stages", "intervals"), "hybrid.md"),
     **{"elsewhere": "numerics.md", "rooms": "correction.md", "locate": "locate.md", "phase-error": "scenes.md"},
     **{"reception": "maps.md", "closed-forms": "numerics.md"},
