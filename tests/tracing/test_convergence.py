@@ -71,7 +71,7 @@ def test_remainder_of_a_geometric_series():
 
 
 def test_command_refuses_depth_or_rays_beside_a_target(tmp_path, capsys):
-    asked = ["trace", "rfid-lab", "--scene", "laboratory", "--out", tmp_path / "run", "--target-error"]
+    asked = ["trace", "laboratory", "--scene", "laboratory", "--out", tmp_path / "run", "--target-error"]
     for words, message in ((["2", "--depth", "2"], "--depth"), (["2", "--rays", "auto"], "--rays"), (["0"], "error")):
         refused([*asked, *words], message, capsys)
     assert not (tmp_path / "run").exists()

@@ -74,7 +74,8 @@ def test_gains_are_those_of_sionna_rts_solver(box, patterns):
     pose = replace(receiver(), orientation_xyzw=boresight_orientation(0.7, 0.2), antenna=patterns[0])
     options, [tx_m] = replace(OPTIONS, rays=30_000, transmission=False), transmitters(1)
     paths = trace_paths(box, tx_m, pose, options).paths
-    length_m, expected = sionna_paths(box, tx_m, pose.position_m, "measured", (0.7, 0.2, 0), depth=2, refraction=False)
+    turned = {"pattern": "measured", "turn_rad": (0.7, 0.2, 0)}
+    _, expected, length_m, _ = sionna_paths(box, tx_m, pose.position_m, options, **turned)
     of_length, of_expected = np.argsort(paths.length_m), np.argsort(length_m)
     np.testing.assert_allclose(paths.gain[of_length], expected[of_expected], atol=AGREE * np.abs(expected).max())
 
