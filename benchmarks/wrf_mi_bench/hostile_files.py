@@ -28,12 +28,14 @@ import psutil
 from wrf_mi.core import InputError
 from wrf_mi.core.files import append_line, one_line, write_atomically
 
+from .bench import BenchFailed
+
 HANG_S = 10.0  # time after which an input counts as a hang
 START_S = 180.0  # time for a child to start and to compile its first kernels
 MEMORY_BYTES = 3 << 30
 """Address space that readers may take beyond that of the process: Python raises `MemoryError` past it."""
 LARGEST_TEXT = 300  # characters of a message
-STATE, RESULTS, SAMPLES = "state", "results.jsonl", "samples"
+STATE, RESULTS, SAMPLES, WORK = "state", "results.jsonl", "samples", "work"
 NUMBERS = (0, -1, 1, 255, 2**15, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1)
 TEXTS = (
     *(b"0", b"-1", b"1e308", b"nan", b"inf", b"100000", b"9999999999", b"1" * 5000, b"..", b"/etc/passwd", b"null"),
@@ -87,6 +89,7 @@ def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str
     place, first = 0, 0
     while place < len(names):
         write_atomically(folder / STATE, json.dumps(asdict(Tally(names[place], first))))
+        shutil.rmtree(folder / WORK, ignore_errors=True)
         call = [sys.executable, "-m", __name__ if __name__ != "__main__" else "wrf_mi_bench.hostile_files"]
         call += [str(folder), ",".join(names[place:]), str(first), str(count)]
         with (folder / "errors.txt").open("w") as errors:
@@ -95,6 +98,10 @@ def run_readers(folder: Path, names: Sequence[str], count: int) -> list[dict[str
         if reason is None:
             break
         last = (folder / STATE).read_text()
+        # A child that ends before its first input would do so again, once for each input.
+        if not (folder / WORK).exists():
+            error = "".join((folder / "errors.txt").read_text().splitlines()[-1:])
+            raise BenchFailed(f"readers of changed files: {reason}, before the first input: {error}")
         append_line(folder / RESULTS, last)
         name, number = json.loads(last)["reader"], json.loads(last)["number"]
         failures[name][number] = reason
@@ -199,7 +206,7 @@ def main(folder: str, names: str, first: str, count: str) -> None:
         mock.patch.object(import_module(user), "run_module", forked_module).start()
     start = int(first)
     for name in names.split(","):
-        reader, work, tally = READERS[name], place / "work", Tally(name, start)
+        reader, work, tally = READERS[name], place / WORK, Tally(name, start)
         shutil.rmtree(work, ignore_errors=True)
         shutil.copytree(place / SAMPLES / reader.group, work)
         content = (work / reader.file).read_bytes()
@@ -219,7 +226,7 @@ def main(folder: str, names: str, first: str, count: str) -> None:
                 tally.failed[str(number)] = wrong
         append_line(place / RESULTS, json.dumps(asdict(tally) | {"number": int(count)}))
         start = 0
-    shutil.rmtree(place / "work", ignore_errors=True)
+    shutil.rmtree(place / WORK, ignore_errors=True)
 
 
 if __name__ == "__main__":

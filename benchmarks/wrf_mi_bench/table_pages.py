@@ -200,7 +200,7 @@ COSTS = {"ms_per_sample": ("prediction of a sample", "ms"), "train_seconds": ("t
 LEAST = 1e-3  # smallest cost on the logarithmic axes
 PUBLISHED = {"nerf2": (200, 0.78), "wrf-gs": (5, 0.82), "wrf-gs+": (8, 0.90)}
 """Milliseconds of a prediction on an RTX 3090 and median SSIM of the authors' programs for the spectra of NeRF2's data
-(WRF-GS+, table I and figure 8), as hollow markers beside spectra of these data.
+(WRF-GS+, section V), as hollow markers beside spectra of these data.
 """
 
 Points = Mapping[str, Mapping[str, float]]  # score and costs of each method by name

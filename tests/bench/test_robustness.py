@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from wrf_mi_bench import elsewhere, endurance, faults
+from wrf_mi_bench import elsewhere, endurance, faults, hostile_files
+from wrf_mi_bench.bench import BenchFailed
 from wrf_mi_bench.hostile_files import run_readers
 from wrf_mi_bench.hostile_samples import READERS
 
@@ -61,3 +62,10 @@ def test_failed_child_is_reported():
     variant = replace(next(elsewhere.variants((1,))), backend="none")
     with pytest.raises(elsewhere.BenchFailed, match="is none of auto, llvm, cuda"):
         elsewhere.computed(variant, True)
+
+
+def test_a_child_that_never_reads_an_input_ends_the_benchmark(tmp_path, monkeypatch):
+    """It would do so again for each input of each reader."""
+    monkeypatch.setattr(hostile_files.sys, "executable", "false")
+    with pytest.raises(BenchFailed, match="status 1, before the first input"):
+        hostile_files.run_readers(tmp_path, list(READERS)[:1], INPUTS)

@@ -46,9 +46,9 @@ def test_example() -> None:
     assert doctest.testmod(receivers).failed == 0
 
 
-@pytest.mark.parametrize("function", [Run.predict, Predictor.__call__])
-def test_functions_say_that_they_take_names(function: Callable[..., Any]) -> None:
-    assert inspect.signature(function).parameters["receiver"].annotation in ("int | str", "int | str | None")
+@pytest.mark.parametrize(("function", "kind"), [(Run.predict, "int | str | None"), (Predictor.__call__, "int | str")])
+def test_functions_say_that_they_take_names(function: Callable[..., Any], kind: str) -> None:
+    assert inspect.signature(function).parameters["receiver"].annotation == kind
 
 
 @pytest.mark.parametrize("model", ["mri", "kriging"])

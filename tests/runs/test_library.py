@@ -57,3 +57,14 @@ def test_settings_by_name_and_presets(flat_folder):
         wrf_mi.train(flat_folder, "idw", preset="fast")
     with pytest.raises(wrf_mi.InputError, match="give one of both"):
         wrf_mi.train(flat_folder, preset="fast", settings=fast.config.settings)
+
+
+def test_what_is_refused_leaves_no_temporary_folder(flat_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(wrf_mi.InputError, match="no such model"):
+        wrf_mi.train(flat_folder, "spline")
+    with pytest.raises(wrf_mi.InputError, match="no such file"):
+        wrf_mi.train(flat_folder, "wrf-gs+", settings={"initial.points": Path("none.ply")})
+    with pytest.raises(wrf_mi.InputError):
+        wrf_mi.Scene.from_plan(flat_folder / "layout.csv", -1.0)
+    assert not any(tmp_path.iterdir())

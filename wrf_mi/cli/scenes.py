@@ -136,9 +136,7 @@ def _correction_options(a: Arguments, record: Record) -> CorrectionOptions:
     from ..correction import default_options
     from ..correction.options import FRAME, PLANES
 
-    options = default_options(record)
-    if a.n_train is not None:  # as many as stated, over all receivers
-        options = replace(options, rows=max(1, len(record) * len(record.receivers)))
+    options = default_options(record, a.n_train)
     if a.calibrate is not None:
         options = replace(options, parts=tuple(a.calibrate.split(",")))
     names = ("depth", "reflections", "rays")

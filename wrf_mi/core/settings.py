@@ -50,7 +50,12 @@ def setting_texts(values: Mapping[str, Any]) -> list[str]:
     >>> setting_texts({"steps": 200, "initial": {"gaussians": 500}})
     ['steps=200', 'initial.gaussians=500']
     """
-    return [f"{key}={json.dumps(value, default=lambda v: v.tolist())}" for key, value in flat(values)]
+    return [f"{key}={_json(value)}" for key, value in flat(values)]
+
+
+def _json(value: Any) -> str:
+    """A value as JSON, which has lists in place of tuples and arrays, and paths as text; else nothing is converted."""
+    return json.dumps(value, default=lambda v: v.tolist() if isinstance(v, np.ndarray | np.generic) else str(v))
 
 
 _adapter = cache(TypeAdapter)
@@ -136,9 +141,7 @@ def _convert(hint: Any, value: Any, source: str, name: str) -> Any:
     if float in (hint, *typing.get_args(hint)):
         value = [_number(each) for each in value] if isinstance(value, list | tuple) else _number(value)
     try:
-        # JSON has lists in place of tuples and arrays; else nothing is converted.
-        text = json.dumps(value, default=lambda v: v.tolist() if isinstance(v, np.ndarray | np.generic) else str(v))
-        return _adapter(hint).validate_json(text, strict=True)
+        return _adapter(hint).validate_json(_json(value), strict=True)
     except ValidationError as error:
         raise InputError(f"{source}, setting {name}: {_mismatch(hint, value, error)}") from None
 

@@ -81,9 +81,10 @@ class Correction:
         return self.state.vector
 
 
-def default_options(record: Record) -> CorrectionOptions:
-    """Options for a record where none are given."""
-    return STRENGTHS if task_of(record).in_decibel else DEFAULTS
+def default_options(record: Record, n_train: int | float | None = None) -> CorrectionOptions:
+    """Options for a record where none are given; all rows are compared if their number ``n_train`` is stated."""
+    options = STRENGTHS if task_of(record).in_decibel else DEFAULTS
+    return options if n_train is None else replace(options, rows=max(1, len(record) * len(record.receivers)))
 
 
 # Products are of a few rows: threads that share them wait for each other, on a busy machine ten times as long.

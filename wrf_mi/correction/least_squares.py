@@ -125,9 +125,13 @@ class Jacobian:
         return (scaled @ scaled.T).astype(float), (scaled @ values.ravel()).astype(float)
 
 
+Residuals = Callable[[FloatArray], FloatArray]  # residuals [rows, values] of a vector [p]
+Derivatives = Callable[[FloatArray], Jacobian]
+
+
 def minimised(
-    residual: Callable[[FloatArray], FloatArray],
-    jacobian: Callable[[FloatArray], Jacobian],
+    residual: Residuals,
+    jacobian: Derivatives,
     start: FloatArray,
     free: IntArray,
     prior: Prior,

@@ -7,7 +7,7 @@ score is relative, and of a median row's, as rows in deep fades have errors too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -31,7 +31,7 @@ from ..tracing.paths.instrument_parameters import instrument_parameters
 from ..tracing.paths.scene_parameters import PREFIX, QUANTITIES, SHIFT, TILT
 from ..tracing.paths.solve import Prepared
 from ..tracing.paths.traced_field import TracedField, traced_fields
-from .least_squares import Jacobian
+from .least_squares import Derivatives, Jacobian, Residuals
 from .options import CorrectionOptions
 
 LATTICE = (12, 40)  # most elevations and azimuths of the lattice of directions
@@ -303,9 +303,7 @@ class Misfit:
             signals.append((np.asarray(real) + 1j * np.asarray(imaginary)).reshape(len(entry), -1))
         return np.concatenate(signals)
 
-    def within(
-        self, start: FloatArray, places: IntArray
-    ) -> tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], Jacobian]]:
+    def within(self, start: FloatArray, places: IntArray) -> tuple[Residuals, Derivatives]:
         """`residual`, and `jacobian` by the entries ``places``, as of `PathSum.within`: of all rows."""
         return self.residual, lambda vector: self.jacobian(vector, places)
 

@@ -11,7 +11,7 @@ a factor of its sums.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from threading import Lock
@@ -28,14 +28,12 @@ from ..receivers.receiver_models import ArrayReceiver, PowerReceiver, Slopes
 from ..receivers.receiver_models import ComplexArray as Complex
 from ..tasks import task_of
 from ..tracing.paths.scene_parameters import PREFIX, SHIFT, TILT
-from .least_squares import Jacobian
+from .least_squares import Derivatives, Jacobian, Residuals
 from .path_lengths import lengths_and_slopes
 
 if TYPE_CHECKING:
     from .misfit import Misfit
 
-Residuals = Callable[[FloatArray], FloatArray]  # residuals [rows, values] of a vector [p]
-Derivatives = Callable[[FloatArray], Jacobian]
 MOST_WAVES = 1 << 24  # most element signals of paths, of 16 bytes each, that are kept for spectra
 TOGETHER = 512  # rows, over all vectors, of which trials are computed at once: their spectra fit into a cache
 MOST_KEPT = 256  # sets of paths that are kept for trials: each takes up to a megabyte

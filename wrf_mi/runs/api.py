@@ -272,8 +272,8 @@ def train(
         Interrupted: ``stop`` ended the run; continue with `resume`.
         BackendError: a deterministic fit in a process that computes on a GPU already.
     """
-    folder = Path(tempfile.mkdtemp(prefix="wrf-mi-") if out is None else out)
-    check_new(folder)
+    if out is not None:
+        check_new(Path(out))
     if deterministic:  # before anything is read: reading a data set may choose the GPU
         init("llvm", threads=1)
     place = scene.folder if isinstance(scene, Scene) else scene
@@ -285,6 +285,7 @@ def train(
     _warn_of_known_rows(problem, splits)
     if config.deterministic:
         init("llvm", threads=1)
+    folder = Path(tempfile.mkdtemp(prefix="wrf-mi-") if out is None else out)
     folder.mkdir(parents=True, exist_ok=True)
     with locked_folder(folder):
         clear_begun(folder)
@@ -295,8 +296,7 @@ def train(
             if not any(any(folder.rglob(name)) for name in (FITTED, CHECKPOINT)):
                 shutil.rmtree(folder)
             raise
-    run = Run(folder, problem.record)
-    object.__setattr__(run, "scene", scene)  # whose temporary folder, if it has one, lives as long as the run
+    run = Run(folder, problem.record, kept=scene)
     if out is None:
         weakref.finalize(run, shutil.rmtree, folder, ignore_errors=True)
     return run

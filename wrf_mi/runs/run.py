@@ -45,11 +45,13 @@ class Run:
         folder: run folder.
         record: data that the model was fitted to; None: the data set that the folder names.
         operator: learned fields predict by operator where they can.
+        kept: what lives as long as the run, such as a scene in a temporary folder.
     """
 
     folder: Path
     record: Record | None = field(default=None, repr=False, compare=False)
     operator: bool = True
+    kept: Any = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Accept the folder's name as text."""

@@ -13,14 +13,14 @@ import json
 import shutil
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core import InputError, Record, Split
 from ..core.registry import resolve
-from ..correction import CorrectionOptions, correct_scene, write_page
+from ..correction import CorrectionOptions, correct_scene, default_options, write_page
 from ..correction.options import OnStage
 from ..datasets.splits import single_split
 from ..scene.correction_data import FILE
@@ -54,9 +54,7 @@ class Scene:
         cls, points: str | Path | Sequence[str | Path], out: str | Path | None = None, **options: Any
     ) -> Scene:
         """Make a scene from a 3D scan or mesh; options and errors of `wrf_mi.scene.make.make_scene`."""
-        place = _new_folder(out)
-        make_scene(points, place, **options)
-        return cls(place)._owned(out)
+        return cls._made(out, lambda place: make_scene(points, place, **options))
 
     @classmethod
     def from_plan(cls, plan: str | Path, height_m: float, out: str | Path | None = None, **options: Any) -> Scene:
@@ -92,9 +90,12 @@ class Scene:
         """
         record = data if isinstance(data, Record) else load_record(str(data))
         rows = split if isinstance(split, Split) else single_split(record, split, seed, n_train)
-        place = _new_folder(out)
-        write_page(correct_scene(self.folder, record, rows, options, material, on_stage), place)
-        return Scene(place)._owned(out)
+        options = options or default_options(record, n_train)
+
+        def corrected(place: Path) -> None:
+            write_page(correct_scene(self.folder, record, rows, options, material, on_stage), place)
+
+        return self._made(out, corrected)
 
     @property
     def correction(self) -> dict[str, Any] | None:
@@ -104,9 +105,7 @@ class Scene:
 
     def edit(self, moves: Sequence[Move] = (), remove: Sequence[str] = (), out: str | Path | None = None) -> Scene:
         """The scene with parts moved or removed; errors of `wrf_mi.scene.edit.edit_scene`."""
-        place = _new_folder(out)
-        edit_scene(self.folder, place, moves, remove)
-        return Scene(place)._owned(out)
+        return self._made(out, lambda place: edit_scene(self.folder, place, moves, remove))
 
     def trace(self, data: str | Path | Record, out: str | Path | None = None, **options: Any) -> Run:
         """Ray tracing in the scene as a run, scored on the test rows of the data; options of `wrf_mi.train`."""
@@ -117,15 +116,20 @@ class Scene:
         """Interactive 3D view of the scene and of ``more``, such as runs; options of `wrf_mi.viewer.view.view`."""
         return resolve("wrf_mi.viewer.view:view")(self.folder, *more, **options)
 
-    def _owned(self, out: str | Path | None) -> Scene:
-        if out is None:
-            weakref.finalize(self, shutil.rmtree, self.folder.parent, ignore_errors=True)
-        return self
-
-
-def _new_folder(out: str | Path | None) -> Path:
-    """A folder that does not exist yet; `InputError`: it does."""
-    place = Path(tempfile.mkdtemp(prefix="wrf-mi-")) / "scene" if out is None else Path(out)
-    if place.exists():
-        raise InputError(f"{place}: exists; remove it, or choose another folder")
-    return place
+    @classmethod
+    def _made(cls, out: str | Path | None, make: Callable[[Path], Any]) -> Scene:
+        """The scene that a function writes into a new folder; `InputError`, before the work: the folder exists."""
+        if out is not None:
+            if Path(out).exists():
+                raise InputError(f"{out}: exists; remove it, or choose another folder")
+            make(Path(out))
+            return cls(Path(out))
+        home = Path(tempfile.mkdtemp(prefix="wrf-mi-"))
+        try:
+            make(home / "scene")
+        except BaseException:
+            shutil.rmtree(home)
+            raise
+        scene = cls(home / "scene")
+        weakref.finalize(scene, shutil.rmtree, home, ignore_errors=True)
+        return scene
