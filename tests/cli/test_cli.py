@@ -77,6 +77,14 @@ print({"drjit", "mitsuba", "sionna"} & set(sys.modules))
     assert done.stdout.splitlines()[-1] == "set()"
 
 
+def test_a_training_imports_no_package_of_scenes_and_pictures() -> None:
+    """Those that take the longest to import: a quarter of the start of a training each."""
+    slow = ("matplotlib", "scipy.signal", "scipy.stats", "sionna", "plotly", "xarray", "pandas")
+    code = f"import sys, wrf_mi.runs.api; print(set({slow!r}) & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
+
+
 def test_version_and_settings(command: Command) -> None:
     assert re.fullmatch(r"\d+\.\d+\.\d+\n", command.done(["--version"]))
     listed = command.done(["train", "--help-settings"])

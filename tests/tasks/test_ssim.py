@@ -12,7 +12,9 @@ from skimage.metrics import structural_similarity
 
 from wrf_mi.backend.device import on_device, to_float
 from wrf_mi.core import InputError
+from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.losses import spectrum_loss, ssim
+from wrf_mi.tasks.task import SCORED_TOGETHER
 
 Float64 = dr.float64_array_t(mi.Float)
 
@@ -29,6 +31,15 @@ def reference(prediction, truth):
 def ours(prediction, truth, float_type=None):
     float_type = float_type or mi.Float
     return np.array(ssim(on_device(prediction, float_type), on_device(truth, float_type), *prediction.shape))
+
+
+def test_many_images_are_scored_in_parts():
+    rng = np.random.default_rng(2)
+    prediction, truth = rng.random((2, 2 * SCORED_TOGETHER + 3, 9, 12), np.float32)
+    assert TASKS["spectrum"].training_score(prediction, truth) == pytest.approx(
+        reference(prediction, truth), abs=SINGLE
+    )
+    assert TASKS["spectrum"].training_score(prediction[:0], truth[:0]).shape == (0,)
 
 
 def smooth(rng, shape):

@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING, Any
 
 from ..core import InputError, Record, Split
 from ..core.registry import resolve
-from ..correction import CorrectionOptions, correct_scene, default_options, write_page
-from ..correction.options import OnStage
 from ..datasets.splits import single_split
 from ..scene.correction_data import FILE
-from ..scene.edit import Move, edit_scene
-from ..scene.make import make_scene
 from ..synthetic import load_record
 
+# What makes, corrects or edits a scene is imported where it is used: it takes a quarter of the start of a training.
 if TYPE_CHECKING:
+    from ..correction import CorrectionOptions
+    from ..correction.options import OnStage
+    from ..scene.edit import Move
     from .run import Run
 
 
@@ -54,6 +54,8 @@ class Scene:
         cls, points: str | Path | Sequence[str | Path], out: str | Path | None = None, **options: Any
     ) -> Scene:
         """Make a scene from a 3D scan or mesh; options and errors of `wrf_mi.scene.make.make_scene`."""
+        from ..scene.make import make_scene
+
         return cls._made(out, lambda place: make_scene(points, place, **options))
 
     @classmethod
@@ -88,6 +90,8 @@ class Scene:
         Raises:
             InputError: data or a scene that cannot be used, or a folder that exists.
         """
+        from ..correction import correct_scene, default_options, write_page
+
         record = data if isinstance(data, Record) else load_record(str(data))
         rows = split if isinstance(split, Split) else single_split(record, split, seed, n_train)
         options = options or default_options(record, n_train)
@@ -105,6 +109,8 @@ class Scene:
 
     def edit(self, moves: Sequence[Move] = (), remove: Sequence[str] = (), out: str | Path | None = None) -> Scene:
         """The scene with parts moved or removed; errors of `wrf_mi.scene.edit.edit_scene`."""
+        from ..scene.edit import edit_scene
+
         return self._made(out, lambda place: edit_scene(self.folder, place, moves, remove))
 
     def trace(self, data: str | Path | Record, out: str | Path | None = None, **options: Any) -> Run:

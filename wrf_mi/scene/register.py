@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike
-from scipy import ndimage, optimize, signal
+from scipy import ndimage, optimize
 from scipy.spatial import cKDTree
 from skimage.transform import EuclideanTransform, estimate_transform
 from trimesh.transformations import planar_matrix_to_3D
@@ -212,6 +212,8 @@ def _agreement(placed: FloatArray, targets: FloatArray, walls: FloatArray) -> fl
 
 def _starts(centred: FloatArray, targets: FloatArray, cell: float) -> list[FloatArray]:
     """Distinct poses where blurred pictures of both plans correlate best, over turns all around."""
+    from scipy.signal import fftconvolve  # slow to import, and few scenes are registered
+
     radius = float(np.linalg.norm(centred, axis=1).max()) + 2 * cell
     low = targets.min(axis=0) - 2 * radius
     shape = np.ceil((targets.max(axis=0) + 2 * radius - low) / cell).astype(int) + 1
@@ -221,7 +223,7 @@ def _starts(centred: FloatArray, targets: FloatArray, cell: float) -> list[Float
     for angle in np.arange(TURNS) * (2 * np.pi / TURNS):
         kernel = _image(centred @ rotation_2d(angle).T / cell + half, np.array([2 * half + 1] * 2))
         # A convolution with the reversed picture is the correlation with it.
-        match = signal.fftconvolve(wall_image, kernel[::-1, ::-1], mode="same")
+        match = fftconvolve(wall_image, kernel[::-1, ::-1], mode="same")
         for _ in range(PEAKS):
             peak = np.array(np.unravel_index(np.argmax(match), match.shape))
             peaks.append((float(match[tuple(peak)]), np.append(low + peak * cell, angle)))

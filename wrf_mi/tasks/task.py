@@ -19,6 +19,7 @@ from .scores import MixtureScores, abs_error_db, cea_db, level_of_amplitudes, ss
 UPLINK = "uplink"  # Key of the reference that copies the uplink
 LAW = "law"  # Key of the reference at receivers that were held out
 CARRIER = "carrier"
+SCORED_TOGETHER = 16  # Images whose similarity is computed at a time
 """Key of the reference at carriers without training rows: that of `Task.reference` at the nearest carrier with some."""
 
 
@@ -197,8 +198,11 @@ class Spectrum(Task):
         from ..backend.device import to_float
         from .losses import ssim as on_device
 
-        scores = on_device(to_float(prediction), to_float(truth), *np.shape(truth))
-        return np.asarray(scores.numpy(), float)
+        count, *shape = np.shape(truth)
+        # The moments of an image take forty times its memory, which Dr.Jit then keeps.
+        parts = [slice(start, start + SCORED_TOGETHER) for start in range(0, count, SCORED_TOGETHER)]
+        scores = [on_device(to_float(prediction[k]), to_float(truth[k]), len(truth[k]), *shape).numpy() for k in parts]
+        return np.concatenate([np.zeros(0), *scores])
 
     def instrument(self, record: Record) -> SpectrumInstrument:
         """An array that reports scaled Bartlett spectra."""

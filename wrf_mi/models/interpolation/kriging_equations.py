@@ -136,7 +136,7 @@ class KrigingSystem:
         """
         # k(x, x) - k^T K^-1 k (Rasmussen and Williams, equation 2.26); rounding may take it below zero.
         half = self.whiten(cross.T)
-        left = np.maximum(prior - np.square(half).sum(axis=0), 0)
+        left = np.maximum(prior - np.einsum("nm,nm->m", half, half), 0)
         if trend is None:
             return np.asarray(left)
         # And that of the trend's coefficients, R^T (B^T K^-1 B)^-1 R with R = b - B^T K^-1 k (equation 2.42).

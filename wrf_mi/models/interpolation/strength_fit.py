@@ -205,13 +205,18 @@ class StrengthPosterior:
         """Minus twice the logarithm of the marginal likelihood of the stops, up to a constant."""
         return self._process.cost
 
-    def predict(self, poses: Poses, receiver: int) -> tuple[FloatArray, FloatArray]:
-        """Mean in dBm, and variance of a single report about it before calibration, [m] each."""
+    def predict(self, poses: Sequence[Poses], receiver: int) -> list[tuple[FloatArray, FloatArray]]:
+        """Mean in dBm, and variance of a single report about it before calibration, [m] each, of several poses [m]."""
         h = self.hyperparameters
-        moved = poses.moved(h.lever_m)
-        expected, columns, _ = self.prior.columns(moved, receiver)
-        mean, variance = self._process.predict(receiver, moved, columns)
-        return expected + mean, variance + (h.drift_db**2 + h.noise_db**2) * self.ratio[receiver] ** 2
+        moved = [each.moved(h.lever_m) for each in poses]
+        # Paths may be traced for the mean, which is not for threads.
+        terms = [self.prior.columns(each, receiver)[:2] for each in moved]
+
+        def posterior(k: int) -> tuple[FloatArray, FloatArray]:
+            mean, variance = self._process.predict(receiver, moved[k], terms[k][1])
+            return terms[k][0] + mean, variance + (h.drift_db**2 + h.noise_db**2) * self.ratio[receiver] ** 2
+
+        return _of_each(posterior, range(len(poses)), sum(map(len, poses)))
 
     def mean(self, poses: Poses, receiver: int) -> FloatArray:
         """The mean of `predict`, dBm."""
@@ -311,7 +316,7 @@ class Fit:
             def predicted(
                 receiver: int, field: StrengthPosterior = field, received: list[IntArray] = received
             ) -> tuple[FloatArray, FloatArray]:
-                return field.predict(self._measured.poses.take(received[receiver]), receiver)
+                return field.predict([self._measured.poses.take(received[receiver])], receiver)[0]
 
             predictions = _of_each(predicted, range(len(mean)), sum(map(len, received)))
             for receiver, (value, variance) in enumerate(predictions):

@@ -97,10 +97,15 @@ class Hyperparameters:
     def covariance(self, a: Poses, b: Poses) -> FloatArray:
         """Covariance of the field [n, m] between poses, dB^2."""
         distance = cdist(a.position_m, b.position_m)
-        covariance = self.shadow_db**2 * np.exp(-distance / self.shadow_m)
+        covariance = self.shadow_db**2 * np.exp(distance / -self.shadow_m)
         if a.heading_rad is not None and b.heading_rad is not None:
-            turn = np.cos(a.heading_rad[:, None] - b.heading_rad[None]) - 1
-            covariance += self.body_db**2 * np.exp(self.concentration * turn - distance / self.body_m)
+            # cos(h - h') is the product of unit vectors: no cosine of each pair.
+            turn = _directions(a.heading_rad) @ _directions(b.heading_rad).T
+            distance /= self.body_m
+            turn *= self.concentration
+            turn -= self.concentration
+            turn -= distance
+            covariance += self.body_db**2 * np.exp(turn, out=turn)
         return np.asarray(covariance)
 
     def weighted_covariance(self, a: Poses, b: Poses, weights: FloatArray) -> FloatArray:
@@ -122,6 +127,11 @@ class Hyperparameters:
     def variance(self, headings: bool) -> float:
         """Variance of the field, with or without the part that depends on headings, dB^2."""
         return self.shadow_db**2 + (self.body_db**2 if headings else 0)
+
+
+def _directions(heading_rad: FloatArray) -> FloatArray:
+    """Unit vectors [n, 2]."""
+    return np.stack([np.cos(heading_rad), np.sin(heading_rad)], axis=1)
 
 
 def basis(

@@ -96,7 +96,7 @@ class Strengths(Fitted):
         position_m = finite_positions(inputs, "kriging")
         mean, std = np.empty((2, len(position_m)))
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
-            means, variances = zip(*(self.field.predict(each, receiver) for each in poses), strict=True)
+            means, variances = zip(*self.field.predict(poses, receiver), strict=True)
             # Of unknown headings: variance within each, and between their means.
             variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
             mean[rows], std[rows] = np.mean(means, axis=0) + self.shift_db, np.sqrt(variance)
