@@ -2,13 +2,17 @@
 
 `wrf_mi_bench.gpu_job` measures each in a process of its own. Fits to their final scores run on the GPU alone, since
 those of the CPU take many minutes; their scores are to be compared with the stored ones of `waits` and `training`.
+
+A machine with a GPU may be there for some minutes only: the GPU's figures are measured first, the CPU's while
+`ENOUGH_S` have not passed, and each part is kept by the content of the packages' files, so that a further call
+measures what is missing.
 """
 
 import json
 import os
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +25,14 @@ from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.stored import SCAN
 
 from .bench import RFID, BenchFailed
-from .comparison import say
+from .comparison import kept_work, say
+from .sources import fit_key, source_files
 
 JOB = "wrf_mi_bench.gpu_job"
 GPU, TWO, ALL = "GPU", "2 cores", "all cores"
 DEVICE = os.environ.get("WRF_MI_GPU", "cuda")  # ``llvm`` rehearses the measurement without a GPU
+RUNS = Path("runs/bench/gpu")
+ENOUGH_S = 240  # seconds after which no further backend is measured
 BACKENDS = {GPU: (DEVICE, 0), TWO: ("llvm", 2), ALL: ("llvm", 0)}
 """Backend and number of threads, 0 for all, by column."""
 FITS: Mapping[str, tuple[str, ...]] = {
@@ -36,6 +43,8 @@ FITS: Mapping[str, tuple[str, ...]] = {
     "correct, laboratory": ("correct", "laboratory", "--scene", "SCENE"),
     "hybrid, laboratory": ("train", "laboratory", "--scene", "SCENE"),
 }
+FEW = {"train": ("--set", "steps=200"), "hybrid": ("--preset", "fast"), "correct": ("--n-train", "40")}
+"""Options of fits in a rehearsal, whose times and scores mean nothing."""
 ASKED = {
     "WRF-GS+, rfid-lab": "0.970 in 20 s",
     "joint fit, laboratory": "15 s",
@@ -52,24 +61,29 @@ def main() -> dict[str, Any]:
         choose(DEVICE)
     except BackendError as error:
         raise InputError(f"bench gpu: {error}") from None
-    rows = fits()
-    measured = {name: _measured(*BACKENDS[name]) for name in BACKENDS}
-    devices = {GPU: measured[GPU]["device"], TWO: f"{measured[TWO]['device']}, 2 cores"}
-    devices[ALL] = f"{measured[ALL]['device']}, {os.cpu_count()} cores"
-    for axes in zip(*(measured[name]["axes"] for name in BACKENDS), strict=True):
+    start, place = time.perf_counter(), RUNS / DEVICE / fit_key(source_files())
+    rows, measured = fits(place), dict[str, dict[str, Any]]()
+    for name, (backend, threads) in BACKENDS.items():
+        if name != GPU and DEVICE == "cuda" and time.perf_counter() - start > ENOUGH_S:
+            say("gpu", f"{name}: left out after {ENOUGH_S} s; call it again")
+            continue
+        say("gpu", name)
+        measured[name] = kept_work(place, name, partial(_measured, backend, threads))
+    devices = {name: f"{of['device']}, {BACKENDS[name][1] or os.cpu_count()} cores" for name, of in measured.items()}
+    for axes in zip(*(of["axes"] for of in measured.values()), strict=True):
         for at, size in enumerate(axes[0]["sizes"]):
             values = {
                 name: f"{axis['ms'][at]:.3g} ms"
-                for name, axis in zip(BACKENDS, axes, strict=True)
+                for name, axis in zip(measured, axes, strict=True)
                 if at < len(axis["ms"])
             }
             rows.append(_row(f"{axes[0]['title']}, {size:,} {axes[0]['work']}", values))
     for model, sizes in measured[GPU]["predictions"].items():
         for size in sizes:
-            rates = {name: f"{measured[name]['predictions'][model][size]:,.0f} a second" for name in BACKENDS}
+            rates = {name: f"{measured[name]['predictions'][model][size]:,.0f} a second" for name in measured}
             rows.append(_row(f"predictions of {model}, {size} at once", rates))
     for title in measured[GPU]["kernels"]:
-        of = {name: measured[name]["kernels"][title] for name in BACKENDS}
+        of = {name: measured[name]["kernels"][title] for name in measured}
         text = {name: f"{k['launches']} launches, {k['ms']:.2g} ms, idle {k['idle']:.0%}" for name, k in of.items()}
         rows.append(_row(f"a step of {title}", text))
     return {"rows": rows, "devices": devices}
@@ -79,23 +93,29 @@ def _row(what: str, values: Mapping[str, str]) -> dict[str, Any]:
     return {"what": what, "value": values[GPU], "asked": ASKED.get(what, ""), **values}
 
 
-def fits() -> list[dict[str, Any]]:
+def fits(place: Path) -> list[dict[str, Any]]:
     """Rows of fits to their final scores on this process's backend, each in a process."""
     rows = []
-    with tempfile.TemporaryDirectory() as work:
-        scene = str(Path(work) / "scene")
-        _run("mesh", str(Path(load_record("laboratory").source) / SCAN), "--out", scene)
-        for number, (what, arguments) in enumerate(FITS.items()):
-            out = Path(work) / str(number)
-            start = time.perf_counter()
-            _run(*(scene if word == "SCENE" else word for word in arguments), "--out", str(out))
-            text = f"{time.perf_counter() - start:.1f} s"
-            if (out / METRICS).exists():
-                metrics = json.loads((out / METRICS).read_text())
-                text = f"{metrics['train_seconds']:.1f} s to median SSIM {metrics['ssim']['median']:.4f}"
-            say("gpu", f"{what}: {text}")
-            rows.append(_row(what, {GPU: text}))
+    for what in FITS:
+        text = kept_work(place, what.replace(", ", "-"), partial(_fit, what))
+        say("gpu", f"{what}: {text}")
+        rows.append(_row(what, {GPU: text}))
     return rows
+
+
+def _fit(what: str, folder: Path) -> str:
+    """Time and score of a fit."""
+    command, scene, out = FITS[what], str(folder / "scene"), folder / "run"
+    if "SCENE" in command:
+        _run("mesh", str(Path(load_record("laboratory").source) / SCAN), "--out", scene)
+    few = () if DEVICE == "cuda" else FEW["hybrid" if what.startswith("hybrid") else command[0]]
+    start = time.perf_counter()
+    _run(*(scene if word == "SCENE" else word for word in command), *few, "--out", str(out))
+    text = f"{time.perf_counter() - start:.1f} s"
+    if (out / METRICS).exists():
+        metrics = json.loads((out / METRICS).read_text())
+        text = f"{metrics['train_seconds']:.1f} s to median SSIM {metrics['ssim']['median']:.4f}"
+    return text
 
 
 def _run(*arguments: str) -> None:
@@ -104,14 +124,13 @@ def _run(*arguments: str) -> None:
         raise BenchFailed(f"bench gpu: `wrf-mi {' '.join(arguments)}` ended with status {status} {message}".rstrip())
 
 
-def _measured(backend: str, threads: int) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "axes.json"
-        status, message = run_module(JOB, [str(file), backend, str(threads)])
-        if status != 0:
-            raise BenchFailed(f"bench gpu: its process of {backend} ended with status {status} {message}".rstrip())
-        read: dict[str, Any] = json.loads(file.read_text())
-        return read
+def _measured(backend: str, threads: int, folder: Path) -> dict[str, Any]:
+    folder.mkdir(parents=True)
+    file = folder / "axes.json"
+    status, message = run_module(JOB, [str(file), backend, str(threads)])
+    if status != 0:
+        raise BenchFailed(f"bench gpu: its process of {backend} ended with status {status} {message}".rstrip())
+    return dict(json.loads(file.read_text()))
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -34,6 +34,8 @@ def test_rows_have_the_figures_of_all_backends(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(gpu, "DEVICE", "llvm")
     monkeypatch.setattr(gpu, "BACKENDS", {gpu.GPU: ("llvm", 0), gpu.TWO: ("llvm", 2), gpu.ALL: ("llvm", 0)})
     monkeypatch.setattr(gpu, "FITS", {"ray tracing, laboratory": TRACED})
+    monkeypatch.setattr(gpu, "FEW", {"train": ()})
+    monkeypatch.setattr(gpu, "RUNS", tmp_path / "runs")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, sys.path)]))
     rows = gpu.main()["rows"]
     titles = {"gaussians-splat": "splatting"}
