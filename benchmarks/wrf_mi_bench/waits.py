@@ -39,7 +39,7 @@ SEEDS = (0, 1, 2)
 CALLS = 3  # timed first calls, whose median is stated
 CAD_TRIANGLES, CAD_ROWS = 100_000, 24
 MAP_POSITIONS = 100_000
-SIDE_STEPS = 600  # steps of a fit beside another one
+SIDE_STEPS = 2000  # steps of a fit beside another one, half a minute
 Figures = dict[str, Any]
 Measure = Callable[[Path], Figures]
 

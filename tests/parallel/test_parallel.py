@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -133,6 +134,17 @@ def test_waiting_for_a_worker_is_printed_once(capsys: pytest.CaptureFixture[str]
         "tracing: waiting for a worker to connect to the scheduler",
         "tracing: 1 of 2, 1 worker",
     ]
+
+
+def test_workers_of_this_machine_that_never_start_are_not_awaited_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    from distributed import Client, LocalCluster
+
+    monkeypatch.setattr(scheduler, "LOST_S", 0.5)
+    monkeypatch.setattr(scheduler, "POLL_S", 0.1)
+    cluster = LocalCluster(n_workers=0, dashboard_address=":0", silence_logs=logging.CRITICAL)
+    without_workers = Scheduler(Client(cluster, set_as_default=False), cluster)
+    with without_workers, pytest.raises(SchedulerFailed, match="no worker of this machine has started"):
+        without_workers.map(worker_tasks.double, [1])
 
 
 def awaited(file: Path) -> str:

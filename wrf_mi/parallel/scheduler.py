@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import queue
 import sys
+import time
 import uuid
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -20,6 +21,7 @@ from .worker import run_part, worker_environment
 
 CONNECT_S = 10.0  # time for a scheduler to answer: an idle one needs milliseconds, a busy one seconds
 POLL_S = 1.0
+LOST_S = 60.0  # time for a worker of this machine to start anew: a busy machine needs seconds
 PARTS_EACH = 8  # parts for each worker: a slow or late worker leaves the others at most an eighth of its share
 LINES = 10  # lines of progress in all where standard error is a file
 
@@ -150,13 +152,21 @@ class Scheduler:
         index = {key: k for k, key in enumerate(keys)}
         for future in futures.values():
             future.add_done_callback(lambda future: done.put(future.key))
+        worked = time.monotonic()
         while futures:
             try:
                 key = done.get(timeout=POLL_S)
-            except queue.Empty:  # for however long: a cluster may have to start workers first
+            except queue.Empty:
                 if client.status == "running" and not client.nthreads():
+                    # For however long on a cluster, which may have to start workers first.
                     progress.waiting()
+                    if self._cluster is not None and time.monotonic() - worked > LOST_S:
+                        reason = f"{what}: no worker of this machine has started for {LOST_S:.0f} s"
+                        raise SchedulerFailed(f"{reason}; use fewer workers, or omit --scheduler") from None
+                else:
+                    worked = time.monotonic()
                 continue
+            worked = time.monotonic()
             k = index[key]
             # Dask forgets a result that was fetched: a worker that is lost later takes none with it.
             results[k] = _result(futures.pop(key), what)
