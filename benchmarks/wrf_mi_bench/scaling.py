@@ -154,7 +154,7 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
     """Times and memory of one call at each size.
 
     ``sizes`` were measured, not those ``left_out``; ``ms`` and ``memory_mb`` are of each, ``exponent`` is that of time
-    with its interval, ``limit`` that of n log n at the same sizes.
+    with its interval, ``limit`` that of n log n at the same sizes, both of two sizes or more.
     """
     sizes, times, memory = list[int](), list[Any](), list[float]()
     for size in axis.sizes:
@@ -173,7 +173,8 @@ def scale(axis: Axis, repeats: int = REPEATS, most_s: float = MOST_S, call_s: fl
         gc.collect()
     result: dict[str, Any] = {"name": axis.name, "title": axis.title, "work": axis.work, "sizes": sizes}
     result |= {"left_out": list(axis.sizes[len(sizes) :]), "ms": [float(np.median(ms)) for ms in times]}
-    return result | {"memory_mb": memory, "exponent": vars(exponent(sizes, times)), "limit": n_log_n(sizes)}
+    growth = {"exponent": vars(exponent(sizes, times)), "limit": n_log_n(sizes)} if len(sizes) > 1 else {}
+    return result | {"memory_mb": memory} | growth
 
 
 def verdict(growth: Interval, limit: float) -> str:
