@@ -57,7 +57,8 @@ def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
     assert dataset.attrs["threshold_db"] == -10
     assert not {"threshold_dbm", "transmit_power_dbm"} & set(dataset.attrs)
     assert "no signal strengths" in heading(figure)
-    assert "full scale (dB)" in " ".join(figure.axes[-1].get_ylabel().split())
+    titles = [axes.get_title().split(": ")[-1] for axes in figure.axes[:3]]
+    assert titles == ["expected power (dB)", "standard deviation (dB)", "probability of more than -10 dB"]
     split = make_splits(run.problem.record, "official")[0]
     assert len(split.test) <= 12 < len(split.all_train)
     for most, trained in ((picture.MOST_POINTS, len(split.all_train)), (12, -(-len(split.all_train) // 3))):

@@ -55,7 +55,7 @@ from ..tasks import Task, task_of
 from ..training.session import OnProgress, quiet
 from . import grid
 from .coverage import coverage_probability
-from .dataset import map_dataset, maps_package
+from .dataset import COVERAGE, POWER, STD, map_dataset, maps_package
 
 if TYPE_CHECKING:
     import xarray
@@ -235,17 +235,17 @@ def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Cond
 
     level = task.level(parts.prediction)
     means = of_headings(level.mean)
-    variables: dict[str, Any] = {"power_dbm": means.mean(axis=1) + added}
+    variables: dict[str, Any] = {POWER: means.mean(axis=1) + added}
     if level.std is not None:
         # The law of total variance: within a heading, and between headings.
         std_db = np.sqrt(np.square(of_headings(level.std)).mean(axis=1) + means.var(axis=1))
-        variables["power_std_db"] = std_db
+        variables[STD] = std_db
         reception = parts.prediction.reception
         received = None if reception is None else of_headings(reception).mean(axis=1)
         if received is not None:
             variables[RECEPTION] = received
         if (limit := conditions.threshold_db) is not None:
-            variables["coverage_probability"] = coverage_probability(variables["power_dbm"], std_db, limit, received)
+            variables[COVERAGE] = coverage_probability(variables[POWER], std_db, limit, received)
     if parts.traced is not None and parts.learned is not None:
         sides = parts.traced, parts.learned
         traced, learned = (of_headings(task.level(Prediction(side)).mean).mean(axis=1) + added for side in sides)
@@ -254,7 +254,7 @@ def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Cond
         names = [field.name for field in fields(PathStatistics)]
         variables |= {name: of_headings(getattr(parts.paths, name)).mean(axis=1) for name in names}
     if task.level_kind != "relative":
-        variables["path_gain_db"] = variables["power_dbm"] - conditions.transmit_dbm
+        variables["path_gain_db"] = variables[POWER] - conditions.transmit_dbm
     return variables
 
 

@@ -18,12 +18,12 @@ from .grid import Grid, SurfaceMesh
 if TYPE_CHECKING:
     import xarray
 
-POWER, BEST = "power_dbm", "best_receiver"
+POWER, STD, COVERAGE, BEST = "power_dbm", "power_std_db", "coverage_probability", "best_receiver"
 VARIABLES = {
     POWER: ("dBm", "expected received power"),
-    "power_std_db": ("dB", "standard deviation of the received power"),
+    STD: ("dB", "standard deviation of the received power"),
     RECEPTION: ("1", "probability that a transmission is received"),
-    "coverage_probability": ("1", "probability that the received power exceeds the threshold"),
+    COVERAGE: ("1", "probability that the received power exceeds the threshold"),
     "path_gain_db": ("dB", "path gain, gains of both antennas included"),
     "traced_share": ("dBm", "received power that the traced side of the model states alone"),
     "learned_share": ("dBm", "received power that the learned side of the model states alone"),

@@ -1,10 +1,10 @@
-"""Picture of a radio map: power at each receiver over the plan or the mesh, with the measured points."""
+"""Picture of a radio map: power, standard deviation and coverage over plan or mesh, with the measured points."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -25,22 +25,21 @@ from ..runs.scene_view import surfaces_of
 from ..scene.mesh.surfaces import cut_lines
 from ..scene.preview import AZIMUTH_DEG, ELEVATION_DEG, MOST_FACES
 from ..tasks import task_of
-from .dataset import POWER
+from .dataset import COVERAGE, POWER, STD
 
 if TYPE_CHECKING:
     import xarray
 
-PANEL_IN, COLUMNS = 3.2, 3  # width of a panel, and number of panels in a line
+PANEL_IN, BAR_IN, COLUMNS = 3.2, 0.5, 3  # width of a panel and of its colour scale; number of panels in a line
 MOST_PANELS = 12  # largest number of receivers that are drawn, the first ones
-MOST_POINTS = 200  # largest number of training rows of a panel, and of other measured rows
+MOST_POINTS = 400  # largest number of training rows of a panel, and of other measured rows
 TAIL = 1.0  # percentage of values beyond either end of the colour scale
 MEASURED_TAIL = 10.0  # likewise for measured levels, among which are single deep fades
 STRONGEST = "strongest receiver"
 TRAINED = {"marker": "o", "s": 13, "edgecolors": "white", "linewidths": 0.4}
 OTHER = {"marker": "s", "s": 11, "edgecolors": "black", "linewidths": 0.4}
 MARKS = "circles: training rows, squares: other measured rows, crosses: receivers"
-LETTERS_PER_INCH, LETTERS_OF_BAR, LINE_IN = 14, 32, 0.16
-"""Of the text above the panels; length of the colour scale's label, and height of a line, inches."""
+LETTERS_PER_INCH, LINE_IN = 14, 0.16  # of the text above the panels, and height of its lines in inches
 SAME_CARRIER = 1e-9  # relative difference of frequencies that are the same
 
 
@@ -52,47 +51,87 @@ class _Measured(NamedTuple):
     trained: NDArray[np.bool_]
 
 
+class _Panel(NamedTuple):
+    """Values [y, x] or [point] with their colours, and the sides on which values may lie beyond these.
+
+    ``number`` is the receiver's, None: all; ``measured`` are its rows.
+    """
+
+    title: str
+    values: FloatArray
+    colours: ScalarMappable
+    beyond: Literal["neither", "max", "both"]
+    number: int | None
+    measured: _Measured | None
+
+
 def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
-    """Expected power at each receiver, and of several at the strongest one, with one colour scale for all.
+    """Expected power, its standard deviation and the coverage, of the strongest receiver; then power at each receiver.
 
     Walls are the cut of the run's scene at the map's height; measured rows of the run's data at this receiver and at
     the map's carrier have their measured level as colour, circles those that trained the model, squares all others.
     """
     flat = "point" not in dataset.sizes
-    power = dataset[POWER].values
-    panels: list[tuple[str, int | None]] = [(STRONGEST, None)] if len(power) > 1 else []
-    panels += [(str(name), k) for k, name in enumerate(dataset["receiver"].values)][:MOST_PANELS]
-    measured = [_measured(dataset, run, k) for k in range(len(power))]
-    low, high = _range(power, np.concatenate([rows.level for rows in measured]))
-    colours = ScalarMappable(Normalize(low, max(high, low + 1e-3)), "viridis")
+    measured = [_measured(dataset, run, k) for k in range(dataset.sizes["receiver"])]
+    panels = _panels(dataset, measured)
     lines = -(-len(panels) // COLUMNS)
     columns = min(COLUMNS, len(panels))
-    width = PANEL_IN * columns + 1
+    width = (PANEL_IN + BAR_IN) * columns
     heading = _heading(dataset, measured, int(width * LETTERS_PER_INCH))
-    height = PANEL_IN * _aspect(dataset) * lines + 0.7 + LINE_IN * heading.count("\n")
+    height = (PANEL_IN * _aspect(dataset) + 0.5) * lines + 0.3 + LINE_IN * heading.count("\n")
     figure = Figure(figsize=(width, height), layout="constrained")
     kind: dict[str, Any] = {} if flat else {"projection": "3d", "computed_zorder": False}
     grid = figure.subplots(lines, columns, squeeze=False, subplot_kw=kind)
     walls = scene_cuts(run, float(dataset["height"])) if flat else []
-    strongest = np.fmax.reduce(power, axis=0)
-    for place, (axes, (name, number)) in enumerate(zip(grid.flat, panels, strict=False)):
-        values, rows = (strongest, None) if number is None else (power[number], measured[number])
+    for axes, panel in zip(grid.flat, panels, strict=False):
         if flat:
-            _draw_plan(axes, dataset, values, colours, walls)
-            _label_metres(axes, lowest=place + columns >= len(panels), leftmost=place % columns == 0)
+            _draw_plan(axes, dataset, panel.values, panel.colours, walls)
+            axes.set_xlabel("x (m)", fontsize=7)
+            axes.set_ylabel("y (m)", fontsize=7)
         else:
-            _draw_mesh(axes, dataset, values, colours)
-        _draw_points(axes, dataset, rows, number, colours)
-        axes.set_title(name, fontsize=8)
+            _draw_mesh(axes, dataset, panel.values, panel.colours)
+        _draw_points(axes, dataset, panel)
+        axes.set_title(panel.title, fontsize=8)
         axes.tick_params(labelsize=6)
+        bar = figure.colorbar(panel.colours, ax=axes, shrink=0.8, pad=0.02 if flat else 0.12, extend=panel.beyond)
+        bar.ax.tick_params(labelsize=6)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
-    bar = figure.colorbar(colours, ax=list(grid.flat), shrink=0.8, extend="both", pad=0.02 if flat else 0.12)
-    label = f"{dataset[POWER].attrs['long_name']} ({dataset[POWER].attrs['units']})"
-    bar.set_label(textwrap.fill(label, LETTERS_OF_BAR), fontsize=8)
-    bar.ax.tick_params(labelsize=7)
     figure.suptitle(heading, fontsize=8)
     return without_formulas(figure)
+
+
+def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Panel]:
+    """Panels of the strongest receiver, then the power at each of the first ones."""
+    power = dataset[POWER].values
+    low, high = _range(power, np.concatenate([rows.level for rows in measured]))
+    colours = ScalarMappable(Normalize(low, max(high, low + 1e-3)), "viridis")
+    unit = dataset[POWER].attrs["units"]
+    names = [str(name) for name in dataset["receiver"].values]
+    several = len(names) > 1
+    number = None if several else 0
+    who = STRONGEST if several else names[0]
+    # Positions without a value, inside solids, have none at any receiver.
+    best = np.where(np.isfinite(power), power, -np.inf).argmax(axis=0)[None]
+
+    def of_best(name: str) -> FloatArray:
+        return np.take_along_axis(dataset[name].values, best, axis=0)[0]
+
+    rows = None if several else measured[0]
+    panels = [_Panel(f"{who}: expected power ({unit})", of_best(POWER), colours, "both", number, rows)]
+    if STD in dataset:
+        values = of_best(STD)
+        scale = Normalize(0, max(float(np.nanpercentile(values, 100 - TAIL)), 1e-3))
+        panels.append(
+            _Panel(f"{who}: standard deviation (dB)", values, ScalarMappable(scale, "magma"), "max", number, None)
+        )
+    if COVERAGE in dataset:
+        threshold = next(dataset.attrs[key] for key in ("threshold_dbm", "threshold_db") if key in dataset.attrs)
+        title = f"{who}: probability of more than {threshold:g} {unit}"
+        shades = ScalarMappable(Normalize(0, 1), "cividis")
+        panels.append(_Panel(title, of_best(COVERAGE), shades, "neither", number, None))
+    numbers = range(len(names) if several else 0)[:MOST_PANELS]
+    return panels + [_Panel(names[k], power[k], colours, "both", k, measured[k]) for k in numbers]
 
 
 def _heading(dataset: xarray.Dataset, measured: Sequence[_Measured], width: int) -> str:
@@ -130,12 +169,6 @@ def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:
     """Lines [n, 2, 2] in which a height cuts each surface of a run's scene, metres; empty without a scene."""
     scene = run.problem.opened_scene
     return [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
-
-
-def _label_metres(axes: Any, lowest: bool, leftmost: bool) -> None:
-    axes.set_xlabel("x (m)" if lowest else "", fontsize=7)
-    axes.set_ylabel("y (m)" if leftmost else "", fontsize=7)
-    axes.tick_params(labelbottom=lowest, labelleft=leftmost)
 
 
 def _draw_plan(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Any) -> None:
@@ -181,17 +214,16 @@ def _measured(dataset: xarray.Dataset, run: Run, number: int) -> _Measured:
     return _Measured(record.tx_pos_m[rows], level[rows], trained[rows])
 
 
-def _draw_points(
-    axes: Any, dataset: xarray.Dataset, measured: _Measured | None, number: int | None, colours: ScalarMappable
-) -> None:
+def _draw_points(axes: Any, dataset: xarray.Dataset, panel: _Panel) -> None:
     """Measured levels of a receiver, and the receivers as crosses."""
     dims = 3 if "point" in dataset.sizes else 2
     at = np.stack([dataset[f"receiver_{axis}"].values for axis in "xyz"], axis=-1)
-    chosen = at if number is None else at[number : number + 1]
+    chosen = at if panel.number is None else at[panel.number : panel.number + 1]
     axes.scatter(*chosen.T[:dims], marker="x", color="#c1121f", s=22, linewidths=1.4, zorder=5)
-    if measured is None:
+    if panel.measured is None:
         return
-    shades = {"cmap": colours.cmap, "norm": colours.norm}
+    shades = {"cmap": panel.colours.cmap, "norm": panel.colours.norm}
     # Training rows, often the fewer, lie above the others.
-    for rows, mark in ((~measured.trained, OTHER), (measured.trained, TRAINED)):
-        axes.scatter(*measured.points_m[rows].T[:dims], c=measured.level[rows], **shades, **mark, zorder=4)
+    for rows, mark in ((~panel.measured.trained, OTHER), (panel.measured.trained, TRAINED)):
+        at_m = panel.measured.points_m[rows]
+        axes.scatter(*at_m.T[:dims], c=panel.measured.level[rows], **shades, **mark, zorder=4)
