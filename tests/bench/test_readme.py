@@ -158,7 +158,7 @@ EARLIER = sorted((CHECKOUT / "benchmarks" / "results" / "earlier").glob("*.json"
 DECIMAL = re.compile(r"\d\.\d")
 BLOCK = re.compile(r"<!-- ([\w/-]+) -->\n.*?<!-- /\1 -->", re.DOTALL)
 STATED = {
-    *(("conventions.md", "score"), ("correction.md", "part"), ("data.md", "name"), ("data.md", "task")),
+    *(("correction.md", "part"), ("data.md", "name"), ("data.md", "task")),
     *(("export.md", "format"), ("joint.md", "setting"), ("locate.md", "column"), ("maps.md", "variable")),
     *(("changelog.md", "0.1.0"), ("gaussians.md", "constant"), ("gaussians.md", "setting"), ("numerics.md", "")),
     ("plugins.md", "parameter"),
