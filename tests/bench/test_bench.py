@@ -27,13 +27,13 @@ NEEDS_NO_DATA = {
 ON_PAGE = {
     **dict.fromkeys(("operator", "training", "waits"), "speed.md"),
     **dict.fromkeys(("stages", "intervals"), "hybrid.md"),
-    **{"rooms": "correction.md", "locate": "locate.md", "phase-error": "scenes.md"},
+    **{"rooms": "correction.md", "locate": "locate.md"},
     **{"reception": "maps.md", "closed-forms": "numerics.md"},
 }
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
 NOT_LISTED = (
     *("scaling", "stress", "robustness", "sentinels", "new-carriers", "new-receivers"),
-    *("elsewhere", "traced-and-splatted", "flat-plan", "damaged-scenes"),
+    *("elsewhere", "traced-and-splatted", "flat-plan", "damaged-scenes", "phase-error"),
 )
 """Checks of many rows, or that the prose of a page summarises."""
 OTHER_BLOCKS = ("checks", *IN_RESULTS)
