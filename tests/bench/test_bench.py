@@ -25,7 +25,7 @@ NEEDS_NO_DATA = {
 }
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
-    **dict.fromkeys(("operator", "training", "waits"), "speed.md"),
+    **dict.fromkeys(("operator", "waits"), "speed.md"),
     **dict.fromkeys(("stages", "intervals"), "hybrid.md"),
     **{"rooms": "correction.md", "locate": "locate.md"},
     **{"reception": "maps.md", "closed-forms": "numerics.md"},
@@ -33,7 +33,7 @@ ON_PAGE = {
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
 NOT_LISTED = (
     *("scaling", "stress", "robustness", "sentinels", "new-carriers", "new-receivers"),
-    *("elsewhere", "traced-and-splatted", "flat-plan", "damaged-scenes", "phase-error"),
+    *("elsewhere", "traced-and-splatted", "flat-plan", "damaged-scenes", "phase-error", "training"),
 )
 """Checks of many rows, or that the prose of a page summarises."""
 OTHER_BLOCKS = ("checks", *IN_RESULTS)
