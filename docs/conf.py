@@ -28,6 +28,7 @@ extensions = [
     "sphinx_design",
     "sphinx_copybutton",
     "checkout_links",
+    "findings_tables",
     "notebook_pages",
     "plain_docstrings",
 ]

@@ -104,7 +104,7 @@ _OWN: Mapping[str, Check] = {
     "scaling": _here("cost against work", "scaling:main"),
     "operator": _here("prediction by operator", "operator:main", table="page_tables:operator"),
     "training": _here("training", "training:main", RFID, table="page_tables:training"),
-    "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="stages:table"),
+    "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="page_tables:stages"),
     "intervals": _here(
         "intervals of three models", "stages:intervals", RFID, FLAT, resumes=True, table="stages:interval_table"
     ),
@@ -117,9 +117,9 @@ _OWN: Mapping[str, Check] = {
         table="unmeasured:table",
         **_STORED,
     ),
-    "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
+    "rooms": _here("random rooms", "rooms:main", resumes=True, table="page_tables:rooms"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
-    "reception": _here("reception", "reception:main", FLAT, resumes=True, table="reception:table"),
+    "reception": _here("reception", "reception:main", FLAT, resumes=True, table="page_tables:reception"),
     "phase-error": _here("spectra from scans", "rooms:phase_errors", resumes=True, table="rooms:phase_table"),
     "closed-forms": _here("traced channels against closed forms", "closed_forms:main", table="closed_forms:table"),
     "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),
@@ -127,7 +127,7 @@ _OWN: Mapping[str, Check] = {
     "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),
     "damaged-scenes": _here("faults of scenes named", "damaged_scenes:main"),
     "plan": _here("where to measure next", "planning:main", FLAT, resumes=True),
-    "waits": _here("what a person waits for", "waits:main", RFID, FLAT, resumes=True),
+    "waits": _here("what a person waits for", "waits:main", RFID, FLAT, resumes=True, table="page_tables:waits"),
     "sentinels": _here(
         "figures kept", "sentinels:main", RFID, FLAT, CONFERENCE, OFFICE, resumes=True, table="sentinels:table"
     ),

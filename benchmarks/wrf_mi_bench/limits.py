@@ -1,4 +1,4 @@
-"""Figures of ``docs/limits.md``, as a Markdown table: ``python -m wrf_mi_bench.limits``."""
+"""Figures of ``docs/scenes.md``, as a Markdown table: ``python -m wrf_mi_bench.limits``."""
 
 import logging
 import tempfile

@@ -33,6 +33,7 @@ RUNS = Path("runs/bench/locate")
 STRETCH = 20  # consecutive test rows that are resampled together: the robot moves 3 m in them
 INSIDE = (0.85, 0.95)  # limits of the share of true positions inside the 90 % regions
 ROWS = 64
+POOLED = "draws"  # last word of a row of several draws
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def row_of(cell: Cell, draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "area_m2": float(np.median(of("area_m2"))),
         "radius_m": float(np.median(of("radius_m"))),
     }
-    which = f"seed {cell.seed}" if len(draws) == 1 else f"{len(draws)} draws"
+    which = f"seed {cell.seed}" if len(draws) == 1 else f"{len(draws)} {POOLED}"
     what = f"{'all' if cell.n_train is None else cell.n_train} rows, {cell.title}, {which}"
     value = f"error {figures['median_m']:.2f} m (mean {figures['mean_m']:.2f}), kNN "
     value += f"{figures['neighbours_median_m']:.2f} m (mean {figures['neighbours_mean_m']:.2f}), "
@@ -168,13 +169,14 @@ def summary(measured: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table: error, gain over nearest neighbours with its 95 % interval, and regions."""
+    """Markdown table of pooled draws: error, gain over nearest neighbours with its 95 % interval, and regions."""
     columns: dict[str, Callable[[Mapping[str, Any]], str]] = {
-        "training rows, model, seed": lambda row: row["what"],
+        "training rows, model": lambda row: row["what"],
         "error, median (mean), m": lambda row: f"**{row['median_m']:.2f}** ({row['mean_m']:.2f})",
         "kNN, median (mean), m": lambda row: f"{row['neighbours_median_m']:.2f} ({row['neighbours_mean_m']:.2f})",
         "gain on kNN, m": lambda row: "{:.2f} ({:.2f} to {:.2f})".format(*row["gain_m"]),
         "inside 90 % regions": lambda row: "{:.0%} ({:.0%} to {:.0%})".format(*row["inside"]),
         "radius, m": lambda row: f"{row['radius_m']:.1f}",
     }
-    return markdown_table(list(columns), ([cell(row) for cell in columns.values()] for row in rows))
+    shown = [row for row in rows if row["what"].endswith(POOLED) or row["what"].startswith("all")]
+    return markdown_table(list(columns), ([cell(row) for cell in columns.values()] for row in shown))

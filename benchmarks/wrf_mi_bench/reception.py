@@ -5,7 +5,7 @@ values is missing: weaker ones are removed before anything is fitted. Each run i
 (`wrf_mi_bench.comparison.stored_part`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,6 @@ from wrf_mi.core.array_files import stored_arrays
 from wrf_mi.runs.folder import PREDICTIONS
 from wrf_mi.runs.reception import REFERENCES
 from wrf_mi.runs.results import RECEPTION
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_receivers import NAME as FLOOR
 from wrf_mi.tasks.scores import bootstrap
@@ -115,23 +114,3 @@ def main() -> dict[str, Any]:
     result: dict[str, Any] = {"rows": rows, "measured": measured_on(parts)}
     worse = [row["what"] for row in rows if any(gain < -WORSE and high < 0 for gain, _, high in row["gain"])]
     return result | ({"failed": f"clearly worse than a reference: {', '.join(worse)}"} if worse else {})
-
-
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table: scores of each model and of both references."""
-    head = [
-        "data, split, rows",
-        "model",
-        "log loss",
-        "rate",
-        "nearest",
-        "Brier score",
-        "calibration error",
-        "error, dB",
-    ]
-    lines = []
-    for row in rows:
-        (loss, *others), brier, error = row["log_loss"], row["brier"][0], row["calibration_error"][0]
-        cells = [f"**{loss:.3f}**", *(f"{value:.3f}" for value in (*others, brier, error)), f"{row['error_db']:.2f}"]
-        lines.append([f"{row['cell']} ({row['received']:.0%} received)", row["model"], *cells])
-    return markdown_table(head, lines)

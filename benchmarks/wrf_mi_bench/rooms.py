@@ -114,20 +114,6 @@ def main() -> dict[str, Any]:
     return {"rows": [*rows, {**median, "cea_db": medians}]}
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of the accuracy in each room, and the duration of the correction."""
-    columns = [column for column in COLUMNS if all(column in row["cea_db"] for row in rows)]
-    head = [*columns, "correction"]
-    lines = [f"| room | {' | '.join(head)} |", "| --- |" + " ---: |" * len(head)]
-    for row in rows:
-        of_room = "correction" in row
-        name = row["what"] if of_room else f"**median**; {row['what']}: {row['value']}"
-        cells = [f"{row['cea_db'][column]:.1f}" for column in columns]
-        seconds = f"{row['correction']['seconds']:.0f} s" if of_room else ""
-        lines.append(f"| {' | '.join([name, *cells, seconds])} |")
-    return "\n".join(lines)
-
-
 PHASE_SEEDS = range(101, 105)
 CARRIERS_HZ = 0.92e9, 2.4e9, 5.0e9
 PHASE_ERRORS_RAD = 0.0, 0.5, 0.75, 1.0, 1.25, 1.5, 2.5

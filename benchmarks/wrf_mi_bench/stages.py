@@ -208,26 +208,6 @@ def main() -> dict[str, Any]:
     return {"rows": rows, "measured": measured_on(parts), **_verdict(rows)}
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table, a line for each cell: the hybrid, its kept stages and its best part by mean score."""
-    head = ["data", "hybrid", "inside", "kept stages", "best part alone", "gain over it"]
-    lines = []
-    for cell in dict.fromkeys(row["cell"] for row in rows):
-        hybrid, *others = (row for row in rows if row["cell"] == cell)
-        best = min(others, key=lambda row: row["gain"])
-        inside = hybrid["inside_90"]
-        cells = [
-            hybrid["what"].rpartition(":")[0],
-            f"**{hybrid['score']['median']:.3g}** ({hybrid['score']['mean']:.3g})",
-            "" if inside is None else f"{inside:.0%}",
-            ", ".join(stage["stage"] for stage in hybrid["stages"] if stage["kept"]),
-            f"{best['model']} {best['score']['median']:.3g} ({best['score']['mean']:.3g})",
-            f"{best['gain']:.2g} ({best['gain_low']:.2g} to {best['gain_high']:.2g})",
-        ]
-        lines.append(cells)
-    return markdown_table(head, lines)
-
-
 def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     pairs = [row for row in rows if "gain" in row]
     worse = [row for row in pairs if row["gain_high"] < 0]

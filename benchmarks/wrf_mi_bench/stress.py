@@ -236,7 +236,7 @@ def fits(count: int) -> list[Row]:
             stated, unseen = stated + matched, unseen + (not matched)
         unseen += not all(np.isfinite(values).all() for params in saved for values in params.values())
     what = f"{FITS} learning rates and starts, {count} cases"
-    value = f"{finished} ended finite, {stated} said at which step which group was not, {unseen} did neither"
+    value = f"{finished} ended finite, {stated} stopped, naming step and parameter group, {unseen} did neither"
     return [{"what": what, "value": value, "asked": NEITHER}]
 
 

@@ -13,7 +13,7 @@ from wrf_mi_bench import sources
 from wrf_mi_bench.bench import CASES, CHECKS, BenchFailed, bench, case_folder, check_table, read_results
 from wrf_mi_bench.check import main
 from wrf_mi_bench.stress_rows import FITS, STAGES, stages
-from wrf_mi_bench.table_pages import IN_RESULTS, front_table, fronts, read_points
+from wrf_mi_bench.table_pages import IN_RESULTS
 
 from wrf_mi.core import InputError
 from wrf_mi.core.registry import resolve
@@ -25,15 +25,18 @@ NEEDS_NO_DATA = {
 }
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
-    **dict.fromkeys(("pareto", "operator", "training", "waits"), "speed.md"),
+    **dict.fromkeys(("operator", "waits"), "speed.md"),
     **dict.fromkeys(("stages", "intervals"), "hybrid.md"),
-    **{"elsewhere": "numerics.md", "rooms": "correction.md", "locate": "locate.md", "phase-error": "scenes.md"},
+    **{"rooms": "correction.md", "locate": "locate.md"},
     **{"reception": "maps.md", "closed-forms": "numerics.md"},
 }
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
-NOT_LISTED = ("scaling", "stress", "robustness", "sentinels", "new-carriers", "new-receivers")
-"""Checks of many rows or of a former hybrid; `docs/numerics.md` summarises stress and robustness."""
-OTHER_BLOCKS = ("checks", "figures", "pareto", "ratios", *IN_RESULTS)
+NOT_LISTED = (
+    *("scaling", "stress", "robustness", "sentinels", "new-carriers", "new-receivers"),
+    *("elsewhere", "traced-and-splatted", "flat-plan", "damaged-scenes", "phase-error", "training"),
+)
+"""Checks of many rows, or that the prose of a page summarises."""
+OTHER_BLOCKS = ("checks", *IN_RESULTS)
 """Blocks of pages that are made from several results."""
 FIGURES = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
 
@@ -122,7 +125,7 @@ def test_case_folder_depends_on_data_versions_and_arguments(name, tmp_path, monk
 
 
 def test_documents_show_the_stored_results():
-    trained, checked = read_results(RESULTS)
+    _, checked = read_results(RESULTS)
     for row in checked:
         if page := ON_PAGE.get(row["case"]):
             assert (
@@ -130,10 +133,7 @@ def test_documents_show_the_stored_results():
                 in (CHECKOUT / "docs" / page).read_text()
             )
     others = [row for row in checked if row["case"] not in {*ON_PAGE, *NOT_LISTED}]
-    for name, text in (("figures", bench_module.table(trained)), ("checks", check_table(others))):
-        assert text in marked("docs/results.md", name)
-    rows = fronts(read_points(RESULTS / "tables"))
-    assert marked("docs/speed.md", "pareto") == front_table(rows)
+    assert marked("docs/results.md", "checks").strip() == check_table(others)
 
 
 def test_documents_show_no_check_without_a_stored_result():
@@ -162,13 +162,6 @@ def test_documents_show_the_worst_of_each_stage():
     assert set(shown_stages) >= {words for words, _ in STAGES}
     worse = [{**row, "value": "worst 9.0e-01"} if row["what"].startswith("phase") else row for row in rows]
     assert "| **9.0e-01** | 0.001 |" in summary_table(worse)
-
-
-def test_documents_show_the_robustness_without_single_files():
-    result = json.loads((RESULTS / "robustness.json").read_text())
-    rows = [row for row in result["figures"]["rows"] if " inputs, " not in row["value"]]
-    shown = check_table([{"title": CHECKS["robustness"].title, "figures": {"rows": rows}}])
-    assert marked("docs/numerics.md", "robustness").strip() == shown
 
 
 def test_stored_results_are_complete():

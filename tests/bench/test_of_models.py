@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from wrf_mi_bench import bench, comparison, reception, stages
+from wrf_mi_bench import bench, comparison, page_tables, reception, stages
 from wrf_mi_bench.comparison import MEASURED, STORED, measured_on, stored_part
 from wrf_mi_bench.locate import CELLS as LOCATE_CELLS
 from wrf_mi_bench.locate import STRETCH, stretches, summary
 from wrf_mi_bench.rows_saved import CURVES, IDW, ROWS, measure, rows_needed, saved
 from wrf_mi_bench.rows_saved import JOINT as JOINT_START
-from wrf_mi_bench.stages import CALIBRATED, CELLS, JOINT, LAB, Cell, parts_of, rows_of, table
+from wrf_mi_bench.stages import CALIBRATED, CELLS, JOINT, LAB, Cell, parts_of, rows_of
 from wrf_mi_bench.unmeasured import HYBRID, LAW, gains, only
 
 from wrf_mi.core import Receiver, Record
@@ -81,10 +81,11 @@ def test_table_names_the_kept_stages_and_the_best_part():
         measured("idw", 0.7, (0.2, 0.1, 0.3)),
         measured(JOINT, 0.91, (-0.01, -0.03, 0.01)),
     ]
-    assert table(rows_of(CELLS[0], results)).splitlines()[2] == (
-        "| rfid-lab, official, 5 rows | **0.9** (0.89) | 88% | mean, field "
-        "| kriging 0.92 (0.91) | -0.02 (-0.03 to -0.01) |"
-    )
+    rows = rows_of(CELLS[0], results)
+    assert page_tables.stages(rows).splitlines()[2:] == [
+        "| rfid-lab, official, 5 rows | **0.9** | 88% | mean, field | kriging 0.92 | -0.02 (-0.03 to -0.01) |"
+    ]
+    assert len(page_tables.stages([{**row, "gain": 0.0} if "gain" in row else row for row in rows]).splitlines()) == 2
 
 
 @pytest.mark.parametrize(
@@ -188,10 +189,9 @@ def test_weakest_values_are_missing_and_reception_is_tabulated(monkeypatch):
     scores = {"log_loss": 0.25, "brier": 0.1, "calibration_error": 0.01}
     block = {"received": 2 / 3, **scores, "reference": {name: scores for name in reception.REFERENCES}}
     row = reception.row_of(cell, "idw", {"reception": block, "gain": [], "score": {"median": 3.0}})
-    cells = (
-        "flat-ble, blocked, 400 rows, a third missing (67% received) | idw | **0.250** | 0.250 | 0.250 | 0.100 | 0.010"
-    )
-    assert reception.table([row]).splitlines()[2] == f"| {cells} | 3.00 |"
+    rows = [row, {**row, "model": "kriging", "log_loss": [0.2, 0.25, 0.25]}]
+    cells = "flat-ble, blocked, 400 rows, a third missing (67% received) | 0.250 | **0.200** | 0.250 | 0.250"
+    assert page_tables.reception(rows).splitlines()[2] == f"| {cells} |"
 
 
 def strengths(observed: np.ndarray) -> Record:

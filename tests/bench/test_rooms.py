@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wrf_mi_bench.page_tables import rooms
 from wrf_mi_bench.random_room import OPTIONS, SNR_DB, Survey, random_room_record
-from wrf_mi_bench.rooms import COLUMNS, clipped_cea_db, disagreement, table
+from wrf_mi_bench.rooms import COLUMNS, clipped_cea_db, disagreement
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 from wrf_mi_scenes.random_rooms import CLEAR_M, FEWEST, HEIGHTS_M, LEAST_M, MOST, MOST_M, MOUNTED_M, MOUNTS, random_room
 
@@ -95,14 +96,15 @@ def test_correction_brings_channels_closer_than_the_scan(tmp_path):
     assert after > before + 3
 
 
-def test_table_has_a_line_for_each_room_and_the_median():
-    row = {
-        "what": "0: 3 x 4 x 3 m",
-        "value": "1.0 to 9.0 dB",
-        "cea_db": {column: float(number) for number, column in enumerate(COLUMNS)},
-        "correction": {"seconds": 31.4},
-    }
-    lines = table([row, {"what": "median gain", "value": "8.0 dB", "cea_db": row["cea_db"]}]).splitlines()
-    assert lines[2] == "| 0: 3 x 4 x 3 m | 0.0 | 1.0 | 2.0 | 3.0 | 31 s |"
-    assert lines[3].startswith("| **median**; median gain: 8.0 dB | 0.0 | 1.0 |")
-    assert len({line.count("|") for line in lines}) == 1
+def test_table_has_the_range_and_the_median_over_rooms():
+    measured = [
+        {
+            "cea_db": {column: more + number for number, column in enumerate(COLUMNS)},
+            "correction": {"seconds": 31.4 + more},
+        }
+        for more in (0.0, 9.0, 3.0)
+    ]
+    lines = rooms([*measured, {"what": "median gain", "cea_db": {column: 100.0 for column in COLUMNS}}]).splitlines()
+    assert lines[2] == "| smallest of 3 rooms | 0.0 | 1.0 | 2.0 | 3.0 | 31 s |"
+    assert lines[3] == "| median of 3 rooms | 3.0 | 4.0 | 5.0 | 6.0 | 34 s |"
+    assert lines[4].startswith("| largest of 3 rooms | 9.0 | 10.0 |")

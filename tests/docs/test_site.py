@@ -12,6 +12,7 @@ from documents import CHECKOUT, DOCS, blocks
 
 import wrf_mi
 from wrf_mi import models
+from wrf_mi.checking.scene_findings import KINDS
 from wrf_mi.graph import receivers
 
 WORKFLOWS = sorted((CHECKOUT / ".github" / "workflows").glob("*.yml"))
@@ -33,6 +34,9 @@ def test_site_is_built_without_warnings_and_lists_every_page(site):
     front = (site / "index.html").read_text(encoding="utf-8")
     for page in (*DOCS.glob("*.md"), *(DOCS / "howto").glob("*.md")):
         assert f'href="{page.relative_to(DOCS).with_suffix(".html")}"' in front or page.name == "index.md", page.name
+    page = (site / "howto" / "mesh.html").read_text(encoding="utf-8")
+    kinds = {kind for kind, (level, _) in KINDS.items() if level != "note"}
+    assert kinds <= set(re.findall(r'class="pre">([\w-]+)<', page))
     for name in wrf_mi.__all__:
         assert (site / "api" / f"wrf_mi.{name}.html").exists(), name
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from typing import Any
 
 from .options import Arguments, add_command
@@ -10,8 +11,14 @@ from .output import exit_status, show
 
 def add_parser(commands: Any) -> None:
     """Add ``check`` to the commands."""
+    from ..checking.scene_findings import KINDS
+
     text = "find what keeps a scene, mesh or scan from opening or makes its paths wrong, and repair a copy"
     parser = add_command(commands, "check", check_command, text)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    width = max(map(len, KINDS)) + 2
+    lines = [f"  {kind:<{width}}{level:<9}{description}" for kind, (level, description) in KINDS.items()]
+    parser.epilog = "\n".join(["kinds of findings:", *lines])
     add = parser.add_argument
     add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, mesh or scan")
     add("--data", metavar="DATASET", help="data set whose devices must not be inside solids, and whose carrier counts")

@@ -30,7 +30,7 @@ BESIDE = 1e-5
 """Slack of the sides of planes, as a share of `Surfaces.scale_m`: points of reflection that coincide in an edge, as
 displaced by `wrf_mi.tracing.search.images`."""
 MOST_KEPT = 1 << 27  # bytes of chains that a process keeps
-SECONDS_PER_HIT = 1.2e-7  # of each surface that a ray meets, on two cores; most of it finds duplicates (docs/limits.md)
+SECONDS_PER_HIT = 1.2e-7  # of each surface that a ray meets, on two cores; most of it finds duplicates (docs/scenes.md)
 WARN_S, MOST_S = 10.0, 3600.0  # durations from which a search is announced, and refused
 _kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
