@@ -59,9 +59,11 @@ def test_examples_of_how_to_pages_run(tmp_path, monkeypatch):
     module = type(sys)("how_to_pages")
     monkeypatch.setitem(sys.modules, "how_to_pages", module)  # where a dataclass looks for its types
     try:
-        for page in ("own-data", "extend"):
+        for page in ("own-data", "own-field", "extend"):
             exec("\n".join(blocks(DOCS / "howto" / f"{page}.md", "python")), names)
         run = wrf_mi.train("office", "nearest", out="run")
+        own = wrf_mi.score_predictions("laboratory", "mine.npz", "own", "mine", split="blocked")
+        assert own.metrics["n_test"] == 200
         assert wrf_mi.check_data("office").suspicions == ()
         assert wrf_mi.open_run("run").predict([[2.0, 3.0, 1.2]], "kitchen").mean.shape == (1,)
         assert run.metrics["abs_error_db"]["median"] < 5
