@@ -100,7 +100,7 @@ class DataReport:
         lines += [f"suspicion {suspicion.name}: {suspicion.text}" for suspicion in self.suspicions]
         lines += [f"note: {text}" for text in self.notes]
         if self.faults:
-            summary = f"{_count(len(self.faults), 'fault')}; suspicions are looked for when there is none"
+            summary = f"{_count(len(self.faults), 'fault')}; correct them, then check again for suspicions"
         else:
             summary = f"no fault, {_count(len(self.suspicions), 'suspicion')}"
         return [*lines, f"{self.dataset}: {summary}"]
