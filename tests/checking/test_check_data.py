@@ -50,7 +50,7 @@ def test_faults_are_named_by_file_and_row_and_counted(folder):
         "fault: tx_pos.csv: 2 more of this kind, up to row 12; correct or remove the row",
         *(f"fault: spectrum/{row:05d}.png, row {row}: {image}" for row in (3, 4)),
         "fault: train_index.txt, line 3: 'three' is not a whole number; correct it",
-        f"{folder}: 15 faults; suspicions are looked for when there is none",
+        f"{folder}: 15 faults; correct them, then check again for suspicions",
     ]
     assert [len(report.lines(most=most)) for most in (2, 100)] == [2 + 1 + 2 + 1 + 1, 15 + 1]
     plain = report.as_dict()

@@ -47,7 +47,7 @@ def test_faults_end_with_status_2(flat: Path, command: Command) -> None:
         "fault: calibration_df.csv, row 4: 2 fields, but the header has 6; correct or remove the row",
         "fault: test_robot_df.csv: missing; give a file that exists, or complete its folder",
     ]
-    assert last == f"{flat}: 3 faults; suspicions are looked for when there is none"
+    assert last == f"{flat}: 3 faults; correct them, then check again for suspicions"
 
 
 def test_suspicions_end_with_status_1_if_asked(flat: Path, command: Command) -> None:
