@@ -90,6 +90,17 @@ with h5py.File("capture.hdf5", "w") as file:
     file["Pilot_Samples"] = samples
     file.attrs.update(num_mob_ant=3, samples_per_user=224)
 """
+TABLES = """
+import numpy as np
+import pandas
+
+rng = np.random.default_rng(0)
+places = {"latitude": 52 + rng.random(40) / 1e4, "longitude": 13 + rng.random(40) / 1e4}
+table = pandas.DataFrame(places | {f"AP{k} dBm": rng.integers(-80, -40, 40) for k in range(3)})
+table.to_csv("table.csv", index=False)
+table.to_parquet("table.parquet")
+table.to_excel("table.xlsx", index=False)
+"""
 SCENARIO = """
 import deepmimo
 import numpy as np
@@ -130,6 +141,7 @@ EXTRAS = (
     Extra("cluster", ("predict field --tx positions.csv --out spread.csv --scheduler local:1",)),
     Extra("argos", ("data info capture.hdf5",), CAPTURE),
     Extra("lidar", tuple(f"mesh scan.{suffix} --out {suffix} --replace" for suffix in ("xyz", "laz")), SCAN),
+    Extra("tables", tuple(f"data import table.{end} --out {end}" for end in ("csv", "parquet", "xlsx")), TABLES),
     Extra("meshes", ("mesh room.usda --out usda --replace",), ROOM),
     Extra("deepmimo", script=SCENARIO),
     Extra("docs", programs=(f"sphinx -q -b html -D execute_notebooks=0 {CHECKOUT / 'docs'} site",)),

@@ -122,10 +122,10 @@ def _serving_model(record: Record, request: RunRequest) -> Model:
     entry = known_model(request.model)
     check_record(entry, record, (other for other in MODELS.values() if other.scene != "required"))
     model = entry.serving(record.task, request.scene is not None)
-    for option, data in (("evaluation", "Gaussians"), ("receiver", "fields of spectra")):
-        if getattr(request, option) is not None and option not in model.train_arguments:
-            able = ", ".join(other.name for other in MODELS.values() if option in other.train_arguments)
-            raise InputError(f"--{option} belongs to {data} ({able}), not to {request.model}")
+    for name, option, data in (("evaluation", "", "Gaussians"), ("receiver", "-model", "fields of spectra")):
+        if getattr(request, name) is not None and name not in model.train_arguments:
+            able = ", ".join(other.name for other in MODELS.values() if name in other.train_arguments)
+            raise InputError(f"--{name}{option} belongs to {data} ({able}), not to {request.model}")
     return model
 
 
@@ -151,10 +151,11 @@ def _settings_of(model: Model, request: RunRequest) -> Any:
         settings: Any = kind(**{field.name: getattr(stated, field.name) for field in fields(stated)})
     else:
         assert isinstance(stated, Iterable)
-        texts = setting_texts(stated) if isinstance(stated, Mapping) else stated
-        settings = default_settings(
-            model, [*_preset(model, request.preset), *texts], {name: getattr(request, name) for name in GIVEN}
-        )
+        texts = [*(setting_texts(stated) if isinstance(stated, Mapping) else stated)]
+        preset, named = _preset(model, request.preset), {text.partition("=")[0].strip() for text in texts}
+        if preset and {text.partition("=")[0] for text in preset} <= named:
+            raise InputError(f"preset {request.preset}: the settings state all that it does; omit one of them")
+        settings = default_settings(model, [*preset, *texts], {name: getattr(request, name) for name in GIVEN})
     if "model" in model.train_arguments and settings.model != model.name:
         raise InputError(f"setting model: {settings.model}, where the model is {model.name}; choose it with --model")
     return settings

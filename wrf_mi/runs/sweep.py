@@ -38,7 +38,7 @@ from .folder import CONFIG, METRICS, RunRequest, is_finished, package_versions
 
 OPTIONS = (
     *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "min-rows", "seed"),
-    *("preset", "receiver", "stages", "paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
+    *("preset", "receiver-model", "stages", "paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )
 """Options of ``wrf-mi train`` that may vary, besides settings."""
