@@ -37,8 +37,9 @@ SPOOLED_BYTES = 1 << 26  # size from which predictions are collected on the disk
 def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inputs:
     """Read what a model predicts from; positions are NaN where only an uplink is given.
 
-    In place of a CSV file ``X,Y,Z`` is one position. A CSV file has columns x, y, z in metres and optionally heading_rad and frequency_hz; an ``.npz`` file ``tx_pos``
-    [m, 3] and optionally ``heading_rad`` [m], ``frequency_hz`` [m], or ``uplink`` [m, antennas, subcarriers] and these.
+    A CSV file has columns x, y, z in metres and optionally heading_rad and frequency_hz; in place of its name ``X,Y,Z``
+    is one position. An ``.npz`` file has ``tx_pos`` [m, 3] and optionally ``heading_rad`` [m], ``frequency_hz`` [m], or
+    ``uplink`` [m, antennas, subcarriers] and these.
     `InputError`: the file is missing, or a row is not made of finite numbers.
     """
     with suppress(ValueError):

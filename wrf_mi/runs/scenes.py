@@ -1,11 +1,4 @@
-"""Scenes as objects: made from scans or plans, corrected by measurements, edited and traced.
-
->>> import wrf_mi
->>> room = wrf_mi.Scene.open("laboratory")
->>> traced = room.trace("laboratory", n_train=20, settings={"depth": 1})
->>> sorted(traced.predict([[2.2, 3.0, 1.7]]).mean.shape)
-[1, 90, 360]
-"""
+"""Scenes as objects: made from scans or plans, corrected by measurements, edited and traced."""
 
 from __future__ import annotations
 
@@ -44,6 +37,11 @@ class Scene:
 
     Attributes:
         folder: scene folder, or name, Mitsuba XML or mesh of one that was opened.
+
+    >>> room = Scene.open("laboratory")
+    >>> traced = room.trace("laboratory", n_train=20, settings={"depth": 1})
+    >>> traced.predict([[2.2, 3.0, 1.7]]).mean.shape
+    (1, 90, 360)
     """
 
     folder: Path

@@ -232,6 +232,8 @@ REFUSED = {
     "rarely heard": (None, {"min_heard": 99}, "no receiver was heard in 99 training rows"),
     "average": (None, {"average": "median"}, "--average 'median' is unknown; give one of db, mw"),
     "pitch": (None, {"pitch_m": -1}, "--pitch -1: give a number above 0"),
+    "storey": (None, {"storey_m": 4.0}, "--storey: it belongs to a column floor without z; omit it"),
+    "heading unit": (None, {"heading": "deg"}, "--heading-unit: the table has no column of headings; omit it"),
     "option": (None, {"sentinel": 1}, "no option sentinel; see ImportOptions"),
     "positions": (None, {"positions": ["a.csv", "b.csv"]}, r"a\.csv: missing"),
 }
