@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core import InputError
-from .options import Arguments, add_command, refuse
+from .options import Arguments, add_command, add_scheduler, refuse
 from .output import Watch, show, summary_table
 
 
@@ -38,6 +38,7 @@ def _add_map(commands: Any) -> None:
     text = "yaw of the transmitter, degrees, for models that know it (default: mean over 8 headings)"
     add("--heading", type=float, metavar="DEG", help=text)
     add("--frequency", type=float, metavar="HZ", help="carrier, where the data have several")
+    add_scheduler(parser)
 
 
 def map_command(a: Arguments) -> int:
@@ -46,6 +47,7 @@ def map_command(a: Arguments) -> int:
     from ..maps.api import radio_map
     from ..maps.dataset import check_map_file, write_map
     from ..maps.picture import map_figure
+    from ..parallel import open_scheduler
     from ..runs.run import open_run
 
     out = Path(a.out)
@@ -54,8 +56,9 @@ def map_command(a: Arguments) -> int:
     options = {"height_m": a.height, "step_m": a.step, "surface": a.surface, "receivers": a.receiver}
     options |= {"threshold_dbm": a.threshold, "transmit_dbm": a.transmit_power}
     options |= {"heading_deg": a.heading, "frequency_hz": a.frequency}
-    with Watch() as watch:
-        dataset = radio_map(run, **options, on_progress=watch.on_progress)
+    with Watch() as watch, open_scheduler(a.scheduler) as scheduler:
+        workers = scheduler if a.scheduler else None
+        dataset = radio_map(run, **options, on_progress=watch.on_progress, scheduler=workers)
     write_map(dataset, out)
     picture = write_figure(out.with_suffix(".png"), map_figure(dataset, run))
     if "power_std_db" not in dataset:

@@ -85,7 +85,7 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         ``reference``, ``constant`` (`wrf_mi.runs.results.against_constant`), for several receivers ``receivers``, with
         standard deviations ``inside_90`` and ``crps``, with probabilities of reception ``reception``, ``n_train``,
         ``n_test``, ``n_not_scored``, ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is
-        not finite is not scored: its truth is NaN; so are all of the trained receivers in a split that holds out others.
+        not finite is not scored: its truth is NaN; so are those of trained receivers where a split holds out others.
 
     Raises:
         InputError: no test rows or none that is finite, predictions of another shape or not finite, or a receiver that
