@@ -88,7 +88,7 @@ def _add_correct(commands: Any) -> None:
     add("--calibrate", metavar="LIST", help=f"{parts} (default: the first four; for signal strengths materials, gain)")
     add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3; strengths: 6)")
     add("--reflections", type=int, metavar="N", help="largest number of reflections (default: 3; strengths: 2)")
-    add("--rays", type=int, metavar="N", help="number of rays from each receiver (default: 65536)")
+    add("--rays", metavar="N", help="number of rays from each receiver (default: 65536), or auto as for train")
     add("--shift-sd", type=float, metavar="M", help="standard deviation of a plane's stated position (default: 0.02 m)")
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
     add_antennas(parser)
