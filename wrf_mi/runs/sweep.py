@@ -281,9 +281,9 @@ def _row(run: SweepRun, status: str) -> dict[str, Any]:
     if not metrics:
         return row | {"metrics": {}}
     task, references = TASKS[metrics["task"]], metrics["reference"]
+    row |= {key: metrics[key] for key in HEADINGS if key in metrics} | {"metrics": metrics}
     row |= {"score": task.label, "reference_median": references[task.headline(references)]["median"]}
-    row |= {key: metrics[task.block][key] for key in SCORES}
-    return row | {key: metrics[key] for key in HEADINGS if key in metrics} | {"metrics": metrics}
+    return row | {key: metrics[task.block][key] for key in SCORES}
 
 
 def check_failures(rows: Sequence[Mapping[str, Any]]) -> None:
