@@ -224,7 +224,7 @@ def map_values(
     workers, least = (1, size) if scheduler is None else (scheduler.workers, 1)
     rows = [every[part] for part in row_parts(len(every), workers, least, size)]
 
-    def each(part: int, mapped: list[dict[str, Any]]) -> None:
+    def collect(part: int, mapped: list[dict[str, Any]]) -> None:
         for place, of_receiver in enumerate(mapped):
             for name, values in of_receiver.items():
                 if name not in variables:
@@ -238,7 +238,7 @@ def map_values(
     chosen, sizes = [positions_m[part] for part in rows], list(map(len, rows))
     function = partial(_mapped_part, receivers, conditions)
     with _each_warning_once():
-        (scheduler or Scheduler()).map(function, chosen, opener, what="mapping", sizes=sizes, each=each, lines=True)
+        (scheduler or Scheduler()).map(function, chosen, opener, what="mapping", sizes=sizes, each=collect, lines=True)
     return variables
 
 

@@ -102,10 +102,9 @@ class Scene:
             InputError: data or a scene that cannot be used, or a folder that exists.
             BackendError: a deterministic correction in a process that computes on a GPU already.
         """
-        from ..correction import CorrectionOptions, correct_scene, default_options, write_page
-
         if deterministic:  # before anything is read: reading a data set may choose the GPU
             init("llvm", threads=1)
+        from ..correction import CorrectionOptions, correct_scene, default_options, write_page
 
         def corrected(place: Path) -> None:
             record = data if isinstance(data, Record) else load_record(data, progress)
