@@ -159,8 +159,8 @@ class Run:
             values = [getattr(prediction, name) for prediction in every]
             return None if any(value is None for value in values) else values[0] if of_one else np.stack(values)
 
-        names, stated = tuple(known[number].name for number in numbers), map(joined, ("mean", "std", "reception"))
-        return LabelledPrediction(*stated, inputs.tx_pos_m, names, self.config.task, of_one)
+        how = inputs.tx_pos_m, tuple(known[number].name for number in numbers), self.config.task, of_one
+        return LabelledPrediction(joined("mean"), joined("std"), joined("reception"), *how)
 
     def score(self, split: str | None = None) -> dict[str, Any]:
         """Scores on the test rows, or on those of another split (`wrf_mi.runs.api.evaluate_run`)."""
