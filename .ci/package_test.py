@@ -46,6 +46,10 @@ known = {"frequencies_hz": np.array([2.44e9]), "official": (np.arange(30), np.ar
 record = wrf_mi.Record("made-up", "rssi", positions_m, (receiver,), rssi_dbm.astype(np.float32), **known)
 write_ble_folder("data", record)
 np.savetxt("positions.csv", positions_m[:3], delimiter=",", header="x,y,z", comments="")
+faces = [np.insert(rng.random((8000, 2)), axis, side, axis=1) for axis in range(3) for side in (0, 1)]
+np.savetxt("scan.xyz", np.concatenate(faces) * [5, 4, 2.7], fmt="%.4f")
+for name in ("capture.hdf5", "scan.laz", "room.usda"):  # refused without an extra before they are read
+    Path(name).touch()
 """
 COMMANDS = (
     "wrf-mi --version",
@@ -60,13 +64,9 @@ SCAN = """
 import laspy
 import numpy as np
 
-rng = np.random.default_rng(0)
-faces = [np.insert(rng.random((8000, 2)), axis, side, axis=1) for axis in range(3) for side in (0, 1)]
-points = np.concatenate(faces) * [5, 4, 2.7]
-np.savetxt("scan.xyz", points, fmt="%.4f")
 cloud = laspy.LasData(laspy.LasHeader(point_format=3, version="1.4"))
 cloud.header.scales = np.full(3, 1e-3)
-cloud.x, cloud.y, cloud.z = points.T
+cloud.x, cloud.y, cloud.z = np.loadtxt("scan.xyz").T
 cloud.write("scan.laz")
 """
 ROOM = """
@@ -89,6 +89,17 @@ samples = np.random.default_rng(0).integers(-9, 9, (4, 2, 3 * 224, 2)).astype(np
 with h5py.File("capture.hdf5", "w") as file:
     file["Pilot_Samples"] = samples
     file.attrs.update(num_mob_ant=3, samples_per_user=224)
+"""
+TABLES = """
+import numpy as np
+import pandas
+
+rng = np.random.default_rng(0)
+places = {"latitude": 52 + rng.random(40) / 1e4, "longitude": 13 + rng.random(40) / 1e4}
+table = pandas.DataFrame(places | {f"AP{k} dBm": rng.integers(-80, -40, 40) for k in range(3)})
+table.to_csv("table.csv", index=False)
+table.to_parquet("table.parquet")
+table.to_excel("table.xlsx", index=False)
 """
 SCENARIO = """
 import deepmimo
@@ -130,6 +141,7 @@ EXTRAS = (
     Extra("cluster", ("predict field --tx positions.csv --out spread.csv --scheduler local:1",)),
     Extra("argos", ("data info capture.hdf5",), CAPTURE),
     Extra("lidar", tuple(f"mesh scan.{suffix} --out {suffix} --replace" for suffix in ("xyz", "laz")), SCAN),
+    Extra("tables", tuple(f"data import table.{end} --out {end}" for end in ("csv", "parquet", "xlsx")), TABLES),
     Extra("meshes", ("mesh room.usda --out usda --replace",), ROOM),
     Extra("deepmimo", script=SCENARIO),
     Extra("docs", programs=(f"sphinx -q -b html -D execute_notebooks=0 {CHECKOUT / 'docs'} site",)),
@@ -220,7 +232,6 @@ def main() -> None:
             print(f"package-test: {package.name} works", file=sys.stderr)
             if kind != "wheel":
                 shutil.rmtree(place)
-        (place / "capture.hdf5").touch()  # for the command that is refused before the file is read
         for extra in EXTRAS:
             steps.next(f"using the extra {extra.name}")
             use_extra(extra, package, python, place)

@@ -51,7 +51,7 @@ def strength_commands(run: Path, folder: Path, heard: dict[str, str], tx: str = 
         ["evaluate", run],
         ["predict", run, "--tx", folder / "tx.csv", "--out", folder / "powers.csv"],
         ["map", run, "--step", "1", "--out", folder / "map.nc"],
-        ["locate", run, "--step", "1", "--input", folder / "heard.csv", "--out", folder / "positions.csv"],
+        ["locate", run, "--step", "1", "--observed", folder / "heard.csv", "--out", folder / "positions.csv"],
         ["compare", run, "--out", folder / "page"],
         ["view", run, "--out", folder / "view.html"],
     ]

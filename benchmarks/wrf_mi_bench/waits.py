@@ -125,7 +125,7 @@ def memory(folder: Path) -> Figures:
 def strength_map(folder: Path) -> Figures:
     """A map of a hybrid of signal strengths in the walls of a flat's plan."""
     flat = data_folder(FLAT)
-    command("mesh", flat / "layout.csv", "--height", "2.7", "--out", folder / "scene")
+    command("mesh", flat / "layout.csv", "--wall-height", "2.7", "--out", folder / "scene")
     command("train", FLAT, "--scene", folder / "scene", "--n-train", "400", "--out", folder / "hybrid")
     places = load_record(FLAT).tx_pos_m
     area = float(np.prod(np.ptp(places[:, :2], axis=0)))

@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from calling import SET
-from commands import Command, rows_of
+from commands import Command, arrays_in, rows_of
 from made_spectra import SIZE
 
 from wrf_mi import synthetic
@@ -156,6 +156,8 @@ def test_predict(run: Path, tmp_path: Path, command: Command) -> None:
     (tmp_path / "tx.csv").write_text(f"Z, X,name,Y\n{rows}\n\n")
     np.savez(tmp_path / "tx.npz", tx_pos=positions)
     first, second = tmp_path / "a.npz", tmp_path / "new" / "b.npz"
+    alone = tmp_path / "alone.npz"
+    command.done(["predict", run, "--tx", "0.5,0.5,-0.5", "--out", alone])
     ended = command(["predict", run, "--tx", tmp_path / "tx.csv", "--out", first])
     assert ended == (0, f"3 predictions: {first}\n", "")
     printed = command.json(["predict", run, "--input", tmp_path / "tx.npz", "--out", second])
@@ -163,6 +165,7 @@ def test_predict(run: Path, tmp_path: Path, command: Command) -> None:
         assert printed == {"out": str(second), "arrays": {k: list(b[k].shape) for k in b.files}}
         for key in a.files:
             np.testing.assert_array_equal(a[key], b[key])
+        np.testing.assert_array_equal(arrays_in(alone)["prediction"][0], a["prediction"][1])
         np.testing.assert_array_equal(a["row"], [0, 1, 2])
         np.testing.assert_array_equal(a["tx_pos"], positions)
         np.testing.assert_array_equal(a["receiver_name"], ["gateway1"])

@@ -145,7 +145,7 @@ def test_wifi_office_imports_by_one_command(tmp_path: Path, command: Command) ->
     """Grid indices of 0.6 m, -200 dBm and 100 m of range where nothing was heard, access points at unknown places."""
     train, test = (DATA / "wifi-office" / f"database_office_{part}.csv" for part in ("train", "test"))
     folder, run = tmp_path / "office", tmp_path / "run"
-    out = command.done(["data", "import", train, "--test", test, "--pitch-m", 0.6, "--out", folder])
+    out = command.done(["data", "import", train, "--test", test, "--pitch", 0.6, "--out", folder])
     assert "-200 is not heard: 659 readings are empty fields" in out
     assert "100000 is no rtt" in out
     assert "split: 81 training and 27 test rows" in out

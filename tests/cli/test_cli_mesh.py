@@ -13,7 +13,9 @@ from commands import Command
 
 def test_a_plan_becomes_a_scene_that_can_be_traced(flat_folder: Path, tmp_path: Path, command: Command) -> None:
     scene, run = tmp_path / "scene", tmp_path / "run"
-    head, *files = command.done(["mesh", flat_folder / "layout.csv", "--height", "2.5", "--out", scene]).splitlines()
+    head, *files = command.done(
+        ["mesh", flat_folder / "layout.csv", "--wall-height", "2.5", "--out", scene]
+    ).splitlines()
     assert head == f"1 floor, 1 ceiling, 4 wall, 0 other: {scene}"
     for line, name in zip(files, ("materials.yml", "preview.png"), strict=True):
         assert line.endswith(str(scene / name))
@@ -27,7 +29,7 @@ def test_registration_moves_the_scene(tmp_path: Path, command: Command) -> None:
     (tmp_path / "layout.csv").write_text("x,y\n0,0\n6,0\n6,4\n2,4\n2,3\n0,3\n0,0\n")
     (tmp_path / "pairs.csv").write_text("x,y,to_x,to_y\n0,0,1,2\n6,0,1,8\n6,4,-3,8\n")
     pairs = ["--register-pairs", tmp_path / "pairs.csv"]
-    moved = command.json(["mesh", tmp_path / "layout.csv", "--height", "2.5", "--out", tmp_path / "moved", *pairs])
+    moved = command.json(["mesh", tmp_path / "layout.csv", "--wall-height", "2.5", "--out", tmp_path / "moved", *pairs])
     assert moved["surfaces"] == {"floor": 1, "ceiling": 1, "wall": 6, "other": 0}
     walls = (tmp_path / "moved" / "meshes").glob("wall*.ply")
     corners = np.concatenate([trimesh.load_mesh(path).vertices for path in walls])
@@ -39,11 +41,11 @@ def test_registration_moves_the_scene(tmp_path: Path, command: Command) -> None:
     ("words", "message"),
     [
         ("missing.ply --out scene", "missing.ply"),
-        ("plan.csv --out scene", "--height"),
-        ("plan.csv --out scene --height -1", "height above zero"),
-        ("plan.csv --out plan.csv --height 2.5", "exists"),
-        ("plan.csv --out scene --height 2.5 --materials materials.yml", "itu_cheese"),
-        ("plan.csv --out scene --height 2.5 --register-pairs plan.csv", "plan.csv"),
+        ("plan.csv --out scene", "--wall-height"),
+        ("plan.csv --out scene --wall-height -1", "height above zero"),
+        ("plan.csv --out plan.csv --wall-height 2.5", "exists"),
+        ("plan.csv --out scene --wall-height 2.5 --materials materials.yml", "itu_cheese"),
+        ("plan.csv --out scene --wall-height 2.5 --register-pairs plan.csv", "plan.csv"),
         ("empty.xyz --out scene", "empty.xyz"),
         ("millimetres.xyz --out scene", "--units mm"),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import Command, positions_file
 
@@ -46,9 +47,9 @@ def test_settings_of_kinds_of_path_that_are_not_traced_have_no_effect(settings: 
     ("arguments", "message"),
     [
         (["--phase-error", "1"], "phase_error 1: without effect, as spectra alone are expectations, and .* holds rssi"),
-        (["--calibrate", "gain", "--scheduler", "local:1"], "omit --scheduler"),
+        (["--calibrate", "gain", "--scheduler", "local:1"], "--scheduler has no effect beside --calibrate"),
         (["--material", "concrete"], "radio materials of its own"),
-        (["--target-error", "1", "--depth", "3"], "give one of them"),
+        (["--target-error", "1", "--depth", "3"], "--depth is chosen by --target-error"),
     ],
 )
 def test_options_of_trace_without_effect_are_refused(
@@ -82,6 +83,25 @@ def test_settings_of_ray_tracing_without_effect_are_named(
     assert all(one.startswith(start) for one, start in zip(found, warned, strict=True)), found
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--depth 3", "--depth belongs to --model ray-tracing, not to hybrid; omit it"),
+        ("--model idw --stages mean", "--stages belongs to --model hybrid, not to idw; omit it"),
+        ("--stages mean,surfaces", "--stages mean,surfaces: of a scene; give --scene"),
+        ("--stages residual --scene {room}", "not used by --stages residual; omit one of them"),
+        ("--preset fast --stages residual", "preset fast: the settings state all that it does; omit one of them"),
+        ("--model wrf-gs+ --receiver-model pixel", "receiver"),
+        ("--material concrete", "--material and antenna options belong to a scene that is traced; give --scene"),
+    ],
+)
+def test_options_of_train_without_effect_are_refused(
+    options: str, message: str, flat_folder: Path, room: Path, tmp_path: Path, command: Command
+) -> None:
+    command.refused(["train", flat_folder, *options.format(room=room).split(), "--out", tmp_path / "run"], message)
+    assert not (tmp_path / "run").exists()
+
+
 def test_settings_of_paths_without_a_scene_are_named(flat_folder: Path, caplog: Any) -> None:
     plan_run(flat_folder, RunRequest("wrf-gs+"))
     assert caplog.text == ""
@@ -98,10 +118,16 @@ def test_other_commands_refuse_or_name_options_without_effect(
     command.refused([*predict, "--no-operator"], "--no-operator belongs to learned fields of spectra, not to kriging")
     command.refused(["evaluate", run, "--no-operator"], "--no-operator belongs to learned fields")
     correct = ["correct", flat_folder, "--scene", room, "--out", tmp_path / "corrected", "--shift-sd", "0.1"]
-    command.refused(correct, "--shift-sd: of planes and frame, which --calibrate materials,gain leaves")
+    command.refused(correct, "shift_sd_m=0.1: of planes and frame, which materials,gain leaves")
     command.refused(["edit", room, "--replace"], "--out")
-    view = ["view", run, "--material", "concrete", "--out", tmp_path / "view.html"]
-    command.refused(view, "material concrete: of a bare mesh, and no source is one")
+    view = ["view", run, "--out", tmp_path / "view.html"]
+    command.refused([*view, "--material", "concrete"], "material concrete: of a bare mesh, and no source is one")
+    command.refused([*view, "--max-paths", 9], "--max-paths is of a layer that these sources lack; omit it")
+    glb = ["export", room, "--format", "glb", "--out", tmp_path / "room.glb", "--replace"]
+    command.refused(glb, "--replace belongs to formats that are folders, not to glb; omit it")
+    scan = tmp_path / "scan.xyz"
+    np.savetxt(scan, np.random.default_rng(0).uniform(0, 5, (100, 3)))
+    command.refused(["check", scan, "--dataset", flat_folder], "a scan; devices and carriers are checked in the scene")
     paths = ["export", room, "--format", "paths", "--tx", "1,1,1", "--rx", "2,1,1", "--frequency", "1e9"]
     paths += ["--out", tmp_path / "paths.csv"]
     for more, option in (("", "--depth"), (",scattering", "--paths scattering")):

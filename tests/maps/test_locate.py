@@ -188,7 +188,7 @@ def test_command_writes_positions_and_picture(fitted: tuple[Path, Record], tmp_p
     run, record = fitted
     file, out = observations(tmp_path / "in.csv", record), tmp_path / "out.csv"
     located = ["locate", run, "--step", "0.5", "--out"]
-    figures = command.json([*located, out, "--input", file, "--posterior", tmp_path / "p.npz"])
+    figures = command.json([*located, out, "--observed", file, "--posterior", tmp_path / "p.npz"])
     assert figures["n"] == 20
     assert figures["error_m"]["median"] < 1.0
     assert 0.5 < figures["held_out"]["inside"] <= 1
@@ -234,7 +234,7 @@ def test_bad_observations_are_refused_in_one_line(
     file = tmp_path / "in.csv"
     file.write_text(text)
     message = f"{re.escape(str(file))}.*{re.escape(words)}"
-    command.refused(["locate", fitted[0], "--input", file, "--out", tmp_path / "out.csv"], message)
+    command.refused(["locate", fitted[0], "--observed", file, "--out", tmp_path / "out.csv"], message)
     assert not (tmp_path / "out.csv").exists()
 
 

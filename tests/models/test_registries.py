@@ -112,7 +112,7 @@ def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[
     np.savetxt(data / "delays.csv", table, "%.4f", ",", header="x,y,z,delay_ns", comments="")
     (folder / "tx.csv").write_text("x,y,z\n1,2,1\n3,1,2\n")
     words = [word for setting in SETTINGS for word in ("--set", setting)]
-    asked = ["--model", "wrf-gs+", "--receiver", "attenuated", "--json", *words, "--out", folder / "attenuated"]
+    asked = ["--model", "wrf-gs+", "--receiver-model", "attenuated", "--json", *words, "--out", folder / "attenuated"]
     nearest = ["--model", "nearest", "--set", "neighbours=1", "--json", "--out", folder / "nearest"]
     models = ("idw", "kriging", "hybrid", *SERVED)
     results = commands(

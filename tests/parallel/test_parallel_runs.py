@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+import xarray
 from commands import Command, arrays_in
 from made_flat import write_flat
 from made_waves import wave_record
@@ -19,6 +20,7 @@ from worker_tasks import Lossy
 from wrf_mi import parallel
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import load, write_spectrum_folder
+from wrf_mi.maps.api import radio_map
 from wrf_mi.models import ray_tracing
 from wrf_mi.parallel import Scheduler
 from wrf_mi.runs.api import predict_to_file, train
@@ -128,6 +130,9 @@ def test_parallel_prediction_of_kriging_equals_serial(flat: Path, two: Scheduler
         heading = np.linspace(-3, 3, len(places)) if name == "strengths" else None
         serial, parallel = both(run, places, two, folder, heading)
         assert_close(serial, parallel, "prediction", "std")
+        if name == "strengths":
+            alone, spread = (radio_map(run, step_m=2.0, scheduler=scheduler) for scheduler in (None, two))
+            xarray.testing.assert_allclose(alone, spread)
 
 
 def test_errors_of_parts_name_the_row_of_the_whole_input(

@@ -107,6 +107,15 @@ def test_several_receivers_have_a_block_each_and_a_pooled_one(tmp_path: Path):
     assert run.receivers == ("anchor0", "anchor1")
 
 
+def test_scores_have_the_same_keys_for_all_tasks():
+    by_task = {task: scored(task, 2)[1][0][0] for task in ("rssi", "csi")}
+    for task, metrics in by_task.items():
+        for block in (metrics, *metrics["receivers"].values()):
+            rule = {"metric": TASKS[task].block, "higher_is_better": TASKS[task].higher_is_better}
+            assert block["score"] == rule | block[TASKS[task].block]
+    assert by_task["rssi"]["score"].keys() == by_task["csi"]["score"].keys() == {"metric", "higher_is_better"} | FIELDS
+
+
 def test_a_receiver_that_received_no_test_row_has_no_scores():
     truth = record("rssi", 2)
     truth.observation[1, 30:] = np.nan

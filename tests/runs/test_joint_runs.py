@@ -154,7 +154,7 @@ def test_run_that_validated_no_step_opens_with_an_infinite_reach(fit: Fit, tmp_p
 
 def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path, command: Command) -> None:
     settings = [part for setting in ("steps=20", *SETTINGS[1:]) for part in ("--set", setting)]
-    receiver = ["--receiver", "array", "--out", tmp_path / "run"]
+    receiver = ["--receiver-model", "array", "--out", tmp_path / "run"]
     command.done(["train", data, "--model", "wrf-gs+", *receiver, *settings])
     prediction = stored(tmp_path / "run")["prediction"]
     # The instrument's scale is part of this receiver.
@@ -167,7 +167,7 @@ def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path,
     [
         ("--rx-polarization H", "--material and antenna options belong to a scene"),
         ("--scene nowhere", "nowhere: no such scene"),
-        ("--model kriging --receiver array", "--receiver belongs to fields of spectra"),
+        ("--model kriging --receiver-model array", "--receiver-model belongs to fields of spectra"),
         ("--set receiver=horn", "receiver model 'horn': unknown; choose from pixel, array"),
         ("--set traced.pattern_degree=9", "setting traced.pattern_degree: 9"),
     ],

@@ -134,7 +134,6 @@ def test_comparison_shows_kriging_and_reference(run: Path, tmp_path: Path) -> No
 def test_bad_calls_are_refused(waves: Path, run: Path, tmp_path: Path, command: Command) -> None:
     out = ["--out", tmp_path / "out"]
     train = ["train", waves, *out, "--model", "kriging"]
-    tracing = "--paths, --depth, --reflections, --rays, --phase-error and --calibrate belong to --model ray-tracing"
     for words, message in (
         ([*train, "--seed", -1], "seed -1"),
         ([*train, "--set", "lengths=0"], "setting lengths: 0 is out of range, choose 1 or more"),
@@ -142,7 +141,7 @@ def test_bad_calls_are_refused(waves: Path, run: Path, tmp_path: Path, command: 
         ([*train, "--material", "x"], "--material and antenna options belong to a scene that is traced; give --scene"),
         ([*train, "--scene", tmp_path / "none.xml"], "takes no scene; omit --scene"),
         ([*train[:-1], "ray-tracing"], "needs a scene; give --scene SCENE, or choose kriging"),
-        ([*train, "--depth", 2], tracing),
+        ([*train, "--depth", 2], "--depth belongs to --model ray-tracing, not to kriging; omit it"),
         (["train", waves, "--scene", "x", *out], "x: no such scene file"),
     ):
         command.refused(words, message)

@@ -18,7 +18,13 @@ def test_a_run_without_a_folder_lives_as_long_as_its_object(flat_folder):
     assert run.score()["n_test"] == run.metrics["n_test"]
     assert run.stages == []
     assert set(run.map(step_m=1.0).sizes) == {"receiver", "y", "x"}
-    assert len(run.locate(truth[:, :2]).tx_pos_m) == 2
+    named = every.to_xarray()
+    assert named["prediction"].dims == ("row", "receiver")
+    np.testing.assert_array_equal(named["prediction"].sel(receiver=run.receivers[1].name), every.mean[1])
+    np.testing.assert_array_equal(run.predict(named["tx_pos_m"].T).mean, every.mean)
+    located = run.locate(truth[:, :2])
+    observed = run.problem.record.to_xarray()["observation"][:2, ::-1]  # receivers in another order, by their names
+    np.testing.assert_array_equal(run.locate(observed).tx_pos_m, located.tx_pos_m)
     assert run.plan(2).tx_pos_m.shape == (2, 3)
     assert len(run.plot().axes) >= truth.shape[0]
     assert run.view().counts["transmitters"] > 0

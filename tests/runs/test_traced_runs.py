@@ -222,7 +222,7 @@ def test_refused_trace_writes_nothing(
     for words, message in (
         ([*train, *out], "ray-tracing needs a scene; give --scene SCENE"),
         ([*train, "--scene", room, "--set", "beta=1", *out], "unknown setting beta"),
-        (["train", flat_folder, "--depth", "1", *out], "belong to --model ray-tracing"),
+        (["train", flat_folder, "--depth", "1", *out], "--depth belongs to --model ray-tracing"),
         (
             ["trace", folder, "--scene", "laboratory", *out],
             "carrier frequency unknown; state frequency_hz in its gateway_info",

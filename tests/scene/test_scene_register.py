@@ -61,7 +61,7 @@ def test_a_map_with_the_wrong_row_0_is_refused(moved, tmp_path, capsys):
     """Another building than the flat, wherever its origin is; the true map passes."""
     walls = np.concatenate([np.stack([OFFICE_M[:-1], OFFICE_M[1:]], axis=1), PARTITIONS_M]) + moved
     places = walk(ROUTE_M) + moved
-    options = ["--height", "2.5", "--positions", write_positions(tmp_path / "places.csv", places)]
+    options = ["--wall-height", "2.5", "--positions", write_positions(tmp_path / "places.csv", places)]
     true, wrong = (write_grid(tmp_path / f"{row_0}.npz", row_0, walls, places[::8]) for row_0 in ("top", "bottom"))
     status, _, err = call(["mesh", true, *options, "--out", tmp_path / "true"], capsys)
     assert status == 0, err

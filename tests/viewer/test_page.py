@@ -142,7 +142,7 @@ def test_views_display_themselves_in_notebooks(text):
 
 def test_pages_have_a_largest_size(monkeypatch):
     monkeypatch.setattr(view_module, "LARGEST_BYTES", 1_000_000)
-    with pytest.raises(InputError, match=r"view: \d\.\d MB, the limit is 1 MB; lower --transmitters"):
+    with pytest.raises(InputError, match=r"view: \d\.\d MB, the limit is 1 MB; lower --max-transmitters"):
         _ = View(made_view()).html
 
 

@@ -226,7 +226,7 @@ def test_a_chunk_that_ends_its_decompressor_is_refused_in_one_line(tmp_path):
 
 def test_command_writes_one_file(traced, room, tmp_path, capsys):
     out = tmp_path / "new" / "view.html"
-    status, printed, err = call(["view", traced, "--out", out, "--transmitters", 2, "--paths", 1], capsys)
+    status, printed, err = call(["view", traced, "--out", out, "--max-transmitters", 2, "--max-paths", 1], capsys)
     assert status == 0
     assert printed.splitlines()[-1] == f"view: {out} ({out.stat().st_size / 1e6:.1f} MB)"
     assert err.startswith("opening the scene\n")
@@ -248,7 +248,7 @@ def test_command_refuses_in_one_line(traced, tmp_path, capsys, monkeypatch):
     ):
         refused(["view", tmp_path / source, "--out", out], message, capsys)
     refused(["view", traced, "--out", tmp_path], "a folder; give the name of a file", capsys)
-    refused(["view", traced, "--out", out, "--gaussians", 0], "setting gaussians: 0 is out of range", capsys)
+    refused(["view", traced, "--out", out, "--max-gaussians", 0], "setting gaussians: 0 is out of range", capsys)
     assert not out.exists()
     with pytest.raises(InputError, match="nothing to show"):
         view()

@@ -142,7 +142,7 @@ class DataReport:
                 yield f"fault: {relative(Path(file))}: {len(faults) - most} more of this kind{where}; {remedy}"
 
 
-def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progress: bool = False) -> DataReport:
+def check_data(data: str | Path | Record, ignore: Collection[str] = (), progress: bool = False) -> DataReport:
     """Find every fault of a data set, and data that read well but are likely wrong (``docs/data.md``, "Checks").
 
     >>> report = check_data("laboratory")
@@ -150,7 +150,7 @@ def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progr
     (True, ())
 
     Args:
-        dataset: a folder, a file, or the name of a known data set, as of `wrf_mi.load`; or a record.
+        data: a folder, a file, or the name of a known data set, as of `wrf_mi.load`; or a record.
         ignore: names of suspicions that are not reported, keys of `SUSPICIONS`.
         progress: show a progress bar on standard error where the data set is made on this machine first.
 
@@ -162,13 +162,13 @@ def check_data(dataset: str | Path | Record, ignore: Collection[str] = (), progr
     """
     if unknown := sorted(set(ignore) - set(SUSPICIONS)):
         raise InputError(f"suspicion {unknown[0]!r}: unknown; known are {', '.join(SUSPICIONS)}")
-    if isinstance(dataset, Record):
-        name, source = dataset.name, dataset.source
+    if isinstance(data, Record):
+        name, source = data.name, data.source
     else:
-        name, source = str(dataset), str(_path(dataset) or "")
+        name, source = str(data), str(_path(data) or "")
 
     def read() -> Record:
-        record = dataset if isinstance(dataset, Record) else load_record(dataset, progress)
+        record = data if isinstance(data, Record) else load_record(data, progress)
         check_parts(record)
         return record
 

@@ -145,6 +145,9 @@ def checked(
     if where.path.suffix.lower() == ".xml":
         return _check_xml(where, str(source), frame, record, carriers_hz)
     if not has_faces(where.path):
+        if record is not None or frequency_hz is not None:
+            text = "a scan; devices and carriers are checked in the scene that wrf-mi mesh makes of it"
+            raise InputError(f"{source}: {text}; omit data set and frequency")
         return Checked(where, _check_scan(where.path, str(source), frame), None, ())
     findings, parts = _placed(mesh_file_parts(where.path), where.path, frame)
     findings += _of_triangles(parts, where.path, frame, record, carriers_hz)

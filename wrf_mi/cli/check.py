@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from .options import Arguments, add_command
+from .options import Arguments, add_command, refuse
 from .output import exit_status, show
 
 
@@ -21,7 +21,8 @@ def add_parser(commands: Any) -> None:
     parser.epilog = "\n".join(["kinds of findings:", *lines])
     add = parser.add_argument
     add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, mesh or scan")
-    add("--data", metavar="DATASET", help="data set whose devices must not be inside solids, and whose carrier counts")
+    text = "data set whose devices must not be inside solids, and whose carrier counts"
+    add("--dataset", metavar="DATASET", help=text)
     add("--frequency", type=float, metavar="HZ", help="carrier at which materials and phases are checked")
     add("--units", default="m", help="unit of the coordinates: m (default), cm, mm or ft")
     add("--up", choices=("y", "z"), help="axis that is up (default: y in GLB, else z)")
@@ -37,19 +38,15 @@ def add_parser(commands: Any) -> None:
 def check_command(a: Arguments) -> int:
     """Report faults (exit status 2), warnings (0, or 1 if asked) and notes of a scene, or repair it."""
     from ..checking import check_scene, repair_scene
-    from ..core import InputError
 
     form = {"units": a.units, "up": a.up, "frequency_hz": a.frequency}
     if a.repair is not None:
-        if a.data or a.strict:
-            text = "--data and --strict belong to a check; omit them, then check the new folder"
-            raise InputError(f"check --repair: {text}")
+        refuse(a, ("dataset", "strict"), "has no effect beside --repair: check the new folder")
         repair = repair_scene(a.scene, a.repair, **_materials(a.material), overwrite=a.replace, **form)
         show(a.json, repair.as_dict(), "\n".join(repair.lines()))
         return 2 if repair.unrepaired else 0
-    if a.material or a.replace:
-        raise InputError("check: --material and --replace belong to --repair OUT; give a folder, or omit them")
-    report = check_scene(a.scene, data=a.data, **form)
+    refuse(a, ("material", "replace"), "belongs to --repair OUT")
+    report = check_scene(a.scene, data=a.dataset, **form)
     show(a.json, report.as_dict(), "\n".join(report.lines()))
     return exit_status(report.ok, a.strict and report.of_level("warning"))
 

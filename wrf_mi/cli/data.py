@@ -44,7 +44,7 @@ def add_parser(commands: Any) -> None:
 def _add_import(data: Any) -> None:
     text = "make a data set from tables of signal strengths: CSV, Parquet, Excel (docs/howto/own-data.md)"
     parser = add_command(data, "import", import_command, text)
-    add = parser.add_argument
+    add, metres = parser.add_argument, dict[str, Any](type=float, metavar="M")
     add("files", nargs="+", metavar="FILE", help="tables with a column per receiver, or a row per reading")
     add("--out", required=True, metavar="FOLDER", help="data set to write")
     add("--replace", action="store_true", help="replace the folder if it exists")
@@ -61,18 +61,20 @@ def _add_import(data: Any) -> None:
     text = "number for what was not heard, repeatable, or none (default: found and named)"
     add("--not-heard", action="append", metavar="DBM", help=text)
     add("--average", choices=AVERAGES, help="mean of the readings of a place (default: db)")
-    add("--place-m", type=float, metavar="M", help="average in squares of this side (default: at equal positions)")
+    add("--place", dest="place_m", **metres, help="average in squares of this side (default: at equal positions)")
     add("--units", metavar="UNIT", help="unit of positions: m, mm, cm, km, ft, deg (default: by names, or m)")
-    add("--pitch-m", type=float, metavar="M", help="positions are indices of a grid of this pitch")
+    add("--pitch", dest="pitch_m", **metres, help="positions are indices of a grid of this pitch")
     add("--crs", metavar="CRS", help="coordinate reference system of positions, such as EPSG:3857")
     text = "unit of headings: rad, deg (from x towards y) or compass (degrees from north, clockwise)"
-    add("--heading", metavar="UNIT", help=text)
-    add("--height-m", type=float, metavar="M", help="height of the moving end without z (default: 1.3)")
-    add("--storey-m", type=float, metavar="M", help="height of a storey, for a column floor without z (default: 3)")
-    add("--anchor-height-m", type=float, metavar="M", help="height of receivers without z (default: 2.5)")
-    add("--frequency-hz", type=float, metavar="HZ", help="carrier of all rows (default: of the table, or 2.44e9)")
+    add("--heading-unit", metavar="UNIT", dest="heading", help=text)
+    add("--height", dest="height_m", **metres, help="height of the moving end without z (default: 1.3)")
+    add("--storey", dest="storey_m", **metres, help="height of a storey, for a column floor without z (default: 3)")
+    add("--anchor-height", dest="anchor_height_m", **metres, help="height of receivers without z (default: 2.5)")
+    text = "carrier of all rows (default: of the table, or 2.44e9)"
+    add("--frequency", type=float, dest="frequency_hz", metavar="HZ", help=text)
     add("--merge-radios", action="store_true", default=None, help="make networks of one radio (BSSIDs) one receiver")
-    add("--min-heard", type=int, metavar="N", help="leave out receivers heard in fewer training rows (default: 1)")
+    text = "leave out receivers with fewer training rows (default: 1)"
+    add("--min-rows", type=int, dest="min_heard", metavar="N", help=text)
 
 
 def list_command(a: Arguments) -> int:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core import InputError
-from .options import Arguments, add_command
+from .options import Arguments, add_command, add_scheduler, refuse
 from .output import Watch, show, summary_table
 
 
@@ -38,6 +38,7 @@ def _add_map(commands: Any) -> None:
     text = "yaw of the transmitter, degrees, for models that know it (default: mean over 8 headings)"
     add("--heading", type=float, metavar="DEG", help=text)
     add("--frequency", type=float, metavar="HZ", help="carrier, where the data have several")
+    add_scheduler(parser)
 
 
 def map_command(a: Arguments) -> int:
@@ -46,6 +47,7 @@ def map_command(a: Arguments) -> int:
     from ..maps.api import radio_map
     from ..maps.dataset import check_map_file, write_map
     from ..maps.picture import map_figure
+    from ..parallel import open_scheduler
     from ..runs.run import open_run
 
     out = Path(a.out)
@@ -54,8 +56,9 @@ def map_command(a: Arguments) -> int:
     options = {"height_m": a.height, "step_m": a.step, "surface": a.surface, "receivers": a.receiver}
     options |= {"threshold_dbm": a.threshold, "transmit_dbm": a.transmit_power}
     options |= {"heading_deg": a.heading, "frequency_hz": a.frequency}
-    with Watch() as watch:
-        dataset = radio_map(run, **options, on_progress=watch.on_progress)
+    with Watch() as watch, open_scheduler(a.scheduler) as scheduler:
+        workers = scheduler if a.scheduler else None
+        dataset = radio_map(run, **options, on_progress=watch.on_progress, scheduler=workers)
     write_map(dataset, out)
     picture = write_figure(out.with_suffix(".png"), map_figure(dataset, run))
     if "power_std_db" not in dataset:
@@ -123,7 +126,7 @@ def _add_locate(commands: Any) -> None:
     add("run", metavar="RUN", help="run folder of a model of signal strengths that states standard deviations")
     text = "signal strengths: a column RECEIVER_dbm or rssi_RECEIVER for each receiver, empty where nothing was "
     text += "received, and true positions x, y in metres if known (default: the test rows of the run)"
-    add("--input", metavar="FILE.csv", help=text)
+    add("--observed", metavar="FILE.csv", help=text)
     text = "file to write: estimate x, y, z, radius and area of the region, nearest neighbours; FILE.png beside it"
     add("--out", required=True, metavar="FILE.csv", help=text)
     text = "also write the probability of each position: arrays x_m, y_m, height_m, probability"
@@ -148,8 +151,8 @@ def locate_command(a: Arguments) -> int:
     if a.posterior is not None and Path(a.posterior).suffix.lower() != ".npz":
         raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
     run = located_run(a.run)
-    if a.input is not None:
-        strengths_dbm, true_m = files.read_observations(a.input, run.receivers, run.config.left_out)
+    if a.observed is not None:
+        strengths_dbm, true_m = files.read_observations(a.observed, run.receivers, run.config.left_out)
     else:
         strengths_dbm, true_m = files.test_observations(run)
     options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
@@ -195,11 +198,11 @@ def _add_view(commands: Any) -> None:
     text = "run folder; scene: name, folder, Mitsuba XML or mesh; map: NetCDF file or Zarr folder. Several are combined"
     add("sources", nargs="+", metavar="RUN|SCENE|MAP", help=text)
     add("--out", required=True, metavar="VIEW.html", help="file to write")
-    text = "held-out rows whose observations, Gaussians' signals and paths are stored (default: 40)"
-    add("--transmitters", type=int, metavar="N", help=text)
-    add("--gaussians", type=int, metavar="N", help="Gaussians, the strongest (default: 1000)")
-    text = "paths of each transmitter to each receiver, the strongest (default: 200)"
-    add("--paths", type=int, metavar="N", help=text)
+    text = "largest number of test rows whose observations, Gaussians' signals and paths are stored (default: 40)"
+    add("--max-transmitters", type=int, metavar="N", help=text)
+    add("--max-gaussians", type=int, metavar="N", help="largest number of Gaussians, the strongest (default: 1000)")
+    text = "largest number of paths of each transmitter to each receiver, the strongest (default: 200)"
+    add("--max-paths", type=int, metavar="N", help=text)
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete (default: none)")
 
 
@@ -210,10 +213,12 @@ def view_command(a: Arguments) -> int:
     out = Path(a.out)
     if out.is_dir():
         raise InputError(f"{out}: a folder; give the name of a file, such as {out / 'view.html'}")
-    limits = {name: getattr(a, name) for name in ("transmitters", "gaussians", "paths")}
+    limits = {name: getattr(a, f"max_{name}") for name in ("transmitters", "gaussians", "paths")}
     limits = {name: value for name, value in limits.items() if value is not None}
     with Watch() as watch:
-        page = view(*a.sources, **limits, material=a.material, on_stage=watch.on_progress, progress=sys.stderr.isatty())
+        how: dict[str, Any] = {"on_progress": watch.on_progress, "progress": sys.stderr.isatty()}
+        page = view(*a.sources, **limits, material=a.material, **how)
+    refuse(a, (f"max_{name}" for name in limits if name not in page.counts), "is of a layer that these sources lack")
     size = page.write(out).stat().st_size
     names = {name: name.replace("_", " ").replace("gaussians", "Gaussians") for name in page.counts}
     counted = ", ".join(f"{n} {names[name][: -1 if n == 1 else None]}" for name, n in page.counts.items())

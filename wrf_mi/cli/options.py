@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from typing import Any, NoReturn, get_args
 
@@ -52,24 +52,36 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     text = "scene to trace: for hybrid, beside wrf-gs, wrf-gs+, factorised and r2f2, or alone for ray-tracing"
     add("--scene", metavar="SCENE", help=text)
     text = "receiver of spectra: pixel (magnitude at each direction) or array (element signals; default with a scene)"
-    add("--receiver", metavar="NAME", help=text)
+    add("--receiver-model", metavar="NAME", help=text)
     text = "of Gaussians: splatted (default) or traced by the Mitsuba plugins, through the walls of a scene (slower)"
     add("--evaluation", choices=get_args(EvaluationName), help=f"evaluation {text}")
     add_tracing(parser)
+    add_rows(parser)
+    add_run(parser)
+    text = "settings for less time or a lower error, or the paper's of WRF-GS+ (default: default)"
+    add("--preset", choices=("fast", "default", "best", "paper"), help=text)
+
+
+def add_rows(parser: argparse.ArgumentParser) -> None:
+    """Add options of the rows that are used, and of the fit to them, which all models and ``correct`` take."""
+    add = parser.add_argument
     folded = "blocked, frequency, frequency-known, receiver, other-run"
     text = f"official, random, trajectory, or with folds in turn {folded}; one fold: blocked:K, frequency:K"
     default = "none: folds in space for the scores, then all rows for the model (default: official, or else none)"
     add("--split", help=f"{text}; {default}")
     add_n_train(parser)
-    text = "leave out receivers with fewer training rows (default: 0 of signal strengths, predicted from the others; 2)"
-    add("--min-rows", type=int, metavar="N", help=text)
     add("--seed", type=int, metavar="N", help="seed of split and fit (default: 0)")
     add("--deterministic", action="store_true", help="bit-identical results, on one thread of the CPU")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="setting to change; repeatable")
+
+
+def add_run(parser: argparse.ArgumentParser) -> None:
+    """Add options of every run: the least number of rows, and intervals."""
+    add = parser.add_argument
+    text = "leave out receivers with fewer training rows (default: 0 of signal strengths, predicted from the others; 2)"
+    add("--min-rows", type=int, metavar="N", help=text)
     text = "calibrate predicted standard deviations on training rows held out in space (one more fit)"
     add("--intervals", action="store_true", help=text)
-    text = "settings for less time or a lower error, or the paper's of WRF-GS+ (default: default)"
-    add("--preset", choices=("fast", "default", "best", "paper"), help=text)
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help="setting to change; repeatable")
 
 
 def add_tracing(parser: argparse.ArgumentParser) -> None:
@@ -82,7 +94,7 @@ def add_tracing(parser: argparse.ArgumentParser) -> None:
     add("--reflections", type=int, metavar="N", help="largest number of reflections among these (default: all)")
     text = "standard deviation of the phase of each reflection: spectra are expected ones (docs/scenes.md; default: 0)"
     add("--phase-error", type=float, metavar="RAD", help=text)
-    fit = "what to train on the training rows, separated by commas: gain, materials, planes, patterns, pose, surface"
+    fit = "what to fit to training rows, separated by commas: gain, materials, planes, patterns, pose, surface"
     add("--calibrate", metavar="LIST", help=fit)
     add("--rays", metavar="N", help="number of rays from each source, or auto: until no more paths are found")
     add_antennas(parser)
@@ -139,6 +151,19 @@ def check_operator(a: Arguments) -> None:
     if config.model not in FIELDS or config.task != "spectrum":
         text = f"--no-operator belongs to learned fields of spectra, not to {config.model} on {config.task}"
         raise InputError(f"{a.run}: {text}; omit it")
+
+
+def stated(a: Arguments, names: Iterable[str]) -> list[str]:
+    """Options, of those names, that the command line states."""
+    values = {name.replace("_", "-"): getattr(a, name.replace("-", "_"), None) for name in names}
+    # 0 is a statement, though it equals False.
+    return [f"--{name}" for name, value in values.items() if not (value is None or value is False or value == [])]
+
+
+def refuse(a: Arguments, names: Iterable[str], reason: str) -> None:
+    """Refuse options that would change nothing: `InputError` with the reason, naming the first that is stated."""
+    if idle := stated(a, names):
+        raise InputError(f"{idle[0]} {reason}; omit it")
 
 
 def _number(text: str) -> int | float:

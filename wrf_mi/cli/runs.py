@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core import InputError
-from .options import Arguments, add_command, add_n_train, add_operator, add_scheduler, check_operator
+from .options import Arguments, add_command, add_n_train, add_operator, add_scheduler, check_operator, refuse, stated
 from .output import Watch, show, show_metrics
 
 
@@ -42,15 +42,13 @@ def evaluate_command(a: Arguments) -> int:
     """Score a run again."""
     if a.predictions is not None:
         return _score_predictions(a)
-    own = ("dataset", "name", "out", "n_train", "seed")
-    if idle := [name for name in own if getattr(a, name) is not None]:
-        raise InputError(f"evaluate: --{idle[0].replace('_', '-')} belongs to --predictions; omit it")
+    refuse(a, ("dataset", "name", "out", "n_train", "seed"), "belongs to --predictions")
     if a.run is None:
         raise InputError("evaluate: nothing to score; give a run folder, or --predictions FILE and --dataset")
     from ..runs.api import evaluate_run
 
-    if a.reliability is not None and a.split is not None:
-        raise InputError("evaluate: --reliability is of the run's own test rows; omit --split")
+    if a.split is not None:
+        refuse(a, ("reliability",), "is of the run's own test rows, not of --split")
     if a.reliability is not None and Path(a.reliability).suffix.lower() != ".png":
         raise InputError(f"{a.reliability}: the picture is written as .png; give such a name")
     check_operator(a)
@@ -74,9 +72,10 @@ def _score_predictions(a: Arguments) -> int:
     """Score predictions of another model."""
     from ..runs.other_models import score_predictions
 
-    if a.run is not None or a.reliability is not None or a.no_operator:
-        raise InputError("evaluate: --predictions makes a run folder; omit RUN, --reliability and --no-operator")
-    if lacking := [name for name in ("dataset", "name", "out") if getattr(a, name) is None]:
+    if a.run is not None:
+        raise InputError("evaluate: --predictions makes a run folder; omit RUN")
+    refuse(a, ("reliability", "no_operator"), "belongs to RUN, not to --predictions")
+    if lacking := [name for name in ("dataset", "name", "out") if not stated(a, (name,))]:
         raise InputError(f"evaluate: --predictions needs --{lacking[0]}")
     options = {"n_train": a.n_train, "seed": a.seed or 0, "split": a.split or "official"}
     run = score_predictions(a.dataset, a.predictions, a.out, a.name, **options)
@@ -87,8 +86,8 @@ def _add_predict(commands: Any) -> None:
     parser = add_command(commands, "predict", predict_command, "predict at new transmitter positions")
     parser.add_argument("run", metavar="RUN", help="run folder")
     source = parser.add_mutually_exclusive_group(required=True)
-    text = "positions x, y, z in metres (and heading_rad, frequency_hz), with a header"
-    source.add_argument("--tx", metavar="FILE.csv", help=text)
+    text = "transmitter: X,Y,Z in metres, or a CSV file with columns x,y,z and perhaps heading_rad and frequency_hz"
+    source.add_argument("--tx", metavar="X,Y,Z|FILE.csv", help=text)
     text = "array tx_pos [m, 3] in metres (and heading_rad [m], frequency_hz [m]), or uplink [m, antennas, subcarriers]"
     source.add_argument("--input", metavar="FILE.npz", help=text)
     text = "file to write: FILE.npz, or FILE.csv (signal strengths; columns x, y, z in metres, NAME_dbm, NAME_std_db, "

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core import InputError
-from .options import DATASET, SCENE, Arguments, add_antennas, add_command, add_n_train, antenna_options
+from .options import DATASET, SCENE, Arguments, add_antennas, add_command, add_rows, antenna_options
 from .output import Watch, show
 
 if TYPE_CHECKING:
-    from ..core import Record
-    from ..correction.options import CorrectionOptions
     from ..scene.edit import Move
 
 
@@ -37,7 +34,7 @@ def _add_mesh(commands: Any) -> None:
     add("--up", choices=("y", "z"), help=text)
     text = "point of the source, metres, z up, that becomes the origin, such as 701300,4485500,0"
     add("--origin", type=_point, metavar="X,Y,Z", help=text)
-    add("--height", type=float, metavar="M", help="height from floor to ceiling; required for a plan")
+    add("--wall-height", type=float, metavar="M", help="height from floor to ceiling; required for a plan")
     add("--floor", type=float, default=0.0, metavar="M", help="z of a plan's floor (default: 0)")
     add("--resolution", type=float, metavar="M", help="side of a plan's cell where the file has none")
     text = "side of the plan at which the first row of an NPZ grid lies, where the file does not state row_0"
@@ -57,7 +54,7 @@ def mesh_command(a: Arguments) -> int:
 
     pairs = None if a.register_pairs is None else register_pairs(*read_pairs(a.register_pairs), name=a.register_pairs)
     source = {"units": a.units, "up": a.up, "origin_m": a.origin, "row_0": a.row_0, "resolution_m": a.resolution}
-    storey = {"height_m": a.height, "floor_m": a.floor, "materials": a.materials}
+    storey = {"height_m": a.wall_height, "floor_m": a.floor, "materials": a.materials}
     frame = {"registration": pairs, "register_walls_of": a.register_walls, "positions": a.positions}
     scene = make_scene(a.points, a.out, **source, **storey, **frame, replace=a.replace)
     kinds = list(scene.materials.surfaces.values())
@@ -87,39 +84,34 @@ def _add_correct(commands: Any) -> None:
     add("dataset", metavar="DATASET", help=DATASET)
     add("--scene", required=True, metavar="SCENE", help=SCENE)
     add("--out", required=True, metavar="SCENE2", help="scene folder to make")
-    parts = "what is changed, from materials,planes,frame,hidden,gain,pose,patterns"
-    add(
-        "--calibrate",
-        metavar="LIST",
-        help=f"{parts} (default: the first four; for signal strengths materials and gain)",
-    )
+    parts = "what to fit to training rows, separated by commas: materials, planes, frame, hidden, gain, pose, patterns"
+    add("--calibrate", metavar="LIST", help=f"{parts} (default: the first four; for signal strengths materials, gain)")
     add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3; strengths: 6)")
     add("--reflections", type=int, metavar="N", help="largest number of reflections (default: 3; strengths: 2)")
-    add("--rays", type=int, metavar="N", help="number of rays from each receiver (default: 65536)")
+    add("--rays", metavar="N", help="number of rays from each receiver (default: 65536), or auto as for train")
     add("--shift-sd", type=float, metavar="M", help="standard deviation of a plane's stated position (default: 0.02 m)")
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
     add_antennas(parser)
-    add("--split", help="as for train; test rows are not used")
-    add_n_train(parser)
-    add("--seed", type=int, default=0, metavar="N", help="seed of split and held-out rows (default: 0)")
+    add_rows(parser)
     add("--replace", action="store_true", help="replace an existing scene folder")
 
 
 def correct_command(a: Arguments) -> int:
     """Correct a scene, and write its page."""
-    from ..checking import warn_of_suspicions
-    from ..correction import correct_scene, write_page
-    from ..datasets.splits import single_split
-    from ..synthetic import load_record
+    from ..runs.scenes import Scene
 
     if Path(a.out).exists() and not a.replace:  # before the work, not after it
         raise InputError(f"{a.out}: exists; remove it, choose another folder, or give --replace")
-    record = load_record(a.dataset, progress=sys.stderr.isatty()).with_antennas(antenna_options(a))
-    options, split = _correction_options(a, record), single_split(record, a.split, a.seed, a.n_train)
-    warn_of_suspicions(record)
+    named = {"depth": a.depth, "reflections": a.reflections, "rays": a.rays, "shift_sd_m": a.shift_sd}
+    settings = [f"{name}={value}" for name, value in named.items() if value is not None]
+    settings += [] if a.calibrate is None else [f"parts=[{a.calibrate}]"]
+    names = ("split", "n_train", "material", "deterministic", "replace")
+    options: dict[str, Any] = {name: getattr(a, name) for name in names} | {"antennas": antenna_options(a)}
+    options |= {"seed": a.seed or 0, "settings": [*settings, *a.set], "progress": sys.stderr.isatty()}
     with Watch() as watch:
-        correction = correct_scene(a.scene, record, split, options, a.material, watch.on_progress)
-        facts = write_page(correction, a.out, a.replace)
+        scene = Scene.open(a.scene).correct(a.dataset, a.out, **options, on_progress=watch.on_progress)
+    facts = scene.correction
+    assert facts is not None
     what = "rows of held-out receivers" if facts["held_out_receivers"] else "held-out rows"
     lines = [f"{facts['score']} of {facts['held_out']} {what}   median    mean"]
     for stage, score in facts["held_out_scores"].items():
@@ -129,23 +121,6 @@ def correct_command(a: Arguments) -> int:
     lines.append(f"scene: {a.out}\npage: {a.out}/correction.md")
     shown = {"scene": a.out, **{key: value for key, value in facts.items() if key != "parameters"}}
     return show(a.json, shown, "\n".join(lines))
-
-
-def _correction_options(a: Arguments, record: Record) -> CorrectionOptions:
-    from ..core.settings import with_settings
-    from ..correction import default_options
-    from ..correction.options import FRAME, PLANES
-
-    options = default_options(record, a.n_train)
-    if a.calibrate is not None:
-        options = replace(options, parts=tuple(a.calibrate.split(",")))
-    names = ("depth", "reflections", "rays")
-    stated = {name: getattr(a, name) for name in names} | {"shift_sd_m": a.shift_sd}
-    options = with_settings(options, [f"{key}={value}" for key, value in stated.items() if value is not None])
-    if a.shift_sd is not None and not {PLANES, FRAME} & set(options.parts):
-        text = f"of {PLANES} and {FRAME}, which --calibrate {','.join(options.parts)} leaves; omit it"
-        raise InputError(f"--shift-sd: {text}")
-    return options
 
 
 def _add_edit(commands: Any) -> None:

@@ -17,11 +17,14 @@ from .options import (
     Arguments,
     Parser,
     add_command,
-    add_n_train,
+    add_rows,
+    add_run,
     add_scheduler,
     add_tracing,
     add_training,
     antenna_options,
+    refuse,
+    stated,
 )
 from .output import Watch, show, show_metrics
 
@@ -32,7 +35,6 @@ HYBRID, RAY_TRACING = "hybrid", "ray-tracing"
 TRACING = ("paths", "depth", "reflections", "rays", "phase_error", "calibrate")
 """Options that become settings of the ray tracer."""
 BESIDE_RESUME = ("resume", "json", "help_settings", "call")  # arguments that ``--resume`` does not refuse
-UNSTATED = ("None", "False", "[]")  # arguments that the command line does not state, in Python's notation
 
 
 def add_parser(commands: Any) -> None:
@@ -54,7 +56,7 @@ def train_command(a: Arguments) -> int:
     if a.help_settings:
         return _show_settings()
     if a.resume:
-        if any(repr(value) not in UNSTATED for name, value in vars(a).items() if name not in BESIDE_RESUME):
+        if stated(a, (name for name in vars(a) if name not in BESIDE_RESUME)):
             raise InputError("--resume RUN goes on with the settings of RUN: omit data set and settings")
         return _resume(a)
     if not a.dataset or not a.out:
@@ -92,48 +94,33 @@ def training_request(a: Arguments) -> RunRequest:
 
     model = a.model or HYBRID
     settings = [*_tracing_settings(a, model), *_stages(a, model), *a.set]
-    names = (
-        "scene",
-        "material",
-        "receiver",
-        "evaluation",
-        "n_train",
-        "min_rows",
-        "deterministic",
-        "intervals",
-        "preset",
-    )
-    stated = {name: getattr(a, name) for name in names} | {"split": a.split, "seed": a.seed or 0}
-    return RunRequest(model, settings=settings, antennas=antenna_options(a), **stated)
+    names = ("scene", "material", "evaluation", "n_train", "min_rows", "deterministic", "intervals", "preset", "split")
+    request = {name: getattr(a, name) for name in names} | {"receiver": a.receiver_model, "seed": a.seed or 0}
+    return RunRequest(model, settings=settings, antennas=antenna_options(a), **request)
 
 
 def _stages(a: Arguments, model: str) -> list[str]:
     """Setting of ``--stages``, which trace does not have."""
-    stages = getattr(a, "stages", None)
-    if stages is None:
-        return []
     if model != HYBRID:
-        raise InputError(f"--stages belongs to --model {HYBRID}, not to {model}")
-    return [f"stages={stages}"]
+        refuse(a, ("stages",), f"belongs to --model {HYBRID}, not to {model}")
+    return [f"stages={a.stages}"] if stated(a, ("stages",)) else []
 
 
 def _tracing_settings(a: Arguments, model: str) -> list[str]:
     from ..tracing.options import stated_kinds
 
     if model != RAY_TRACING:
-        if any(getattr(a, name) is not None for name in TRACING):
-            listed = "--paths, --depth, --reflections, --rays, --phase-error and --calibrate"
-            raise InputError(f"{listed} belong to --model {RAY_TRACING}")
+        refuse(a, TRACING, f"belongs to --model {RAY_TRACING}, not to {model}")
         return []
     # Trained paths are searched with the default seed; --seed is that of training and split.
     seed = None if a.calibrate is not None else a.seed
     kinds = {} if a.paths is None else stated_kinds(a.paths)
-    stated = {"depth": a.depth, "reflections": a.reflections, "rays": _rays(a.rays), "seed": seed}
-    stated |= {"phase_error": a.phase_error, **kinds}
+    traced = {"depth": a.depth, "reflections": a.reflections, "rays": _rays(a.rays), "seed": seed}
+    traced |= {"phase_error": a.phase_error, **kinds}
     if (target := getattr(a, "target_error", None)) is not None:  # an option of trace
-        stated |= _target_settings(a, target, kinds)
-    stated["calibration"] = a.calibrate
-    return [f"{key}={json.dumps(value)}" for key, value in stated.items() if value is not None]
+        traced |= _target_settings(a, target, kinds)
+    traced["calibration"] = a.calibrate
+    return [f"{key}={json.dumps(value)}" for key, value in traced.items() if value is not None]
 
 
 def _rays(text: str | None) -> int | str | None:
@@ -148,9 +135,7 @@ def _target_settings(a: Arguments, target_db: float, kinds: dict[str, bool]) -> 
     """Settings of ``--target-error``: a kind in ``--paths`` is permitted, and switched on where it contributes."""
     from ..tracing.convergence import CHOSEN_KINDS
 
-    for name in ("depth", "rays"):
-        if getattr(a, name) is not None:
-            raise InputError(f"trace: --target-error chooses what --{name} states; give one of them")
+    refuse(a, ("depth", "rays"), "is chosen by --target-error")
     permitted = ",".join(kind for kind in CHOSEN_KINDS if kinds.get(kind, not kinds))
     return {**dict.fromkeys(CHOSEN_KINDS, False), "target_error_db": target_db, "target_kinds": permitted}
 
@@ -170,8 +155,7 @@ def _show_settings() -> int:
 def _add_trace(commands: Any) -> None:
     text = "predict by ray tracing and score it like a learned field"
     parser = add_command(commands, "trace", trace_command, text)
-    parser.set_defaults(model=RAY_TRACING, receiver=None, evaluation=None, preset=None, set=[])
-    parser.set_defaults(deterministic=False, intervals=False, min_rows=None)
+    parser.set_defaults(model=RAY_TRACING, receiver_model=None, evaluation=None, preset=None)
     add = parser.add_argument
     add("dataset", metavar="DATASET", help=DATASET)
     add("--scene", required=True, metavar="SCENE", help=SCENE)
@@ -181,9 +165,8 @@ def _add_trace(commands: Any) -> None:
     add("--target-error", type=float, metavar="DB", help=target)
     text = "write the traced paths as a scenario of DeepMIMO, which deepmimo.load opens (docs/data.md)"
     add("--deepmimo", metavar="FOLDER", help=text)
-    add("--split", help="as for train")
-    add_n_train(parser)
-    add("--seed", type=int, metavar="N", help="seed of split and rays (default: 0)")
+    add_rows(parser)
+    add_run(parser)
     add_scheduler(parser)
 
 
@@ -192,13 +175,14 @@ def trace_command(a: Arguments) -> int:
     from ..parallel import open_scheduler
 
     training_request(a)  # refused before workers start
-    if a.calibrate is not None and a.scheduler is not None:
-        raise InputError("trace: --calibrate trains in one process; omit --scheduler")
+    if a.deterministic:
+        init("llvm", threads=1)
+    if a.calibrate is not None:
+        text = "has no effect beside --calibrate, which trains in one process and stores no paths"
+        refuse(a, ("scheduler", "deepmimo"), text)
     if a.deepmimo is not None:
         from ..tracing.deepmimo import check_deepmimo_folder
 
-        if a.calibrate is not None:
-            raise InputError("trace: --calibrate trains paths and stores none; omit it, or --deepmimo")
         check_deepmimo_folder(a.deepmimo)
     with open_scheduler(a.scheduler) as scheduler:
         status = run_training(a, scheduler=scheduler if a.scheduler else None)
@@ -233,10 +217,10 @@ def sweep_command(a: Arguments) -> int:
     from ..runs.sweep import check_failures, check_run, plan_sweep, run_sweep, sweep_table
 
     # Read off the parser, so that no option of train is left out.
-    stated = {name: getattr(a, name.replace("-", "_")) for name in training_names()}
-    settings = stated.pop("set")
-    options = {name: str(value) for name, value in stated.items() if value is not None and not isinstance(value, bool)}
-    flags = [f"--{name}" for name, value in stated.items() if value is True]
+    common = {name: getattr(a, name.replace("-", "_")) for name in training_names()}
+    settings = common.pop("set")
+    options = {name: str(value) for name, value in common.items() if value is not None and not isinstance(value, bool)}
+    flags = [f"--{name}" for name, value in common.items() if value is True]
     sweep = plan_sweep(a.out, a.vary, options, settings, flags)
     parser = Parser(prog="wrf-mi")
     _add_train(parser.add_subparsers())

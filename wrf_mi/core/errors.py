@@ -9,6 +9,11 @@ class InputError(ValueError):
     """Bad input: one line that names the file, the row and the remedy.
 
     The command prints the line and ends with exit status 2; nothing is half written.
+
+    >>> import wrf_mi
+    >>> wrf_mi.load("nowhere")  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    wrf_mi.core.errors.InputError: data set 'nowhere': neither a folder nor known; ...
     """
 
 
@@ -45,4 +50,11 @@ class DataFault(InputError):
 
 
 class BackendError(RuntimeError):
-    """No usable LLVM or CUDA: one line that names what was found and the remedy."""
+    """No usable LLVM or CUDA: one line that names what was found and the remedy.
+
+    >>> from wrf_mi.backend import init
+    >>> try:
+    ...     backend = init()
+    ... except BackendError as error:
+    ...     print(error)
+    """

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .angles import FloatArray as FloatArray
 from .angles import rotation_matrix
 from .antenna import ANTENNA, Antenna, AntennaOptions
+from .registry import resolve
 
 
 @dataclass(frozen=True)
@@ -267,6 +268,14 @@ class Record:
         known = np.isfinite(std)
         relative = std / (np.median(std[known]) if known.any() else 1.0)
         return np.where(known, relative, 1.0) ** -2
+
+    def to_xarray(self) -> Any:
+        """The record as an `xarray.Dataset` with named dimensions, which `wrf_mi.load` reads.
+
+        ``observation`` has the dimensions ``row``, ``receiver`` and ``elevation`` and ``azimuth``, ``subcarrier``, or
+        ``antenna`` and ``subcarrier``. `InputError`: xarray is not installed.
+        """
+        return resolve("wrf_mi.datasets.labelled:dataset_of")(self)
 
     @property
     def has_positions(self) -> bool:

@@ -69,6 +69,12 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
             raise InputError(f"correct: {unknown[0]!r} is not a part; choose of {', '.join(PARTS)}")
         if HIDDEN in self.parts and MATERIALS not in self.parts:
             raise InputError(f"correct: {HIDDEN} needs {MATERIALS}, by which a face is there or not")
+        needed = {"shift_sd_m": (PLANES, FRAME), "pattern_degree": (PATTERNS,)}
+        for name, parts in needed.items():
+            value = getattr(self, name)
+            if value != getattr(CorrectionOptions, name) and not {*parts} & {*self.parts}:
+                text = f"{name}={value:g}: of {' and '.join(parts)}, which {','.join(self.parts)} leaves"
+                raise InputError(f"correct: {text}; omit it")
         if not self.parts:
             raise InputError(f"correct: nothing to change; choose of {', '.join(PARTS)}")
 

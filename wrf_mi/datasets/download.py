@@ -45,6 +45,10 @@ def fetch(name: str, *, base_url: str | None = None, progress: bool = True) -> P
 
     Raises:
         InputError: unknown name, no network, a file that is not the published one, or a folder that cannot be written.
+
+    >>> fetch("laboratory")  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    wrf_mi.core.errors.InputError: data set laboratory: is not downloaded but ...
     """
     dataset = known(name)
     if dataset.base_url is None:

@@ -51,6 +51,8 @@ class Format:
         """Refuse a name of the file, or options, that do not belong to the format; `InputError`: naming them."""
         if self.suffix and out.suffix.lower() != self.suffix:
             raise InputError(f"{out}: format {self.name} is a file {self.suffix}; give such a name")
+        if self.suffix and options.replace:
+            raise InputError(f"--replace belongs to formats that are folders, not to {self.name}; omit it")
         unset = ExportOptions()
         for field in fields(options):
             foreign = field.name in NAMES and field.name not in self.options

@@ -37,6 +37,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,6 +49,7 @@ from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
 from ..core.receivers import receiver_index
 from ..models import Inputs
+from ..parallel import Scheduler, row_parts
 from ..receivers.spreads import PathStatistics
 from ..runs.results import RECEPTION
 from ..runs.run import Run, open_run
@@ -79,6 +81,7 @@ def radio_map(
     heading_deg: float | None = None,
     frequency_hz: float | None = None,
     on_progress: OnProgress = quiet,
+    scheduler: Scheduler | None = None,
 ) -> xarray.Dataset:
     """What the receivers of a run receive from a transmitter at the positions of a plane or a mesh.
 
@@ -96,6 +99,8 @@ def radio_map(
         heading_deg: yaw of the transmitter; None: models that know it are averaged over 8 headings.
         frequency_hz: carrier, where the data have several.
         on_progress: progress callback: stage and fraction done.
+        scheduler: computes parts of the positions; None: this process. Its workers must see the run folder, data set
+            and scene under the same names.
 
     Returns:
         Dataset as `wrf_mi.maps.dataset.map_dataset` describes it; ``docs/maps.md`` defines the variables.
@@ -113,7 +118,7 @@ def radio_map(
         threshold_dbm = THRESHOLD_DBM
     conditions = Conditions(threshold_dbm, transmit_dbm, _headings(opened, heading_deg), frequency_hz)
     places = _places(opened, height_m, step_m, surface)
-    values = map_values(opened, places.positions_m, numbers, conditions, on_progress)
+    values = map_values(opened, places.positions_m, numbers, conditions, on_progress, scheduler)
     unit = "dB" if task.level_kind == "relative" else "dBm"
     attributes = _attributes(opened, task, conditions, heading_deg) | {"receiver_numbers": list(numbers)}
     return map_dataset(places, [known[number] for number in numbers], values, unit, attributes)
@@ -194,7 +199,12 @@ class Conditions:
 
 
 def map_values(
-    run: Run, positions_m: FloatArray, receivers: Sequence[int], conditions: Conditions, on_progress: OnProgress
+    run: Run,
+    positions_m: FloatArray,
+    receivers: Sequence[int],
+    conditions: Conditions,
+    on_progress: OnProgress,
+    scheduler: Scheduler | None = None,
 ) -> dict[str, NDArray[np.float32]]:
     """Variables [receivers, m] of `wrf_mi.maps.dataset.VARIABLES` that a run's model states at positions [m, 3] in
     metres, computed chunk by chunk; NaN inside solid objects of the scene.
@@ -208,19 +218,34 @@ def map_values(
     variables = dict[str, NDArray[np.float32]]()
     scene = run.problem.opened_scene
     outside = np.ones(len(positions_m), bool) if scene is None else grid.outside_solids(scene, positions_m)
-    with _each_warning_once():
-        for start in range(0, len(positions_m), size):
-            rows = start + np.flatnonzero(outside[start : start + size])
-            if len(rows):
-                for place, receiver in enumerate(receivers):
-                    for name, values in _of_chunk(run, positions_m[rows], receiver, conditions).items():
-                        if name not in variables:
-                            variables[name] = np.full((len(receivers), len(positions_m)), np.nan, np.float32)
-                        variables[name][place, rows] = values
-            on_progress("mapping", min(start + size, len(positions_m)) / len(positions_m))
-    if not variables:
+    every = np.flatnonzero(outside)
+    if not len(every):
         raise InputError(f"{run.folder}: all positions of the map lie in solid objects; give another height")
+    workers, least = (1, size) if scheduler is None else (scheduler.workers, 1)
+    rows = [every[part] for part in row_parts(len(every), workers, least, size)]
+
+    def collect(part: int, mapped: list[dict[str, Any]]) -> None:
+        for place, of_receiver in enumerate(mapped):
+            for name, values in of_receiver.items():
+                if name not in variables:
+                    variables[name] = np.full((len(receivers), len(positions_m)), np.nan, np.float32)
+                variables[name][place, rows[part]] = values
+        mapped.clear()  # the scheduler keeps results to the end
+        if scheduler is None:  # one with workers has a bar of its own
+            on_progress("mapping", (part + 1) / len(rows))
+
+    opener: Any = (lambda: run) if scheduler is None else partial(open_run, run.folder, operator=run.operator)
+    chosen, sizes = [positions_m[part] for part in rows], list(map(len, rows))
+    function = partial(_mapped_part, receivers, conditions)
+    with _each_warning_once():
+        (scheduler or Scheduler()).map(function, chosen, opener, what="mapping", sizes=sizes, each=collect, lines=True)
     return variables
+
+
+def _mapped_part(
+    receivers: Sequence[int], conditions: Conditions, run: Run, positions_m: FloatArray
+) -> list[dict[str, Any]]:
+    return [_of_chunk(run, positions_m, receiver, conditions) for receiver in receivers]
 
 
 def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Conditions) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from scipy.special import softmax
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..datasets.labelled import of_receivers
 from ..models import Session
 from ..runs.folder import load_rows
 from ..runs.run import Run, open_run
@@ -110,7 +111,7 @@ def locate(
     Args:
         run: folder of a finished run on signal strengths, or the run; its model states standard deviations.
         observed_dbm: signal strengths [n_rx, m] in dBm, receivers in the order of ``run.receivers``; NaN where nothing
-            was received.
+            was received; or an `xarray.DataArray` (row, receiver) with the names of receivers.
         step_m: distance between candidate positions, metres; None: 0.25 m, more for large areas.
         height_m: height of the transmitters; None: the median of the training rows.
         level: probability that regions hold.
@@ -146,7 +147,7 @@ def locate(
     >>> shutil.rmtree(folder)
     """
     run = located_run(run)
-    record, observed = run.problem.record, np.asarray(observed_dbm, float)
+    record, observed = run.problem.record, np.asarray(of_receivers(observed_dbm, run.receivers), float)
     _check(run, observed, level, offset_db)
     candidates = candidates_of(run, step_m, height_m)
     session = Session(run.folder, run.folder, on_progress, stop)

@@ -1,38 +1,4 @@
-"""Runs of any model, from a data set to scores in a run folder: the functions behind the command and the Python API.
-
-Signal strengths of a made-up receiver, in the layout of flat-ble:
-
-    >>> import shutil, tempfile
-    >>> from pathlib import Path
-    >>> import numpy as np
-    >>> import wrf_mi
-    >>> from wrf_mi.datasets import write_ble_folder
-    >>> positions_m = np.random.default_rng(0).uniform(1, 5, (40, 3))
-    >>> rssi_dbm = -40 - 20 * np.log10(np.linalg.norm(positions_m, axis=1))[None]
-    >>> receiver = wrf_mi.Receiver("anchor1", np.zeros(3), np.array([0.0, 0, 0, 1]))
-    >>> known = {"frequencies_hz": np.array([2.44e9]), "official": (np.arange(30), np.arange(30, 40))}
-    >>> record = wrf_mi.Record("made-up", "rssi", positions_m, (receiver,), rssi_dbm, **known)
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> data = write_ble_folder(folder / "data", record)
-    >>> [len(split.test) for split in wrf_mi.make_splits(wrf_mi.load(data), "official")]
-    [10]
-    >>> run = wrf_mi.train(data, "kriging", out=folder / "run")
-    >>> bool(run.metrics["abs_error_db"]["median"] < 1)
-    True
-    >>> wrf_mi.open_run(run.folder).predict([[2, 3, 4]]).mean.shape
-    (1,)
-    >>> run.score()["n_test"]
-    10
-    >>> (run.folder / "model.npz").unlink()  # as if stopped
-    >>> _ = wrf_mi.resume(run.folder)
-    >>> np.savez(other := folder / "other.npz", prediction=rssi_dbm + 1, row=np.arange(40))
-    >>> scored = wrf_mi.score_predictions(data, other, folder / "other", "one decibel off")
-    >>> round(scored.metrics["abs_error_db"]["median"], 3)
-    1.0
-    >>> wrf_mi.compare([run.folder, scored.folder], folder / "compare").name
-    'index.html'
-    >>> shutil.rmtree(folder)
-"""
+"""Runs of any model, from a data set to scores in a run folder: the functions behind the command and the Python API."""
 
 from __future__ import annotations
 
@@ -44,7 +10,7 @@ import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -87,6 +53,9 @@ from .folder import (
 from .run import Run, load_fitted, open_run, predict_to_file
 from .scenes import Scene
 
+if TYPE_CHECKING:
+    import xarray
+
 logger = logging.getLogger(__name__)
 
 
@@ -122,10 +91,10 @@ def _serving_model(record: Record, request: RunRequest) -> Model:
     entry = known_model(request.model)
     check_record(entry, record, (other for other in MODELS.values() if other.scene != "required"))
     model = entry.serving(record.task, request.scene is not None)
-    for option, data in (("evaluation", "Gaussians"), ("receiver", "fields of spectra")):
-        if getattr(request, option) is not None and option not in model.train_arguments:
-            able = ", ".join(other.name for other in MODELS.values() if option in other.train_arguments)
-            raise InputError(f"--{option} belongs to {data} ({able}), not to {request.model}")
+    for name, option, data in (("evaluation", "", "Gaussians"), ("receiver", "-model", "fields of spectra")):
+        if getattr(request, name) is not None and name not in model.train_arguments:
+            able = ", ".join(other.name for other in MODELS.values() if name in other.train_arguments)
+            raise InputError(f"--{name}{option} belongs to {data} ({able}), not to {request.model}")
     return model
 
 
@@ -151,10 +120,11 @@ def _settings_of(model: Model, request: RunRequest) -> Any:
         settings: Any = kind(**{field.name: getattr(stated, field.name) for field in fields(stated)})
     else:
         assert isinstance(stated, Iterable)
-        texts = setting_texts(stated) if isinstance(stated, Mapping) else stated
-        settings = default_settings(
-            model, [*_preset(model, request.preset), *texts], {name: getattr(request, name) for name in GIVEN}
-        )
+        texts = [*(setting_texts(stated) if isinstance(stated, Mapping) else stated)]
+        preset, named = _preset(model, request.preset), {text.partition("=")[0].strip() for text in texts}
+        if preset and {text.partition("=")[0] for text in preset} <= named:
+            raise InputError(f"preset {request.preset}: the settings state all that it does; omit one of them")
+        settings = default_settings(model, [*preset, *texts], {name: getattr(request, name) for name in GIVEN})
     if "model" in model.train_arguments and settings.model != model.name:
         raise InputError(f"setting model: {settings.model}, where the model is {model.name}; choose it with --model")
     return settings
@@ -213,7 +183,7 @@ def _check_scene(model: Model, record: Record, scene: str | None, request: RunRe
 
 @alone_in_process()
 def train(
-    dataset: str | Path | Record,
+    data: str | Path | Record | xarray.Dataset,
     model: str = "hybrid",
     scene: str | Path | Scene | None = None,
     *,
@@ -238,7 +208,7 @@ def train(
     """Fit a model to a data set and score it.
 
     Args:
-        dataset: name or folder of a data set, or a loaded record.
+        data: name or folder of a data set, a loaded record, or an `xarray.Dataset` (`wrf_mi.core.Record.to_xarray`).
         model: name of the model, a key of `wrf_mi.models.MODELS`.
         scene: scene, or name, scene folder, Mitsuba XML or mesh to trace, for models that take one.
         out: run folder to make; must not exist or be empty. None: a temporary one, removed with the run.
@@ -271,6 +241,10 @@ def train(
         InputError: data, scene, settings or folder that cannot be used; nothing is left on the disk.
         Interrupted: ``stop`` ended the run; continue with `resume`.
         BackendError: a deterministic fit in a process that computes on a GPU already.
+
+    >>> run = train("laboratory", "idw", n_train=20)
+    >>> run.metrics["n_train"]
+    20
     """
     if out is not None:
         check_new(Path(out))
@@ -279,7 +253,8 @@ def train(
     place = scene.folder if isinstance(scene, Scene) else scene
     what = RunRequest(model, place, material, antennas, receiver, evaluation, split, n_train, seed, settings)
     request = replace(what, deterministic=deterministic, intervals=intervals, min_rows=min_rows, preset=preset)
-    problem, config, splits = plan_run(dataset, request, progress)
+    data = data if isinstance(data, str | Path | Record) else load_record(data)
+    problem, config, splits = plan_run(data, request, progress)
     warn_of_suspicions(problem.record)
     warn_of_left_out(problem.record, config.left_out, _least_rows(problem.record, request))
     _warn_of_known_rows(problem, splits)
@@ -329,6 +304,11 @@ def resume(
         InputError: not a run folder, or one that another process writes into.
         Interrupted: ``stop`` ended the run once more.
         BackendError: as `train`.
+
+    >>> run = train("laboratory", "idw", n_train=20)
+    >>> (run.folder / "model.npz").unlink()  # as if stopped
+    >>> resume(run.folder).metrics["n_train"]
+    20
     """
     run = open_run(folder, record)
     if run.config.deterministic:

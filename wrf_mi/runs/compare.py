@@ -51,6 +51,11 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
 
     Raises:
         InputError: no run, a folder that is not a run, or ``out`` that holds something else than a comparison.
+
+    >>> import tempfile, wrf_mi
+    >>> runs = [wrf_mi.train("laboratory", model, n_train=20) for model in ("idw", "kriging")]
+    >>> compare([run.folder for run in runs], f"{tempfile.mkdtemp()}/page").name
+    'index.html'
     """
     groups = _groups(read_runs(run_dirs))
     out = Path(out)

@@ -216,9 +216,9 @@ def _options(config: RunConfig) -> dict[str, Any]:
     options = {"n_train": config.n_train, "scene": config.scene, "material": config.material}
     options |= {field.name: getattr(config.antennas, field.name) for field in fields(AntennaOptions)}
     standard = default_settings(config.entry, (), {})
-    for name in ("receiver", "evaluation"):
+    for option, name in {"receiver_model": "receiver", "evaluation": "evaluation"}.items():
         if name in config.entry.train_arguments and getattr(config.settings, name) != getattr(standard, name):
-            options[name] = getattr(config.settings, name)
+            options[option] = getattr(config.settings, name)
     return options | {"seed": config.seed or None}
 
 

@@ -81,11 +81,11 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     timed at one row; None: ``predict``.
 
     Returns:
-        The blocks of ``metrics.json`` that scoring gives (``task``, the task's metric, ``reference``, ``constant``
-        (`wrf_mi.runs.results.against_constant`), for several receivers ``receivers``, with standard deviations
-        ``inside_90`` and ``crps``, with probabilities of reception ``reception``, ``n_train``, ``n_test``,
-        ``n_not_scored``, ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is not finite
-        is not scored: its truth is NaN; so are all of the trained receivers in a split that holds out others.
+        The blocks of ``metrics.json`` that scoring gives (``task``, ``score`` and the same by the name of the metric,
+        ``reference``, ``constant`` (`wrf_mi.runs.results.against_constant`), for several receivers ``receivers``, with
+        standard deviations ``inside_90`` and ``crps``, with probabilities of reception ``reception``, ``n_train``,
+        ``n_test``, ``n_not_scored``, ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is
+        not finite is not scored: its truth is NaN; so are those of trained receivers where a split holds out others.
 
     Raises:
         InputError: no test rows or none that is finite, predictions of another shape or not finite, or a receiver that
@@ -156,7 +156,8 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
 
     def blocks(chosen: Any) -> dict[str, Any]:
         reference = {key: summary(values[chosen]) for key, values in references.items()}
-        return {scorer.block: summary(scores[chosen]), "reference": reference}
+        stated, meaning = summary(scores[chosen]), {"metric": scorer.block, "higher_is_better": scorer.higher_is_better}
+        return {"score": meaning | stated, scorer.block: stated, "reference": reference}
 
     metrics: dict[str, Any] = {"task": task, **blocks(slice(None)), "n_test": len(arrays["row"])}
     if len(scores) > 1:

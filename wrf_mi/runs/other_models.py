@@ -32,7 +32,7 @@ SAME_PLACE_M = 1e-3  # distance within which a predicted position is that of a r
 
 
 def score_predictions(
-    dataset: str | Path | Record,
+    data: str | Path | Record,
     predictions: str | Path,
     out: str | Path,
     name: str,
@@ -43,7 +43,7 @@ def score_predictions(
     """Score predictions that another program made, in a run folder that `wrf_mi.compare` takes like its own.
 
     Args:
-        dataset: name or folder of a data set, or a loaded record.
+        data: name or folder of a data set, or a loaded record.
         predictions: an ``.npz`` file with ``prediction`` [n_rx, m, ...], or [m, ...] of one receiver, as
             `wrf_mi.core.Record` has observations, and ``row`` [m], rows of the data set from 0, or ``tx_pos`` [m, 3],
             metres; optionally ``std`` of the same shape, ``receiver_name`` [n_rx], ``train_seconds``,
@@ -62,10 +62,15 @@ def score_predictions(
 
     Raises:
         InputError: a file that cannot be used, a test row without a prediction, or a name that is taken.
+
+    >>> import tempfile, wrf_mi
+    >>> run, folder = wrf_mi.train("laboratory", "idw", n_train=20), tempfile.mkdtemp()
+    >>> score_predictions("laboratory", run.folder / "predictions.npz", folder, "theirs").metrics["model"]
+    'theirs'
     """
     if name in MODELS:
         raise InputError(f"--name {name}: a model of wrf_mi; give the other model another name")
-    record = dataset if isinstance(dataset, Record) else load_record(str(dataset))
+    record = data if isinstance(data, Record) else load_record(str(data))
     splits = make_splits(record, split, seed, n_train)
     path, folder = Path(predictions), Path(out)
     check_new(folder)
@@ -79,7 +84,7 @@ def score_predictions(
     scores: list[Scores] = [evaluate(record, part, predict) for part in splits]
     metrics, scored = scores[0] if len(scores) == 1 else pool(scores)
     costs = {key: float(arrays.get(key, np.nan)) for key in COSTS}
-    source = str(dataset) if not isinstance(dataset, Record) else record.source or record.name
+    source = str(data) if not isinstance(data, Record) else record.source or record.name
     stated: tuple[Any, ...] = (None, None, AntennaOptions(), False, False, {})
     config = RunConfig(name, source, record.task, split, n_train, seed, *stated)
     header = {"model": name, "dataset": source, "split": split, "seed": seed, "predictions": str(path)}

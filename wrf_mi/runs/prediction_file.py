@@ -8,6 +8,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,10 +37,15 @@ SPOOLED_BYTES = 1 << 26  # size from which predictions are collected on the disk
 def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inputs:
     """Read what a model predicts from; positions are NaN where only an uplink is given.
 
-    A CSV file has columns x, y, z in metres and optionally heading_rad and frequency_hz; an ``.npz`` file ``tx_pos``
-    [m, 3] and optionally ``heading_rad`` [m], ``frequency_hz`` [m], or ``uplink`` [m, antennas, subcarriers] and these.
+    A CSV file has columns x, y, z in metres and optionally heading_rad and frequency_hz; in place of its name ``X,Y,Z``
+    is one position. An ``.npz`` file has ``tx_pos`` [m, 3] and optionally ``heading_rad`` [m], ``frequency_hz`` [m], or
+    ``uplink`` [m, antennas, subcarriers] and these.
     `InputError`: the file is missing, or a row is not made of finite numbers.
     """
+    with suppress(ValueError):
+        x, y, z = map(float, str(csv_file).split(","))
+        if np.isfinite([x, y, z]).all():
+            return Inputs(np.array([[x, y, z]]))
     path = Path(csv_file if csv_file is not None else npz_file or "")
     if not path.is_file():
         raise InputError(f"{path}: no such file; give positions x, y, z in metres")

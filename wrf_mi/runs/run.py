@@ -21,6 +21,7 @@ from ..core.memory import require_memory
 from ..core.receivers import receiver_index
 from ..core.registry import resolve
 from ..datasets import load_split
+from ..datasets.labelled import LabelledPrediction, ordered
 from ..models import Fitted, Inputs, Model, Problem
 from ..models.checks import check_inputs
 from ..models.gaussian.model import FittedField
@@ -46,6 +47,11 @@ class Run:
         record: data that the model was fitted to; None: the data set that the folder names.
         operator: learned fields predict by operator where they can.
         kept: what lives as long as the run, such as a scene in a temporary folder.
+
+    >>> import wrf_mi
+    >>> run = wrf_mi.train("laboratory", "idw", n_train=20)
+    >>> run.predict([[2.2, 3.0, 1.7]]).to_xarray()["prediction"].dims
+    ('row', 'receiver', 'elevation', 'azimuth')
     """
 
     folder: Path
@@ -126,11 +132,11 @@ class Run:
         tx_heading_rad: ArrayLike | None = None,
         uplink: ArrayLike | None = None,
         carriers_hz: ArrayLike | None = None,
-    ) -> Prediction:
+    ) -> LabelledPrediction:
         """Predict the observations of a receiver, or of all.
 
         Args:
-            tx_pos_m: transmitter positions [m, 3], metres; None: unknown.
+            tx_pos_m: transmitter positions [m, 3], metres, or an `xarray.DataArray` (row, axis); None: unknown.
             receiver: name, or index from 0; None: all receivers.
             tx_heading_rad: yaw of the transmitter [m], radians; None: unknown.
             uplink: uplink channels [m, antennas, subcarriers]; None: unknown.
@@ -138,19 +144,23 @@ class Run:
 
         Returns:
             Observations [m, ...] as in `wrf_mi.core.Record` and, if the model states them, standard deviations; of
-            several receivers [n_rx, m, ...], as in ``predictions.npz``.
+            several receivers [n_rx, m, ...], as in ``predictions.npz``; `to_xarray` names the dimensions.
 
         Raises:
             InputError: not a finished run with one split, inputs that the model does not predict from, or no such
                 receiver.
         """
-        inputs = _inputs(tx_pos_m, tx_heading_rad, uplink, carriers_hz)
-        if receiver is not None or len(self.receivers) == 1:
-            return self.predict_inputs(inputs, receiver_index(self.receivers, receiver or 0))
-        every = [self.predict_inputs(inputs, index) for index in range(len(self.receivers))]
-        stds = [prediction.std for prediction in every if prediction.std is not None]
-        mean = np.stack([prediction.mean for prediction in every])
-        return Prediction(mean, np.stack(stds) if len(stds) == len(every) else None)
+        inputs, known = _inputs(ordered(tx_pos_m, "row", "axis"), tx_heading_rad, uplink, carriers_hz), self.receivers
+        of_one = receiver is not None or len(known) == 1
+        numbers = [receiver_index(known, receiver or 0)] if of_one else range(len(known))
+        every = [self.predict_inputs(inputs, number) for number in numbers]
+
+        def joined(name: str) -> Any:
+            values = [getattr(prediction, name) for prediction in every]
+            return None if any(value is None for value in values) else values[0] if of_one else np.stack(values)
+
+        how = inputs.tx_pos_m, tuple(known[number].name for number in numbers), self.config.task, of_one
+        return LabelledPrediction(joined("mean"), joined("std"), joined("reception"), *how)
 
     def score(self, split: str | None = None) -> dict[str, Any]:
         """Scores on the test rows, or on those of another split (`wrf_mi.runs.api.evaluate_run`)."""
@@ -335,6 +345,11 @@ def open_run(folder: str | Path, record: Record | None = None, operator: bool = 
     """Open a run: ``open_run(folder).predict(tx_pos_m, receiver)`` predicts what a receiver observes.
 
     Arguments are the attributes of `Run`; `InputError` where the folder is none of a run.
+
+    >>> import wrf_mi
+    >>> run = wrf_mi.train("laboratory", "idw", n_train=20)
+    >>> open_run(run.folder).config.model
+    'idw'
     """
     run = Run(Path(folder), record, operator)
     _ = run.config

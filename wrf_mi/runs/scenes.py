@@ -1,11 +1,4 @@
-"""Scenes as objects: made from scans or plans, corrected by measurements, edited and traced.
-
->>> import wrf_mi
->>> room = wrf_mi.Scene.open("laboratory")
->>> traced = room.trace("laboratory", n_train=20, settings={"depth": 1})
->>> sorted(traced.predict([[2.2, 3.0, 1.7]]).mean.shape)
-[1, 90, 360]
-"""
+"""Scenes as objects: made from scans or plans, corrected by measurements, edited and traced."""
 
 from __future__ import annotations
 
@@ -13,21 +6,25 @@ import json
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core import InputError, Record, Split
+from ..backend import init
+from ..checking import warn_of_suspicions
+from ..core import AntennaOptions, InputError, Record, Split
+from ..core.antenna import AS_STATED
 from ..core.registry import resolve
+from ..core.settings import setting_texts, with_settings
 from ..datasets.splits import single_split
 from ..scene.correction_data import FILE
 from ..synthetic import load_record
+from ..training.session import OnProgress, quiet
 
 # What makes, corrects or edits a scene is imported where it is used: it takes a quarter of the start of a training.
 if TYPE_CHECKING:
     from ..correction import CorrectionOptions
-    from ..correction.options import OnStage
     from ..scene.edit import Move
     from .run import Run
 
@@ -40,6 +37,11 @@ class Scene:
 
     Attributes:
         folder: scene folder, or name, Mitsuba XML or mesh of one that was opened.
+
+    >>> room = Scene.open("laboratory")
+    >>> traced = room.trace("laboratory", n_train=20, settings={"depth": 1})
+    >>> traced.predict([[2.2, 3.0, 1.7]]).mean.shape
+    (1, 90, 360)
     """
 
     folder: Path
@@ -71,9 +73,13 @@ class Scene:
         split: str | Split | None = None,
         n_train: int | float | None = None,
         seed: int = 0,
-        options: CorrectionOptions | None = None,
+        settings: Iterable[str] | Mapping[str, Any] | CorrectionOptions = (),
         material: str | None = None,
-        on_stage: OnStage = lambda what, share: None,
+        antennas: AntennaOptions = AS_STATED,
+        deterministic: bool = False,
+        replace: bool = False,
+        on_progress: OnProgress = quiet,
+        progress: bool = False,
     ) -> Scene:
         """The scene with planes and materials fitted to the training rows of measurements.
 
@@ -83,23 +89,36 @@ class Scene:
             split: name of a split, or its rows; None: the data's own, or else all rows.
             n_train: number or fraction of the training rows to use; None: all.
             seed: seed of split and held-out rows.
-            options: what may change; None: by the kind of measurements.
+            settings: what may change, and how: values by name, ``key=value`` texts, or the options; defaults are by the
+                kind of measurements.
             material: radio material of a bare mesh.
-            on_stage: called as the correction goes on.
+            antennas: patterns and polarisations that override the data set.
+            deterministic: compute on one thread of the CPU, bit-identical from run to run.
+            replace: replace an existing folder.
+            on_progress: progress callback: stage and fraction done.
+            progress: show bars on standard error where data are traced.
 
         Raises:
             InputError: data or a scene that cannot be used, or a folder that exists.
+            BackendError: a deterministic correction in a process that computes on a GPU already.
         """
-        from ..correction import correct_scene, default_options, write_page
-
-        record = data if isinstance(data, Record) else load_record(str(data))
-        rows = split if isinstance(split, Split) else single_split(record, split, seed, n_train)
-        options = options or default_options(record, n_train)
+        if deterministic:  # before anything is read: reading a data set may choose the GPU
+            init("llvm", threads=1)
+        from ..correction import CorrectionOptions, correct_scene, default_options, write_page
 
         def corrected(place: Path) -> None:
-            write_page(correct_scene(self.folder, record, rows, options, material, on_stage), place)
+            record = data if isinstance(data, Record) else load_record(data, progress)
+            record = record.with_antennas(antennas)
+            if isinstance(settings, CorrectionOptions):
+                options = settings
+            else:
+                texts = setting_texts(settings) if isinstance(settings, Mapping) else settings
+                options = with_settings(default_options(record, n_train), texts)
+            rows = split if isinstance(split, Split) else single_split(record, split, seed, n_train)
+            warn_of_suspicions(record)
+            write_page(correct_scene(self.folder, record, rows, options, material, on_progress), place, replace)
 
-        return self._made(out, corrected)
+        return self._made(out, corrected, replace)
 
     @property
     def correction(self) -> dict[str, Any] | None:
@@ -123,11 +142,11 @@ class Scene:
         return resolve("wrf_mi.viewer.view:view")(self.folder, *more, **options)
 
     @classmethod
-    def _made(cls, out: str | Path | None, make: Callable[[Path], Any]) -> Scene:
+    def _made(cls, out: str | Path | None, make: Callable[[Path], Any], replace: bool = False) -> Scene:
         """The scene that a function writes into a new folder; `InputError`, before the work: the folder exists."""
         if out is not None:
-            if Path(out).exists():
-                raise InputError(f"{out}: exists; remove it, or choose another folder")
+            if Path(out).exists() and not replace:
+                raise InputError(f"{out}: exists; remove it, choose another folder, or replace it")
             make(Path(out))
             return cls(Path(out))
         home = Path(tempfile.mkdtemp(prefix="wrf-mi-"))

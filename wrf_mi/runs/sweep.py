@@ -38,7 +38,7 @@ from .folder import CONFIG, METRICS, RunRequest, is_finished, package_versions
 
 OPTIONS = (
     *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "min-rows", "seed"),
-    *("preset", "receiver", "stages", "paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
+    *("preset", "receiver-model", "stages", "paths", "depth", "reflections", "phase-error", "rays", "calibrate"),
     *(field.name.replace("_", "-") for field in fields(AntennaOptions)),
 )
 """Options of ``wrf-mi train`` that may vary, besides settings."""
@@ -281,9 +281,9 @@ def _row(run: SweepRun, status: str) -> dict[str, Any]:
     if not metrics:
         return row | {"metrics": {}}
     task, references = TASKS[metrics["task"]], metrics["reference"]
+    row |= {key: metrics[key] for key in HEADINGS if key in metrics} | {"metrics": metrics}
     row |= {"score": task.label, "reference_median": references[task.headline(references)]["median"]}
-    row |= {key: metrics[task.block][key] for key in SCORES}
-    return row | {key: metrics[key] for key in HEADINGS if key in metrics} | {"metrics": metrics}
+    return row | {key: metrics[task.block][key] for key in SCORES}
 
 
 def check_failures(rows: Sequence[Mapping[str, Any]]) -> None:

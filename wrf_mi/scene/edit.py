@@ -36,6 +36,9 @@ class Move:
         shift_m: displacement [3], metres.
         turn_deg: rotation about the vertical axis through the middle of the parts' common box, degrees, from +x
             towards +y; before the displacement.
+
+    >>> Move(("table*", "box"), (0.5, 0, 0), 90).parts
+    ('table*', 'box')
     """
 
     parts: tuple[str, ...]

@@ -207,7 +207,7 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
     if is_plan(file):
         return _read_plan(file, units, up, storey)
     if storey != UNSTATED:
-        raise InputError(f"{file}: no plan; leave out --height, --floor, --resolution and --row-0")
+        raise InputError(f"{file}: no plan; leave out --wall-height, --floor, --resolution and --row-0")
     if has_faces(file):
         return _Source(file, _read_faces(file, units, up))
     scan = read_scan(files, units, up)
@@ -249,7 +249,7 @@ def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> 
         text = f"{file}: has a column z or three numbers in a row, and a CSV is a plan of wall corners, x,y"
         raise InputError(f"{text}; for points in three dimensions leave out its header and call it .xyz")
     if height_m is None:
-        raise InputError(f"{file}: a plan has no heights; give that of the ceiling in metres (--height)")
+        raise InputError(f"{file}: a plan has no heights; give that of the ceiling in metres (--wall-height)")
     if units not in (None, "m"):
         raise InputError(f"{file}: a plan is in metres; give its cell with --resolution and leave out --units")
     if up is not None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from ..core import Record
 from ..datasets import load
+from ..datasets.labelled import record_of
 from .floor_channels import PLACES, PREFIX, walked_channels
 from .floor_receivers import CHANNELS as FLOOR_CHANNELS
 from .floor_receivers import NAME as FLOOR_STRENGTHS
@@ -28,7 +30,7 @@ __all__ = [
 ]
 
 
-def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
+def load_record(name_or_folder: str | Path | Any, progress: bool = False) -> Record:
     """Read any data set as `wrf_mi.datasets.load` does, or trace a synthetic data set.
 
     Synthetic are ``laboratory`` (some seconds), ``traced-room`` (some minutes), ``traced-room-bands``,
@@ -36,7 +38,8 @@ def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
     or two each).
 
     Args:
-        name_or_folder: a folder, or the name of a known data set.
+        name_or_folder: a folder, the name of a known data set, or an `xarray.Dataset` or `xarray.DataArray` with the
+            dimensions of `wrf_mi.core.Record.to_xarray`.
         progress: show a progress bar on standard error while tracing.
 
     Raises:
@@ -49,6 +52,8 @@ def load_record(name_or_folder: str | Path, progress: bool = False) -> Record:
     makers: dict[str, Callable[..., Record]] = {LABORATORY: laboratory_record, ROOM: traced_room}
     makers |= {BANDS: traced_room_bands, FLOOR_STRENGTHS: traced_floor_strengths, FLOOR_CHANNELS: traced_floor_channels}
     makers |= {f"{PREFIX}{place}": partial(walked_channels, place) for place in PLACES}
+    if hasattr(name_or_folder, "dims"):
+        return record_of(name_or_folder)
     if not Path(name_or_folder).is_dir() and str(name_or_folder) in makers:
         return makers[str(name_or_folder)](progress=progress)
     return load(name_or_folder)

@@ -107,7 +107,7 @@ def rows_content(results: Results, options: ViewOptions) -> tuple[RowsContent | 
     chosen = placed[stored := representative(score, most)]
     notes = []
     if len(stored) < len(placed):
-        text = f"evenly over the order of their {task.label} (option --transmitters)"
+        text = f"evenly over the order of their {task.label} (option --max-transmitters)"
         notes.append(f"Transmitters: {len(stored)} of {len(placed)} held-out rows, {text}.")
     observed = observations_of(results, chosen)
     rows = results.row[placed], results.tx_pos_m[placed], score
@@ -183,7 +183,7 @@ def gaussians_content(
     log_scale, total, notes = np.log(np.maximum(scale, SMALLEST_M)), strength.shape[1], []
     if len(order) < total:
         text = f"the {len(order)} of {total} of the largest mean power over the stored transmitters"
-        notes.append(f"Gaussians: {text} (option --gaussians).")
+        notes.append(f"Gaussians: {text} (option --max-gaussians).")
     return GaussiansContent(clouds[0].position_m[order], log_scale, rotation, strength[:, order], total), notes
 
 

@@ -43,7 +43,7 @@ class View:
         """The page: one HTML document that needs no network; `InputError`: it would be larger than `LARGEST_BYTES`."""
         text = page(self.content)
         if (size := len(text.encode())) > LARGEST_BYTES:
-            remedy = "lower --transmitters, --gaussians or --paths, or give fewer maps"
+            remedy = "lower --max-transmitters, --max-gaussians or --max-paths, or give fewer maps"
             raise InputError(f"view: {size / 1e6:.1f} MB, the limit is {LARGEST_BYTES / 1e6:.0f} MB; {remedy}")
         return text
 
@@ -168,7 +168,7 @@ def view(
     gaussians: int = SHOWN_GAUSSIANS,
     paths: int = SHOWN_PATHS,
     material: str | None = None,
-    on_stage: Callable[[str, float], None] = lambda stage, share: None,
+    on_progress: Callable[[str, float], None] = lambda stage, share: None,
     progress: bool = False,
 ) -> View:
     """Interactive 3D view of a scene, runs and maps.
@@ -183,7 +183,7 @@ def view(
         gaussians: number of Gaussians, the strongest.
         paths: number of paths of each stored transmitter to each receiver, the strongest.
         material: radio material of a bare mesh; None: its surfaces are shown without one.
-        on_stage: progress callback: stage and fraction done.
+        on_progress: progress callback: stage and fraction done.
         progress: show a bar on standard error where paths are traced.
 
     Raises:
@@ -197,7 +197,7 @@ def view(
     if not sources:
         raise InputError("view: nothing to show; give a run folder, a scene or a map")
     plotly_js()  # refused before the work
-    gathered = _Gathered(options, material, on_stage, progress)
+    gathered = _Gathered(options, material, on_progress, progress)
     for source in sources:
         gathered.add(source)
     if material is not None and not gathered.material_used:

@@ -202,7 +202,7 @@ def test_receivers_heard_too_rarely_are_left_out_by_name(tmp_path: Path) -> None
     frame = wide().assign(rssi_far=[-95.0, -96] + [np.nan] * 28, split=["train"] * 20 + ["test"] * 10)
     assert len(imported(tmp_path, frame).receivers) == 4
     assert len(imported(tmp_path, frame, min_heard=3).receivers) == 3
-    assert "left out (--min-heard): far" in (tmp_path / "data" / "import.yml").read_text().replace("\n", " ")
+    assert "left out (--min-rows): far" in (tmp_path / "data" / "import.yml").read_text().replace("\n", " ")
 
 
 def test_pitch_heading_carrier_run_and_storeys(tmp_path: Path) -> None:
@@ -231,7 +231,9 @@ REFUSED = {
     "nothing heard": (None, {"not_heard": STRENGTHS.ravel().tolist()}, "no reading was heard"),
     "rarely heard": (None, {"min_heard": 99}, "no receiver was heard in 99 training rows"),
     "average": (None, {"average": "median"}, "--average 'median' is unknown; give one of db, mw"),
-    "pitch": (None, {"pitch_m": -1}, "--pitch-m -1: give a number above 0"),
+    "pitch": (None, {"pitch_m": -1}, "--pitch -1: give a number above 0"),
+    "storey": (None, {"storey_m": 4.0}, "--storey: it belongs to a column floor without z; omit it"),
+    "heading unit": (None, {"heading": "deg"}, "--heading-unit: the table has no column of headings; omit it"),
     "option": (None, {"sentinel": 1}, "no option sentinel; see ImportOptions"),
     "positions": (None, {"positions": ["a.csv", "b.csv"]}, r"a\.csv: missing"),
 }

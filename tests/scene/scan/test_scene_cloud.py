@@ -59,6 +59,13 @@ def test_a_box_is_six_rectangles_with_closed_corners(noise_m, count, seed):
     assert np.abs(normals - normals.round()).max() < 0.005
 
 
+def test_planes_of_points_without_noise_at_round_coordinates_are_found():
+    faces = [
+        np.insert(np.random.default_rng(0).random((8000, 2)), axis, side, 1) for axis in range(3) for side in (0, 1)
+    ]
+    assert rooms(surfaces_from_points(np.concatenate(faces) * [5, 4, 2.7])) == (1, 1, 4, 0)
+
+
 def test_an_l_shape_a_sloping_ceiling_and_a_real_slope_are_kept():
     surfaces = by_kind(surfaces_from_points(sampled(l_shape(), COUNT)))
     assert [len(group) for group in surfaces.values()] == [1, 1, 6, 0]

@@ -21,7 +21,7 @@ from ..ble_folder import CARRIER_HZ, write_ble_folder
 from ..unknown import listed
 from .columns import HERTZ, described, find_columns, parsed_columns, unit_of
 from .files import Table, joined, read_table
-from .options import ImportOptions
+from .options import ImportOptions, option_name
 from .places import (
     POSITION_DIGITS,
     LocalFrame,
@@ -127,6 +127,7 @@ class _Import:
 
     def run(self, replace: bool) -> ImportReport:
         """Read, average and write."""
+        self._check_idle()
         frame, xyz_m = self._positions()
         readings, notes, not_heard = without_not_heard(read_readings(self.table, self.columns), self.options.not_heard)
         self.notes += notes
@@ -179,6 +180,19 @@ class _Import:
             table, is_test = dataclasses.replace(table, frame=table.frame[chosen_rows]), is_test[chosen_rows]
         return table, is_test
 
+    def _check_idle(self) -> None:
+        """Refuse options of quantities that the tables state, or do not have."""
+        of, without_z = self.columns.of, "z" not in self.columns.of
+        needed = {
+            "height_m": (without_z, "the table has a column z"),
+            "storey_m": (without_z and "floor" in of, "it belongs to a column floor without z"),
+            "heading": ("heading" in of, "the table has no column of headings"),
+            "anchor_height_m": (self.options.anchors is not None, "it belongs to --anchors"),
+        }
+        for name, (counts, reason) in needed.items():
+            if not counts and getattr(self.options, name) != getattr(ImportOptions, name):
+                raise DataFault(self.table.files[0][0], f"{option_name(name)}: {reason}; omit it")
+
     def _positions(self) -> tuple[LocalFrame, FloatArray]:
         """The local frame and the positions [rows, 3] in it."""
         options, table, of = self.options, self.table, self.columns.of
@@ -189,7 +203,7 @@ class _Import:
         frame, notes = find_frame(xy, geographic, unit, scale_m, options.crs)
         self.notes += notes
         if not options.pitch_m and (xy == np.round(xy)).all() and np.ptp(xy, axis=0).max() < MOST_STEPS:
-            self.notes.append("x and y are whole numbers: if they are indices of a grid, state its pitch by --pitch-m")
+            self.notes.append("x and y are whole numbers: if they are indices of a grid, state its pitch by --pitch")
         shown = f"steps of {options.pitch_m:g} m" if options.pitch_m else frame.crs or unit or "m"
         self.units |= dict.fromkeys(("x", "y", "lat", "lon"), shown)
         return frame, np.column_stack([frame.local_m(xy), self._heights_m()])
@@ -203,7 +217,7 @@ class _Import:
         if "floor" in of:
             self.notes.append(f"z is {options.height_m:g} m above the floor, storeys are {options.storey_m:g} m high")
             return options.height_m + options.storey_m * floor_numbers(table, of["floor"])
-        self.notes.append(f"no column z: all rows are {options.height_m:g} m above the floor (--height-m)")
+        self.notes.append(f"no column z: all rows are {options.height_m:g} m above the floor (--height)")
         return np.full(len(table), options.height_m)
 
     def _conditions(self, readings: Readings) -> dict[str, Any]:
@@ -238,7 +252,7 @@ class _Import:
         options = self.options
         if places * len(readings.ids) > MOST_CELLS:
             text = f"{places} places of {len(readings.ids)} receivers do not fit into memory ({MOST_CELLS} values do)"
-            raise InputError(f"{self.out}: {text}; average by --place-m, or leave receivers out by --receivers")
+            raise InputError(f"{self.out}: {text}; average by --place, or leave receivers out by --receivers")
         means = mean_strengths(readings, place, places, options.average)
         groups = virtual_networks(readings.ids, means.dbm)
         if groups:
@@ -254,9 +268,9 @@ class _Import:
         if len(out := np.setdiff1d(np.arange(len(heard)), remaining)):
             names = listed([readings.ids[number] for number in out])
             text = f"{len(out)} of {len(heard)} receivers were heard in fewer than {max(1, options.min_heard)} training"
-            self.notes.append(f"{text} rows and are left out (--min-heard): {names}")
+            self.notes.append(f"{text} rows and are left out (--min-rows): {names}")
         if not len(remaining):
-            text = f"no receiver was heard in {options.min_heard} training rows; lower --min-heard"
+            text = f"no receiver was heard in {options.min_heard} training rows; lower --min-rows"
             raise InputError(f"{self.out}: {text}")
         readings = chosen(readings, remaining)
         return readings, Means(means.dbm[remaining], means.count[remaining], means.std[remaining])
@@ -282,7 +296,7 @@ class _Import:
         carrier_hz = self.options.frequency_hz or CARRIER_HZ
         stated = "frequency" in self.columns.of or receivers[0].frequency_hz
         if not self.options.frequency_hz and not stated:
-            self.notes.append(f"no carrier is stated: {carrier_hz:.4g} Hz (--frequency-hz)")
+            self.notes.append(f"no carrier is stated: {carrier_hz:.4g} Hz (--frequency)")
         return Record(
             name=self.out.name,
             task="rssi",

@@ -13,6 +13,12 @@ from ...core.files import one_line
 from ..ble_folder import TAG_HEIGHT_M
 
 AVERAGES = ("db", "mw")
+NAMES = {"min_heard": "min-rows", "heading": "heading-unit"}
+
+
+def option_name(attribute: str) -> str:
+    """Option of ``wrf-mi data import`` for an attribute of `ImportOptions`."""
+    return f"--{NAMES.get(attribute) or attribute.removesuffix('_m').removesuffix('_hz').replace('_', '-')}"
 
 
 @dataclass(frozen=True)
@@ -68,4 +74,4 @@ class ImportOptions:
             raise InputError(f"--average {one_line(self.average)!r} is unknown; give one of {', '.join(AVERAGES)}")
         for name in ("place_m", "pitch_m", "frequency_hz", "min_heard"):
             if not 0 <= float(getattr(self, name)) < np.inf:
-                raise InputError(f"--{name.replace('_', '-')} {getattr(self, name)}: give a number above 0")
+                raise InputError(f"{option_name(name)} {getattr(self, name)}: give a number above 0")

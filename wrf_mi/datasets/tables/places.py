@@ -176,7 +176,7 @@ def headings_rad(values: FloatArray, name: str, unit: str) -> tuple[FloatArray, 
     unit = unit or _heading_unit(values, name)
     words = {"compass": "degrees clockwise from north", "deg": "degrees from x towards y", "rad": "radians"}
     if unit not in words:
-        raise InputError(f"--heading {one_line(unit)!r} is unknown; give one of {', '.join(words)}")
+        raise InputError(f"--heading-unit {one_line(unit)!r} is unknown; give one of {', '.join(words)}")
     if unit == "compass":
         values = 90 - values
     return (values if unit == "rad" else np.radians(values)), words[unit]

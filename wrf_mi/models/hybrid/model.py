@@ -337,6 +337,12 @@ class Hybrid(Model):
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse unknown positions, and data that no part can be fitted to."""
+        settings, learned = problem.settings, {FIELD, RESIDUAL}
+        if settings.stages is not None and problem.record.uplink is None:
+            if problem.scene is None and not learned & {*settings.wanted}:
+                raise InputError(f"--stages {settings.stages}: of a scene; give --scene, or name field or residual")
+            if problem.scene is not None and {*settings.wanted} == {RESIDUAL}:
+                raise InputError(f"--scene {problem.scene}: not used by --stages {RESIDUAL}; omit one of them")
         for split in splits:
             known_positions(problem.record, split.all_train, self.name)
             parts_of(problem, split)

@@ -94,7 +94,7 @@ def plan_surfaces(
         InputError: bad height, no wall, or walls that enclose nothing.
     """
     if not (np.isfinite(height_m) and height_m > 0 and np.isfinite(floor_m)):
-        raise InputError(f"height {height_m} m above {floor_m} m: give a height above zero (--height, metres)")
+        raise InputError(f"height {height_m} m above {floor_m} m: give a height above zero (--wall-height, metres)")
     try:
         walls_m = walls_of_plan(source, resolution_m)
         flat, faces = triangulated(floor_of(walls_m))

@@ -57,6 +57,9 @@ LAYER_M2, LAYER_CELLS = 0.3, 8  # least size of a layer
 FLATNESS = 2.0
 """Largest spread of the medians of a layer, in their standard errors: what is bent or tilted is not a layer."""
 MEDIAN_ERROR = 1.25  # standard error of a median, in that of a mean
+OFF_ROUND_M = np.array([0.0137, 0.0071, 0.0113])
+"""Displacement while normals are estimated: Open3D's are wrong where the covariance of points without noise is exactly
+singular, as at the floor z = 0 of points that were drawn on a mesh."""
 TUKEY = 4.685  # constant of the biweight
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution in its median absolute deviations
 
@@ -90,7 +93,8 @@ def thin(points_m: FloatArray) -> Thinned:
     cloud, rows = cloud.remove_statistical_outlier(STRAY_NEIGHBOURS, STRAY_RATIO)
     if len(rows) < STRAY_NEIGHBOURS:
         raise InputError(f"only {len(rows)} points have neighbours; give a denser point cloud")
-    radius, points = NORMAL_RADIUS_M * voxel / VOXEL_M, np.asarray(cloud.points)
+    radius, points = NORMAL_RADIUS_M * voxel / VOXEL_M, np.array(cloud.points)
+    cloud.translate(OFF_ROUND_M)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius, NORMAL_NEIGHBOURS))
     normals = np.array(cloud.normals)
     # Far from the scanner a radius holds a few points, whose noise tilts the normal; in a dense scan they are clutter.
