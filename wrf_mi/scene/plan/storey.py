@@ -17,6 +17,9 @@ from .walls import find_walls
 
 CLOSING_M = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Half-widths of openings that are closed to find the floor: doors first, then larger gaps."""
+LARGEST_GAP_M = 2.5  # widest entrance in an outer wall, a double door: rooms behind wider gaps are open to the outside
+WALLED = 0.75  # least share of a room's outline along walls: the rest are gaps; niches of a facade have less
+NARROWEST_ROOM_M = 0.6  # as wide as the narrowest door
 COVERED = 0.9  # least share of the walls that stand on the floor or at its edge
 EDGE_M = 0.1  # a wall this near to the floor's edge stands at it
 SMALLEST_FLOOR_M2 = 0.5
@@ -35,19 +38,40 @@ def layout_walls(vertices_m: FloatArray) -> FloatArray:
 def floor_of(walls_m: FloatArray) -> BaseGeometry:
     """The area (shapely) that walls [n, 2, 2] enclose, openings closed, without inner yards; `InputError`: they enclose
     none.
+
+    Rooms that are open to the outside by gaps of at most `LARGEST_GAP_M`, such as a corridor with an entrance, belong to
+    it.
     """
     lines = shapely.unary_union(shapely.linestrings(walls_m))
     rooms = shapely.unary_union(shapely.get_parts(shapely.polygonize([lines])))
     areas = [_filled(rooms)]
     # Openings are closed by growing and shrinking, doors first: a wider closing rounds off more of the outline.
-    for half in CLOSING_M:
-        grown = shapely.buffer(lines, half, cap_style="square", join_style="mitre")
-        areas.append(shapely.buffer(_filled(grown), -half, join_style="mitre"))
+    areas += [_closed(lines, half) for half in CLOSING_M]
     for area in areas:
         covered = shapely.length(shapely.intersection(lines, shapely.buffer(area, EDGE_M)))
         if area.area >= SMALLEST_FLOOR_M2 and covered >= COVERED * lines.length:
-            return shapely.simplify(area, EDGE_M / 2)
+            return shapely.simplify(_with_open_rooms(area, lines), EDGE_M / 2)
     raise InputError(f"the {len(walls_m)} walls found enclose no floor; give a plan that shows whole rooms")
+
+
+def _closed(lines: BaseGeometry, half_m: float) -> BaseGeometry:
+    """The area within lines after a morphological closing by squares of twice a half-width."""
+    grown = shapely.buffer(lines, half_m, cap_style="square", join_style="mitre")
+    return shapely.buffer(_filled(grown), -half_m, join_style="mitre")
+
+
+def _with_open_rooms(area: BaseGeometry, lines: BaseGeometry) -> BaseGeometry:
+    """An area with the rooms whose walls are at its edge, so that it covers all walls without them."""
+    added = shapely.difference(_closed(lines, LARGEST_GAP_M / 2), area)
+    # Opened by the width of a door, without which the space between both faces of a wall counts as a room.
+    opened = shapely.buffer(added, -NARROWEST_ROOM_M / 2, join_style="mitre")
+    rooms = shapely.get_parts(shapely.buffer(opened, NARROWEST_ROOM_M / 2, join_style="mitre"))
+    near = shapely.buffer(lines, EDGE_M)
+    walled = shapely.length(shapely.intersection(shapely.boundary(rooms), near)) >= WALLED * shapely.length(rooms)
+    rooms = rooms[walled & (shapely.area(rooms) >= SMALLEST_FLOOR_M2)]
+    # Widened by a millimetre, because rounding leaves slits between an area and its complement.
+    joined = shapely.union_all([shapely.buffer(part, 1e-3, join_style="mitre") for part in (area, *rooms)])
+    return _filled(shapely.buffer(joined, -1e-3, join_style="mitre")) if len(rooms) else area
 
 
 def _filled(area: BaseGeometry) -> BaseGeometry:
