@@ -12,8 +12,9 @@ from ...core.angles import FloatArray
 from ..mesh.outline import triangulated
 from ..mesh.surfaces import Surface, number_names
 from .alignment import grid_from_scans
+from .lines import HALF_WIDTH_M, THICKEST_WALL_M
 from .sources import PlanGrid, PlanPoints, grid_from_points
-from .walls import find_walls
+from .walls import find_walls, joined
 
 CLOSING_M = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Half-widths of openings that are closed to find the floor: doors first, then larger gaps."""
@@ -94,6 +95,29 @@ def walls_of_plan(source: PlanGrid | PlanPoints | FloatArray, resolution_m: floa
     return find_walls(source) if isinstance(source, PlanGrid) else layout_walls(np.asarray(source, float))
 
 
+def at_inner_faces(walls_m: FloatArray, grid: PlanGrid) -> FloatArray:
+    """Walls [n, 2, 2], the middle lines of those in a grid, with outer walls thicker than the blur of a map moved to
+    their inner faces, where reflections happen, and the floor ends.
+    """
+    area, result, step = floor_of(walls_m), walls_m.copy(), grid.resolution_m
+    depth = step * np.arange(1, int(THICKEST_WALL_M / step))
+    for i, (begin, end) in enumerate(walls_m):
+        length = np.linalg.norm(end - begin)
+        along = (end - begin) / length
+        on_wall = begin + np.arange(0, length, step)[:, None] * along
+        left = np.array([-along[1], along[0]])
+        inside = [np.mean(shapely.contains_xy(area, on_wall + side * EDGE_M * left)) > 0.5 for side in (1, -1)]
+        if inside[0] == inside[1]:
+            continue
+        inwards = left if inside[0] else -left
+        occupied = grid.occupied_at(on_wall[:, None] + depth[:, None] * inwards)
+        # At most places no other wall meets this one.
+        half_m = float(np.median(depth[0] * (np.argmin(occupied, axis=1) + 0.5)))
+        if HALF_WIDTH_M < half_m <= THICKEST_WALL_M / 2:
+            result[i] += half_m * inwards
+    return joined(result)
+
+
 def plan_surfaces(
     source: PlanGrid | PlanPoints | FloatArray,
     *,
@@ -121,6 +145,8 @@ def plan_surfaces(
         raise InputError(f"height {height_m} m above {floor_m} m: give a height above zero (--height, metres)")
     try:
         walls_m = walls_of_plan(source, resolution_m)
+        if isinstance(source, PlanGrid):
+            walls_m = at_inner_faces(walls_m, source)
         flat, faces = triangulated(floor_of(walls_m))
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
