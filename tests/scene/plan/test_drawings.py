@@ -86,7 +86,5 @@ def test_positions_in_a_room_that_is_open_to_the_outside_are_named(tmp_path):
     # The path doubles back along the corridor, 3 m wide and open in the west.
     corners = [(0, 0), (8, 0), (8, 9), (0, 9), (0, 6), (8, 6), (8, 3), (0, 3), (0, 0)]
     np.savetxt(tmp_path / "plan.csv", corners, "%.2f", ",", header="x,y", comments="")
-    with pytest.raises(
-        InputError, match=r"32 of 64 positions have no floor below; .* open to the outside by more than"
-    ):
+    with pytest.raises(InputError, match=r"32 of 64 positions have no floor below; .* open to the outside"):
         make_scene(tmp_path / "plan.csv", tmp_path / "scene", height_m=2.7, positions=tmp_path / "walk.csv")

@@ -40,8 +40,8 @@ def floor_of(walls_m: FloatArray) -> BaseGeometry:
     """The area (shapely) that walls [n, 2, 2] enclose, openings closed, without inner yards; `InputError`: they enclose
     none.
 
-    Rooms that are open to the outside by gaps of at most `LARGEST_GAP_M`, such as a corridor with an entrance, belong to
-    it.
+    Rooms that are open to the outside by gaps of at most `LARGEST_GAP_M`, such as a corridor with an entrance, belong
+    to it.
     """
     lines = shapely.unary_union(shapely.linestrings(walls_m))
     rooms = shapely.unary_union(shapely.get_parts(shapely.polygonize([lines])))
