@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from made_flat import write_flat
 
 from wrf_mi.checking import building as module
 from wrf_mi.checking import check_data
-from wrf_mi.checking.building import building_file, in_solid, in_wall, inside_solids, read_building
+from wrf_mi.checking.building import building_file, device_findings, in_solid, in_wall, inside_solids, read_building
+from wrf_mi.checking.scene_geometry import ShapePart
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import load, write_ble_folder
 
@@ -193,3 +195,17 @@ def test_a_plan_that_cannot_be_read_is_suspected(tmp_path):
         assert report.ok
         assert [one.name for one in report.suspicions] == ["building"]
         assert message in report.suspicions[0].text
+
+
+def test_positions_of_a_scene_without_floor_below_are_named():
+    """A floor of 4 m x 2 m and a wall along the 8 m of the scene; a third of the positions is beside the floor."""
+    floor = [[[0, 0, 0], [4, 0, 0], [4, 2, 0]], [[0, 0, 0], [4, 2, 0], [0, 2, 0]]]
+    wall = [[[0, 0, 0], [8, 0, 0], [8, 0, 3]], [[0, 0, 0], [8, 0, 3], [0, 0, 3]]]
+    parts = [ShapePart("room", "wood", Path("room.ply"), np.array([*floor, *wall], float))]
+    inside, beside = [[1, 1, 1], [3, 0.5, 1], [2, 1, 1], [3.5, 1.5, 2]], [[6, 0, 1], [7, 0, 1]]
+    receivers = [SimpleNamespace(position_m=np.array([1.0, 1, 2]))]
+    cases = [np.array(rows, float) for rows in (inside + beside, [*inside, [30, 0, 1]], beside)]
+    records = [SimpleNamespace(tx_pos_m=rows, receivers=receivers) for rows in cases]
+    findings = [list(device_findings(parts, Path("room"), record)) for record in records]
+    assert [[finding.kind for finding in each] for each in findings] == [["no-floor"], [], []]
+    assert "2 of 6 transmitters inside the scene, first number 5, have no floor" in findings[0][0].text

@@ -34,14 +34,14 @@ from ..scene.folder import FACTS_FILE, scene_file
 from ..scene.make import has_faces
 from ..scene.materials import FILE as MATERIALS_FILE
 from ..scene.materials import read_materials, thicknesses
-from ..scene.mesh.surfaces import bodies, sampled
+from ..scene.mesh.surfaces import sampled
 from ..scene.scan.las_units import stated_units, units_remedy, units_text
 from ..scene.scan.points import read_points
 from ..synthetic import load_record
 from ..tracing.sionna.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ, in_itu_range
 from ..tracing.sionna.scenes import HIGHEST_M as HIGHEST_SCENE_M
 from ..tracing.sionna.scenes import REFUSALS, reason
-from .building import THICKEST_SOLID_M, in_solid
+from .building import device_findings
 from .scene_findings import Finding, SceneReport
 from .scene_geometry import ShapePart, between_parts, mesh_file_parts, part_findings, scene_parts
 from .scene_xml_faults import SceneXml, itu_type, read_xml, xml_findings
@@ -292,7 +292,7 @@ def _of_triangles(
     if filled := [part for part in parts if len(part.corners_m)]:
         yield from _coordinates(filled, path, frame, carriers_hz)
     if record is not None:
-        yield from _devices(filled, path, record)
+        yield from device_findings(filled, path, record)
 
 
 def _coordinates(
@@ -339,20 +339,6 @@ def _up(points: FloatArray, path: Path) -> Iterator[Finding]:
         _, along_y, along_z = np.ptp(extent(points), axis=0)
         text = f"looks as if y were up ({along_y:.3g} m along y, {along_z:.3g} m along z)"
         yield Finding("up-axis", path, "", text, "state it by --up y, or --up z if that is right")
-
-
-def _devices(parts: Sequence[ShapePart], path: Path, record: Record) -> Iterator[Finding]:
-    """Devices of a record inside closed bodies that are no rooms."""
-    places = {"transmitters": record.tx_pos_m, "receivers": np.stack([r.position_m for r in record.receivers])}
-    solids = [(part.name, body) for part in parts for body in bodies(part.corners_m) if body.closed]
-    for what, positions in places.items():
-        known = np.flatnonzero(np.isfinite(positions).all(axis=1))
-        for name, body in solids:
-            if np.ptp(body.bounds_m, axis=0).min() > THICKEST_SOLID_M:
-                continue
-            if rows := known[in_solid(positions[known], body.corners_m)].tolist():
-                text = f"{len(rows)} of {len(positions)} {what} inside, first number {rows[0] + 1}"
-                yield Finding("device-inside", path, name, text, "correct the positions, or the scene's frame")
 
 
 def _check_scan(path: Path, name: str, frame: Frame) -> SceneReport:

@@ -63,6 +63,7 @@ KINDS: Mapping[str, tuple[Level, str]] = {
     "material-range": ("fault", "material that ITU-R P.2040 does not have at the carrier"),
     "below-range": ("warning", "material below its range, for which this package has constants and Sionna RT none"),
     "device-inside": ("warning", "transmitters or receivers inside a solid"),
+    "no-floor": ("warning", "some transmitters or receivers without a floor below"),
     "not-opened": ("fault", "scene that Sionna RT refuses for another reason"),
     "few-points": ("warning", "scan with too few points for its extent"),
     "no-viewpoint": ("note", "scan that does not state where the scanner stood"),

@@ -50,6 +50,7 @@ def _add_mesh(commands: Any) -> None:
 def mesh_command(a: Arguments) -> int:
     """Make a scene folder."""
     from ..scene.make import make_scene
+    from ..scene.mesh.files import mesh_parts
     from ..scene.register import read_pairs, register_pairs
 
     pairs = None if a.register_pairs is None else register_pairs(*read_pairs(a.register_pairs), name=a.register_pairs)
@@ -59,13 +60,16 @@ def mesh_command(a: Arguments) -> int:
     scene = make_scene(a.points, a.out, **source, **storey, **frame, replace=a.replace)
     kinds = list(scene.materials.surfaces.values())
     counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
+    floors = [name for name, kind in scene.materials.surfaces.items() if kind == "floor"]
+    floor_m2 = sum(part.area for name in floors for part in mesh_parts(scene.folder / "meshes" / f"{name}.ply"))
     facts = {"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts}
     lines = [", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}"]
+    lines.append(f"floor: {floor_m2:.1f} m2")
     if scene.origin_m is not None:
         point = ", ".join(f"{value:.12g}" for value in scene.origin_m)
         lines.append(f"origin: {point}; subtract it from the positions of the measurements, too")
     lines.append(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
-    return show(a.json, {**facts, "origin_m": scene.origin_m}, "\n".join(lines))
+    return show(a.json, {**facts, "floor_m2": float(floor_m2), "origin_m": scene.origin_m}, "\n".join(lines))
 
 
 def _point(text: str) -> tuple[float, ...]:

@@ -77,8 +77,13 @@ class Plan:
     std: FloatArray
 
     def write(self, file: str | Path) -> Path:
-        """Write positions with their order, expected error after each, and distance walked, as CSV."""
-        columns = np.arange(1, len(self.tx_pos_m) + 1), *self.tx_pos_m.T, self.expected_error[1:], self.walked_m
+        """Write positions to centimetres with their order, expected error after each, and distance walked, as CSV."""
+        columns = (
+            np.arange(1, len(self.tx_pos_m) + 1),
+            *self.tx_pos_m.round(2).T,
+            self.expected_error[1:],
+            self.walked_m,
+        )
         header = ("order", "x", "y", "z", "expected_error", "walked_m")
         return write_csv(Path(file), header, zip(*columns, strict=True))
 

@@ -23,6 +23,7 @@ from ..core.angles import FloatArray
 from ..datasets.folder_files import read_csv
 from .mesh.surfaces import Surface, box_of, cut_lines, moved
 from .plan.sources import PlanGrid
+from .plan.storey import LARGEST_GAP_M
 from .register import best_motion, wall_points
 
 logger = logging.getLogger(__name__)
@@ -94,11 +95,15 @@ def check_positions(
     others = [(remedy, conflicts(positions_m, reflection)) for remedy, reflection in mirrored]
     remedy, best = min(others, key=lambda pair: sum(pair[1]))
     text = f"{name}: {crossings} lines between neighbouring positions cross walls and {outside} of {count} positions"
-    text += f" lie outside; mirrored it is {best[0]} and {best[1]}"
+    text += f" have no floor below; mirrored it is {best[0]} and {best[1]}"
     tolerated = TOLERATED + TOLERATED_SHARE * count
     if crossings + outside > 2 * sum(best) + tolerated:
         raise InputError(f"{text}: {remedy}")
     if crossings + outside > tolerated + LARGEST_SHARE * count:
+        if tolerated < outside == best[1] < count:
+            # Not the frame of the positions: a part of the building that is its own mirror image is open.
+            rooms = f"rooms that are open to the outside by more than {LARGEST_GAP_M:g} m get no floor"
+            raise InputError(f"{text}: {rooms}; close their outer walls in the plan")
         raise InputError(f"{text}: check the registration and the frame of the positions")
     if sum(best) <= crossings + outside:
         # No position lies where the building and its reflection differ.

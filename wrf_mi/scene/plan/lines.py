@@ -22,6 +22,8 @@ CLEARED_M = 0.2
 """Largest distance of cells that are explained by a run; they support no other run along the same stretch."""
 LARGEST_HOLE_M = 0.25  # largest hole in a run, narrower than any door
 SHORTEST_RUN_M = 0.4  # least length of a run; shorter pieces may be clutter
+SOLID = 0.9  # least share of occupied cells in each row of a wall that is drawn thicker than the blur of a map
+THICKEST_WALL_M = 0.6  # solids thicker than an outer wall are blocks
 FILLED = 0.6  # least share of a run's length that holds occupied cells
 LARGEST_RISE_M = 0.2  # cells that rise by more across a run climb through its window: a wall of another direction
 SMALLEST_BLOB_CELLS = 4  # least number of connected occupied cells; fewer are stray returns
@@ -33,12 +35,16 @@ ALONG_ROWS = np.array([[0, 0, 0], [1, 1, 1], [0, 0, 0]])
 
 @dataclass(frozen=True)
 class WallRun:
-    """An axis-parallel piece of wall in a turned plan, along x (axis 0, its offset is a y) or along y (axis 1)."""
+    """An axis-parallel piece of wall in a turned plan, along x (axis 0, its offset is a y) or along y (axis 1).
+
+    Cells within `CLEARED_M` and ``thick_m``, which is above zero for walls thicker than a map's blur, belong to it.
+    """
 
     axis: int
     offset: float
     start: float
     end: float
+    thick_m: float = 0.0
 
     @property
     def length(self) -> float:
@@ -106,7 +112,8 @@ def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[WallRu
     """Axis-parallel runs of occupied cells of a turned grid, the best supported first."""
     step = grid.resolution_m
     half, rim, hole = (max(0, round(m / step)) for m in (HALF_WIDTH_M, CLEARED_M, LARGEST_HOLE_M))
-    left = np.pad(grid.occupied, half)
+    whole, thickest = np.pad(grid.occupied, half), THICKEST_WALL_M / step
+    left = whole.copy()
     low = grid.origin_m - half * step
     runs: list[WallRun] = []
     while True:
@@ -122,10 +129,25 @@ def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[WallRu
             # The next direction may explain it.
             image[first : row + half + 1, begin:end] = False
             continue
-        middle = float(np.median(across)) + first
+        middle, thick = float(np.median(across)) + first, 0.0
+        low_row, high_row = _solid_rows((whole if axis == 0 else whole.T)[:, begin:end], round(middle))
+        if thickest >= high_row - low_row > 2 * half + 1:
+            # The window saw a part of a thick wall.
+            middle, thick = (low_row + high_row - 1) / 2, (high_row - low_row) / 2 - half
         offset = low[1 - axis] + (middle + 0.5) * step
-        runs.append(WallRun(axis, offset, low[axis] + begin * step, low[axis] + end * step))
-        image[max(0, int(middle) - rim) : int(np.ceil(middle)) + rim + 1, max(0, begin - 1) : end + 1] = False
+        runs.append(WallRun(axis, offset, low[axis] + begin * step, low[axis] + end * step, thick * step))
+        low_row, high_row = int(middle - thick) - rim, int(np.ceil(middle + thick)) + rim + 1
+        image[max(0, low_row) : high_row, max(0, begin - 1) : end + 1] = False
+
+
+def _solid_rows(image: Mask, row: int) -> tuple[int, int]:
+    """First and last + 1 row of the solid wall about a row of an image; both are the row where it is not solid."""
+    solid = image.mean(axis=1) >= SOLID
+    if not solid[row]:
+        return row, row
+    gaps = np.flatnonzero(~solid)
+    position = int(np.searchsorted(gaps, row))
+    return int(gaps[position - 1]) + 1 if position else 0, int(gaps[position]) if position < len(gaps) else len(solid)
 
 
 def _best(image: Mask, half: int, hole: int, shortest: float) -> tuple[float, int, int, int]:

@@ -6,13 +6,15 @@ of a ROS map, is its top (largest y); an NPZ file states on which side its row 0
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from ...core import InputError
 from ...core.angles import FloatArray
@@ -21,6 +23,8 @@ from ...core.files import inside, one_line, text_lines
 from ...core.pictures import PICTURE_ERRORS, open_picture
 from ...core.yaml_files import read_yaml
 from ...datasets.folder_files import read_columns
+
+logger = logging.getLogger(__name__)
 
 Mask = NDArray[np.bool_]
 Row0 = Literal["top", "bottom"]
@@ -32,6 +36,7 @@ OCCUPIED_PROBABILITY = 0.65
 FREE_PROBABILITY = 0.196  # a cell less likely than this is free (``free_thresh`` there)
 POINT_CELL_M = 0.05  # side of the cells that points are counted in, as usual for maps of indoor robots
 LARGEST_GRID_CELLS = 4_000_000  # 100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away
+THINNEST_WALL_M = 0.05  # thinner lines of a drawing are door leaves, dimensions and letters
 LARGEST_PICTURE = 4 * LARGEST_GRID_CELLS
 """Most cells of an occupancy grid that is stated as such: the walls of more take hours to find."""
 
@@ -51,6 +56,13 @@ class PlanGrid:
     free: Mask
     resolution_m: float
     origin_m: FloatArray
+
+    def occupied_at(self, xy_m: FloatArray) -> Mask:
+        """Whether the cells of points [..., 2] are occupied; those outside the grid are not."""
+        column, row = np.moveaxis(np.floor((xy_m - self.origin_m) / self.resolution_m).astype(int), -1, 0)
+        rows, columns = self.occupied.shape
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        return np.asarray(self.occupied[np.where(inside, row, 0), np.where(inside, column, 0)] & inside)
 
     def centres_m(self, mask: Mask) -> FloatArray:
         """Centres [n, 2] of the cells of a mask."""
@@ -126,7 +138,8 @@ def read_plan(
     - ``.npz`` with points ``xy_m`` [n, 2] and optionally ``time_s`` [n], equal for all returns of a scan.
     - ``.png``, ``.pgm``: a grey picture, dark where occupied, with or without the ``.yaml`` of a ROS map beside it,
       which may be given in its place: ``image``, ``resolution``, ``origin`` [x, y, yaw], ``negate``
-      (https://wiki.ros.org/map_server). The yaw has to be zero; its thresholds are not used.
+      (https://wiki.ros.org/map_server). The yaw has to be zero; its thresholds are not used. Without a YAML, lines
+      thinner than `THINNEST_WALL_M` are not walls (`without_thin_lines`).
     - ``.csv`` with the header ``x,y``: wall vertices (`read_layout`).
     - ``.xyz``, ``.txt``: points in two columns x, y (metres), separated by spaces, tabs or commas; # begins a comment.
 
@@ -244,7 +257,30 @@ def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
             grey = np.asarray(picture.convert("L"), float) / 255
     except PICTURE_ERRORS as error:
         raise InputError(f"{path}: not a picture that can be read ({one_line(error)})") from None
-    return grid_from_probability(grey if negate else 1 - grey, resolution_m, "top", origin, str(path))
+    grid = grid_from_probability(grey if negate else 1 - grey, resolution_m, "top", origin, str(path))
+    return grid if sheet.is_file() else without_thin_lines(grid, str(path))
+
+
+def without_thin_lines(grid: PlanGrid, name: str = "plan") -> PlanGrid:
+    """A drawing without lines thinner than `THINNEST_WALL_M`, whose cells are free; how many is logged.
+
+    A drawing of which less than half remains has walls drawn as lines, and is returned as it is.
+    """
+    # A disk, so that walls of any direction remain; of even diameter, too, hence the half cells.
+    cells = max(1, int(THINNEST_WALL_M / grid.resolution_m + 1e-6))
+    offset = np.arange(cells) - (cells - 1) / 2
+    disk = np.hypot(offset[:, None], offset) <= cells / 2
+    thick = ndimage.binary_opening(grid.occupied, disk)
+    lines = grid.occupied & ~ndimage.binary_dilation(thick, np.ones((3, 3)))
+    if not lines.any():
+        return grid
+    share = lines.sum() / grid.occupied.sum()
+    if share > 0.5:
+        logger.warning("%s: walls are drawn as lines thinner than %g m, so every line is a wall", name, THINNEST_WALL_M)
+        return grid
+    text = "%s: lines thinner than %g m, %.2g %% of the dark cells, are not walls (door leaves, dimensions, letters)"
+    logger.warning(f"{text}; draw walls thicker", name, THINNEST_WALL_M, 100 * share)
+    return replace(grid, occupied=grid.occupied & ~lines, free=grid.free | lines)
 
 
 def _read_sheet(sheet: Path, path: Path, resolution_m: float | None) -> tuple[Path, bool, FloatArray, float]:

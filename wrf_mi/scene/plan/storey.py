@@ -12,11 +12,15 @@ from ...core.angles import FloatArray
 from ..mesh.outline import triangulated
 from ..mesh.surfaces import Surface, number_names
 from .alignment import grid_from_scans
+from .lines import HALF_WIDTH_M, THICKEST_WALL_M
 from .sources import PlanGrid, PlanPoints, grid_from_points
-from .walls import find_walls
+from .walls import find_walls, joined
 
 CLOSING_M = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Half-widths of openings that are closed to find the floor: doors first, then larger gaps."""
+LARGEST_GAP_M = 2.5  # widest entrance in an outer wall, a double door: rooms behind wider gaps are open to the outside
+WALLED = 0.75  # least share of a room's outline along walls: the rest are gaps; niches of a facade have less
+NARROWEST_ROOM_M = 0.6  # as wide as the narrowest door
 COVERED = 0.9  # least share of the walls that stand on the floor or at its edge
 EDGE_M = 0.1  # a wall this near to the floor's edge stands at it
 SMALLEST_FLOOR_M2 = 0.5
@@ -35,19 +39,40 @@ def layout_walls(vertices_m: FloatArray) -> FloatArray:
 def floor_of(walls_m: FloatArray) -> BaseGeometry:
     """The area (shapely) that walls [n, 2, 2] enclose, openings closed, without inner yards; `InputError`: they enclose
     none.
+
+    Rooms that are open to the outside by gaps of at most `LARGEST_GAP_M`, such as a corridor with an entrance, belong
+    to it.
     """
     lines = shapely.unary_union(shapely.linestrings(walls_m))
     rooms = shapely.unary_union(shapely.get_parts(shapely.polygonize([lines])))
     areas = [_filled(rooms)]
     # Openings are closed by growing and shrinking, doors first: a wider closing rounds off more of the outline.
-    for half in CLOSING_M:
-        grown = shapely.buffer(lines, half, cap_style="square", join_style="mitre")
-        areas.append(shapely.buffer(_filled(grown), -half, join_style="mitre"))
+    areas += [_closed(lines, half) for half in CLOSING_M]
     for area in areas:
         covered = shapely.length(shapely.intersection(lines, shapely.buffer(area, EDGE_M)))
         if area.area >= SMALLEST_FLOOR_M2 and covered >= COVERED * lines.length:
-            return shapely.simplify(area, EDGE_M / 2)
+            return shapely.simplify(_with_open_rooms(area, lines), EDGE_M / 2)
     raise InputError(f"the {len(walls_m)} walls found enclose no floor; give a plan that shows whole rooms")
+
+
+def _closed(lines: BaseGeometry, half_m: float) -> BaseGeometry:
+    """The area within lines after a morphological closing by squares of twice a half-width."""
+    grown = shapely.buffer(lines, half_m, cap_style="square", join_style="mitre")
+    return shapely.buffer(_filled(grown), -half_m, join_style="mitre")
+
+
+def _with_open_rooms(area: BaseGeometry, lines: BaseGeometry) -> BaseGeometry:
+    """An area with the rooms whose walls are at its edge, so that it covers all walls without them."""
+    added = shapely.difference(_closed(lines, LARGEST_GAP_M / 2), area)
+    # Opened by the width of a door, without which the space between both faces of a wall counts as a room.
+    opened = shapely.buffer(added, -NARROWEST_ROOM_M / 2, join_style="mitre")
+    rooms = shapely.get_parts(shapely.buffer(opened, NARROWEST_ROOM_M / 2, join_style="mitre"))
+    near = shapely.buffer(lines, EDGE_M)
+    walled = shapely.length(shapely.intersection(shapely.boundary(rooms), near)) >= WALLED * shapely.length(rooms)
+    rooms = rooms[walled & (shapely.area(rooms) >= SMALLEST_FLOOR_M2)]
+    # Widened by a millimetre, because rounding leaves slits between an area and its complement.
+    joined = shapely.union_all([shapely.buffer(part, 1e-3, join_style="mitre") for part in (area, *rooms)])
+    return _filled(shapely.buffer(joined, -1e-3, join_style="mitre")) if len(rooms) else area
 
 
 def _filled(area: BaseGeometry) -> BaseGeometry:
@@ -68,6 +93,29 @@ def walls_of_plan(source: PlanGrid | PlanPoints | FloatArray, resolution_m: floa
         else:
             source = grid_from_scans(source.xy_m, source.time_s)
     return find_walls(source) if isinstance(source, PlanGrid) else layout_walls(np.asarray(source, float))
+
+
+def at_inner_faces(walls_m: FloatArray, grid: PlanGrid) -> FloatArray:
+    """Walls [n, 2, 2], the middle lines of those in a grid, with outer walls thicker than the blur of a map moved to
+    their inner faces, where reflections happen, and the floor ends.
+    """
+    area, result, step = floor_of(walls_m), walls_m.copy(), grid.resolution_m
+    depth = step * np.arange(1, int(THICKEST_WALL_M / step))
+    for i, (begin, end) in enumerate(walls_m):
+        length = np.linalg.norm(end - begin)
+        along = (end - begin) / length
+        on_wall = begin + np.arange(0, length, step)[:, None] * along
+        left = np.array([-along[1], along[0]])
+        inside = [np.mean(shapely.contains_xy(area, on_wall + side * EDGE_M * left)) > 0.5 for side in (1, -1)]
+        if inside[0] == inside[1]:
+            continue
+        inwards = left if inside[0] else -left
+        occupied = grid.occupied_at(on_wall[:, None] + depth[:, None] * inwards)
+        # At most places no other wall meets this one.
+        half_m = float(np.median(depth[0] * (np.argmin(occupied, axis=1) + 0.5)))
+        if HALF_WIDTH_M < half_m <= THICKEST_WALL_M / 2:
+            result[i] += half_m * inwards
+    return joined(result)
 
 
 def plan_surfaces(
@@ -97,6 +145,8 @@ def plan_surfaces(
         raise InputError(f"height {height_m} m above {floor_m} m: give a height above zero (--wall-height, metres)")
     try:
         walls_m = walls_of_plan(source, resolution_m)
+        if isinstance(source, PlanGrid):
+            walls_m = at_inner_faces(walls_m, source)
         flat, faces = triangulated(floor_of(walls_m))
     except InputError as error:
         raise InputError(f"{name}: {error}") from None

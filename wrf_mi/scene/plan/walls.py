@@ -63,8 +63,9 @@ def find_walls(grid: PlanGrid) -> FloatArray:
         walls += pieces[len(runs) :]
         # The occupied cells that lie at these walls are explained.
         cells = shapely.points(left.centres_m(left.occupied))
-        lines = shapely.STRtree(shapely.linestrings(np.array(pieces)))
-        near = lines.query(cells, predicate="dwithin", distance=CLEARED_M)[0]
+        reach = [CLEARED_M + run.thick_m for run in (*runs, *tidy)]
+        lines = shapely.linestrings(np.array(pieces))
+        near = shapely.STRtree(cells).query(lines, predicate="dwithin", distance=reach)[1]
         occupied = left.occupied.copy()
         row, column = np.nonzero(occupied)
         occupied[row[near], column[near]] = False
