@@ -50,7 +50,8 @@ def register(model: Model) -> None:
 def known_model(name: str) -> Model:
     """The model of a name (InputError: there is none)."""
     if name not in MODELS:
-        raise InputError(f"model {name!r}: no such model; choose from {', '.join(MODELS)}")
+        remedy = f"choose from {', '.join(MODELS)}, or add yours by register or an entry point"
+        raise InputError(f"model {name!r}: no such model; {remedy} (docs/howto/extend.md)")
     return MODELS[name]
 
 
