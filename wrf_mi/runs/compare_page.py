@@ -108,7 +108,7 @@ def _section(section: Section) -> str:
 {_models(section.runs)}
 <h3>Scores</h3>
 <p class="note">{_text(TASKS[section.runs[0].task].label)}, {_better(section.runs[0])}. Click a heading to sort.
-Medians and differences of means may rank runs differently.</p>
+The median comes first here, the verdicts below are of differences of means: they may rank runs differently.</p>
 {_table(shown, section.scores, NUMERIC)}
 <h3>Paired differences</h3>
 <p class="note">Each run against its reference{_text(others)}, on the test rows that both have: mean difference per row,
@@ -202,7 +202,7 @@ def _class(key: str, numeric: frozenset[str]) -> str:
 
 def _cell(key: str, value: Any, numeric: frozenset[str]) -> str:
     """A value with four significant digits, empty where unknown; verdicts are coloured."""
-    if value is None:
+    if value is None or value != value:  # NaN: not stated by another program
         return f"<td{_class(key, numeric)}></td>"
     if key == "verdict":
         return f'<td class="{_text(str(value).partition(" ")[0])}">{_text(value)}</td>'
