@@ -139,7 +139,7 @@ def test_bad_input_is_refused_before_anything_starts(
     out = tmp_path / "sweep"
     for data, varied, message in (
         (folder, "seed=0,x", "--seed: invalid int value: 'x'"),
-        (folder, "model=wrf-gs,other", "--model: invalid choice: 'other'"),
+        (folder, "model=wrf-gs,other", "--model: model 'other': no such model"),
         (folder, "no.such=1", "unknown setting no.such"),
         (folder, "batch=1,0", "batch: 0 is out of range"),
         (folder, "split=official,blocked:9", "blocked"),

@@ -29,7 +29,7 @@ from ..core import AntennaOptions, InputError
 from ..core.digest import content_digest
 from ..core.files import one_line, readable, write_atomically, write_csv
 from ..datasets.registry import locate
-from ..models import known_model
+from ..models import MODELS
 from ..parallel import Scheduler, run_module
 from ..synthetic import load_record
 from ..tasks import TASKS
@@ -106,7 +106,7 @@ def plan_sweep(
     fixed = {setting.partition("=")[0].strip() for setting in settings} | set(options)
     choices = _choices(vary, fixed | {flag.removeprefix("--") for flag in flags})
     # A preset of all runs is that of the models that have some.
-    with_presets = {name for name in choices.get("model", ()) if known_model(name).presets}
+    with_presets = {name for name in choices.get("model", ()) if name in MODELS and MODELS[name].presets}
     runs: dict[str, SweepRun] = {}
     for chosen in itertools.product(*choices.values()):
         varied = dict(zip(choices, chosen, strict=True))
