@@ -25,7 +25,7 @@ def test_bad_arguments_are_refused(command: Command) -> None:
         ("predict run --tx a --input b --out c", "not allowed with argument"),
         ("evaluate", "nothing to score; give a run folder"),
         ("compare run", "required: --out"),
-        ("train x --model nerf3 --out y", "invalid choice: 'nerf3'"),
+        ("train x --model nerf3 --out y", "argument --model: model 'nerf3': no such model; choose from wrf-gs, "),
         ("train x --seed one --out y", "invalid int value: 'one'"),
         ("train x --n-train many --out y", "argument --n-train: 'many' is no number"),
         ("train x --preset slow --out y", "invalid choice: 'slow'"),

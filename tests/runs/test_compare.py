@@ -13,8 +13,9 @@ from commands import arrays_in, rows_of
 from matplotlib.figure import Figure
 from PIL import Image
 
-from wrf_mi.core import InputError
+from wrf_mi.core import InputError, Split
 from wrf_mi.core.files import write_figure
+from wrf_mi.datasets import save_split
 from wrf_mi.runs import figures
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.compare_tables import COLUMNS
@@ -47,6 +48,7 @@ def make_run(
         **{"ms_per_sample": 3.25, "train_seconds": 61.5 if trained else 0.0, "peak_memory_mb": 512.0},
     }
     (path / "metrics.json").write_text(json.dumps(metrics))
+    save_split(path / "split.npz", Split(split, seed, *(np.array(part, int) for part in ([1000], [], rows))))
     if trained:
         write_log(path)
     return path

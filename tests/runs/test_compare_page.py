@@ -19,12 +19,12 @@ from test_compare import captured, edit_metrics, make_run
 
 from wrf_mi.cli.main import build_parser
 from wrf_mi.cli.train import training_request
-from wrf_mi.core import Record
+from wrf_mi.core import Record, Split
 from wrf_mi.runs import figures
 from wrf_mi.runs.api import plan_run, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.compare_page import changed_settings, command
-from wrf_mi.runs.compare_tables import best_run, common, common_means, differences
+from wrf_mi.runs.compare_tables import OTHER_ROWS, best_run, common, common_means, differences, first_differences
 from wrf_mi.runs.folder import AntennaOptions, RunRequest, read_config, start_run
 from wrf_mi.runs.results import Results
 from wrf_mi.runs.run import open_run
@@ -40,6 +40,8 @@ def strengths(
     idw_db: float = 3.0,
     receivers: int = 1,
     path: Any = "",
+    positions_m: Any = None,
+    train: Any = (1000, 1001),
 ) -> Results:
     """Signal strengths with given absolute errors, [m] or [n_rx, m], and those of IDW."""
     rows = np.array(rows)
@@ -47,9 +49,12 @@ def strengths(
     prediction = truth + np.broadcast_to(error_db, truth.shape)
     block = {"median": 1.0, "mean": float(np.nanmean(np.abs(prediction - truth)))}
     metrics = {"abs_error_db": block, "split": "official", "model": name}
-    names, nowhere = tuple(f"anchor{k}" for k in range(receivers)), np.zeros((len(rows), 3))
+    names = tuple(f"anchor{k}" for k in range(receivers))
+    positions_m = np.zeros((len(rows), 3)) if positions_m is None else positions_m
     stated = (Path(path) / name, name, "rssi", "flat", metrics, seed, names)
-    return Results(*stated, rows, nowhere, prediction, truth, {"idw100": truth + idw_db}, None, None, {})
+    split = Split("official", seed, np.array(train, np.int64), np.zeros(0, np.int64), rows)
+    idw = {"idw100": truth + idw_db}
+    return Results(*stated, rows, positions_m, prediction, truth, idw, None, None, {}, [split])
 
 
 def verdicts(runs: list[Results]) -> dict[tuple[str, str], str]:
@@ -79,7 +84,7 @@ def test_differences_have_the_sign_of_the_score_and_the_rule_of_the_interval() -
 
 def test_only_rows_with_the_same_truth_and_both_predictions_are_compared() -> None:
     one, other = strengths("one", 1.0), strengths("other", 2.0, rows=range(30, 70))
-    assert [row for _, row in common([one, other])] == list(range(30, 40))
+    assert [row for _, row in common([one, strengths("equal", 2.0, rows=range(30, 70))])] == list(range(30, 40))
     other.truth[0, 0] = 7.0  # row 30 is another measurement
     other.truth[0, 1] = np.nan  # row 31 was not received
     shared = [row for _, row in common([one, other])]
@@ -89,6 +94,43 @@ def test_only_rows_with_the_same_truth_and_both_predictions_are_compared() -> No
     apart = strengths("apart", 2.0, rows=range(90, 99))
     assert common_means([one, apart]) == {}
     assert verdicts([one, apart])["apart", "one"] == "too few rows"
+
+
+def test_runs_of_other_training_rows_have_no_verdict() -> None:
+    good, bad, few = strengths("good", 1.0), strengths("bad", 2.0), strengths("few", 3.0, train=[1000])
+    found = verdicts([good, bad, few])
+    assert found["bad", "good"] == "worse"
+    assert (found["few", "good"], found["bad", "few"]) == (OTHER_ROWS, OTHER_ROWS)
+    assert found["few", "IDW of 100 nearest"] == "tie"  # the reference of the same training rows
+    assert all(gain.low is None for gain in differences([good, bad, few]) if gain.verdict == OTHER_ROWS)
+
+
+def test_all_pairs_follow_those_of_the_best_run() -> None:
+    runs = [strengths(name, error) for name, error in (("c", 3.0), ("a", 1.0), ("b", 2.0), ("d", 4.0))]
+    gains = differences(runs)
+    reference = "IDW of 100 nearest"
+    first = [("c", "a"), ("c", reference), ("a", reference), ("b", "a"), ("b", reference), ("d", "a"), ("d", reference)]
+    assert [(gain.run, gain.against) for gain in first_differences(runs, gains)] == first
+    others = {(gain.run, gain.against): gain.verdict for gain in gains[len(first) :]}
+    assert others == {("c", "b"): "worse", ("c", "d"): "better", ("b", "d"): "better"}
+
+
+def test_intervals_of_rows_along_a_path_are_those_of_its_stretches() -> None:
+    """The standard error of a mean is that of 20 independent stretches of 10 equal rows, in any order of the rows."""
+    rng, rows = np.random.default_rng(0), np.arange(200)
+    stretch = rng.permutation(20)
+    error, x_m = np.repeat(rng.uniform(1, 3, 20), 10), 10.0 * np.repeat(stretch, 10) + np.tile(np.arange(10), 20) / 10
+    place_m = np.stack([x_m, 0 * x_m, 0 * x_m], axis=1)
+    expected = 2 * 1.96 * np.std(error[::10]) / np.sqrt(20)
+    orders = rows, rng.permutation(rows)
+    widths = []
+    for order in orders:
+        gain = differences([strengths("walk", error[order], rows, idw_db=2.0, positions_m=place_m[order])])[0]
+        assert gain.blocks == 20
+        widths.append(gain.high - gain.low)
+    assert widths == pytest.approx([expected] * 2, rel=0.1)  # 2,000 resamples: 3 % of a quantile
+    unknown = differences([strengths("walk", error, rows, idw_db=2.0, positions_m=place_m * np.nan)])[0]
+    assert unknown.high - unknown.low == pytest.approx(expected, rel=0.1)
 
 
 def test_receivers_of_a_row_count_as_one_observation() -> None:

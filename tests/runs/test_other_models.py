@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import shlex
+from html import unescape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from commands import rows_of
 
 from wrf_mi import InputError, Record, compare, load, make_splits, open_run, score_predictions, train
 from wrf_mi.cli.main import main
+from wrf_mi.cli.output import show_metrics
 from wrf_mi.core.files import write_csv
-from wrf_mi.runs.compare_tables import TIE, differences
+from wrf_mi.runs.compare_tables import OTHER_ROWS, TIE, differences
 from wrf_mi.runs.results import read_runs
 
 
@@ -27,6 +31,7 @@ def predicted(run: Path) -> dict[str, Any]:
         return dict(arrays)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_predictions_of_a_run_have_its_scores_under_another_name(flat: tuple[Record, Path], tmp_path: Path) -> None:
     record, run = flat
     own = open_run(run).metrics
@@ -35,9 +40,34 @@ def test_predictions_of_a_run_have_its_scores_under_another_name(flat: tuple[Rec
         assert copied.metrics[key] == own[key], key
     assert np.isnan(copied.metrics["train_seconds"])
     page = compare([run, copied.folder], tmp_path / "compare")
-    assert "my NeRF" in page.read_text()
+    text = unescape(page.read_text())
+    assert "my NeRF" in text
+    assert "training rows as stated by their author" in text
+    command = next(line for line in text.splitlines() if line.startswith("wrf-mi evaluate"))
+    again = shlex.split(command.replace("<pre>", ""))[1:-1]
+    assert main([*again, str(tmp_path / "again")]) == 0
+    assert read_config_text(tmp_path / "again") == read_config_text(copied.folder)
+    table = {row["run"]: row for row in rows_of(tmp_path / "compare" / "compare.csv")}
+    constant = table["mean of each receiver's training rows, official"]
+    assert float(constant["median"]) == own["constant"]["median"]
     between = [each for each in differences(read_runs([run, copied.folder])) if each.against == "kriging"]
     assert {(each.difference, each.verdict) for each in between} == {(0.0, TIE)}
+
+
+def read_config_text(folder: Path) -> str:
+    return (folder / "config.yaml").read_text()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_other_numbers_of_training_rows_are_not_compared(flat: tuple[Record, Path], tmp_path: Path) -> None:
+    record, run = flat
+    file = run / "predictions.npz"
+    fewer = score_predictions(record.source, file, tmp_path / "fewer", "fewer", n_train=0.5, seed=3)
+    page = compare([run, fewer.folder], tmp_path / "compare").read_text()
+    assert OTHER_ROWS in page
+    assert "--n-train 0.5 --seed 3" in page
+    gains = {(gain.run, gain.against): gain for gain in differences(read_runs([run, fewer.folder]))}
+    assert {gain.verdict for names, gain in gains.items() if set(names) == {"kriging", "fewer"}} == {OTHER_ROWS}
 
 
 @pytest.mark.parametrize("by", ["rows", "positions", "csv"])
@@ -57,13 +87,21 @@ def test_rows_are_found_by_number_or_position_in_any_order(by: str, flat: tuple[
     assert np.isnan(other["train_seconds"]) if by == "csv" else other["train_seconds"] == 7
 
 
-def test_folds_are_pooled(flat: tuple[Record, Path], tmp_path: Path) -> None:
+@pytest.mark.usefixtures("undrawn")
+def test_folds_are_pooled(flat: tuple[Record, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record, _ = flat
     file = tmp_path / "all.npz"
     np.savez(file, prediction=record.observation + 1, row=np.arange(len(record)))
-    metrics = score_predictions(record.source, file, tmp_path / "run", "one off", split="blocked").metrics
+    run = score_predictions(record.source, file, tmp_path / "run", "one off", split="blocked")
+    metrics, splits = run.metrics, make_splits(record, "blocked")
+    counts = [len(split.all_train) for split in splits]
+    assert metrics["n_train_of_folds"] == counts
+    in_words = f"{len(counts)} folds of {min(counts)} to {max(counts)} training rows"
+    assert in_words in compare([run.folder], tmp_path / "compare").read_text()
+    show_metrics(metrics, run.folder, as_json=False)
+    assert f"split blocked, {in_words}" in capsys.readouterr().out
     assert metrics["abs_error_db"]["median"] == pytest.approx(1, abs=1e-5)
-    assert metrics["n_test"] == sum(len(split.test) for split in make_splits(record, "blocked"))
+    assert metrics["n_test"] == sum(len(split.test) for split in splits)
 
 
 def damaged(**changes: Any) -> Any:

@@ -66,6 +66,17 @@ def test_bad_plans_are_refused(vary: list[str], message: str, tmp_path: Path) ->
         plan_sweep(tmp_path, vary, {"dataset": "x", "model": "wrf-gs"}, ["steps=3"], ["--deterministic"])
 
 
+def test_a_preset_is_that_of_the_models_that_have_some(tmp_path: Path) -> None:
+    fast = {"dataset": "x", "preset": "fast"}
+    plan = plan_sweep(tmp_path, ["model=kriging,wrf-gs+"], fast)
+    assert [" ".join(run.arguments) for run in plan.runs] == [
+        "train x --model kriging",
+        "train x --preset fast --model wrf-gs+",
+    ]
+    # No run has it, which train refuses.
+    assert all("--preset" in run.arguments for run in plan_sweep(tmp_path, ["model=kriging,idw"], fast).runs)
+
+
 def test_every_option_of_train_may_vary(tmp_path: Path) -> None:
     assert set(training_names()) == {*OPTIONS, *FLAGS, "set"}
     plan = plan_sweep(tmp_path, ["intervals=true,false", "phase-error=0,1"], {"dataset": "x"})
@@ -128,7 +139,7 @@ def test_bad_input_is_refused_before_anything_starts(
     out = tmp_path / "sweep"
     for data, varied, message in (
         (folder, "seed=0,x", "--seed: invalid int value: 'x'"),
-        (folder, "model=wrf-gs,other", "--model: invalid choice: 'other'"),
+        (folder, "model=wrf-gs,other", "--model: model 'other': no such model"),
         (folder, "no.such=1", "unknown setting no.such"),
         (folder, "batch=1,0", "batch: 0 is out of range"),
         (folder, "split=official,blocked:9", "blocked"),

@@ -11,7 +11,7 @@ from typing import Any, NoReturn, get_args
 from ..core import AntennaOptions, InputError
 from ..core.antenna import FRAMES, OMNIDIRECTIONAL, PATTERNS, POLARIZATIONS
 from ..graph.settings import EvaluationName
-from ..models import MODELS
+from ..models import MODELS, no_model
 
 Arguments = argparse.Namespace
 
@@ -46,7 +46,12 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     """Add data set, model, split and settings."""
     add = parser.add_argument
     add("dataset", nargs="?", metavar="DATASET", help=DATASET)
-    add("--model", choices=list(MODELS), help="model to fit (default: hybrid); baselines: docs/models.md")
+    add(
+        "--model",
+        type=_model_name,
+        choices=list(MODELS),
+        help="model to fit (default: hybrid); baselines: docs/models.md",
+    )
     text = "stages of the hybrid that may be used, from mean,calibration,correction,surfaces,field,residual"
     add("--stages", metavar="LIST", help=f"{text} (default: all that the data allow)")
     text = "scene to trace: for hybrid, beside wrf-gs, wrf-gs+, factorised and r2f2, or alone for ray-tracing"
@@ -82,6 +87,12 @@ def add_run(parser: argparse.ArgumentParser) -> None:
     add("--min-rows", type=int, metavar="N", help=text)
     text = "calibrate predicted standard deviations on training rows held out in space (one more fit)"
     add("--intervals", action="store_true", help=text)
+
+
+def _model_name(name: str) -> str:
+    if name not in MODELS:
+        raise argparse.ArgumentTypeError(str(no_model(name)))
+    return name
 
 
 def add_tracing(parser: argparse.ArgumentParser) -> None:

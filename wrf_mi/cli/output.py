@@ -46,7 +46,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     """Print the content of ``metrics.json`` as a table or as JSON, and the run folder; the exit status."""
     if as_json:
         return show(as_json, metrics, "")
-    from ..runs.results import unbeaten
+    from ..runs.results import rows_of_folds, unbeaten
     from ..tasks import TASKS
 
     task = TASKS[metrics["task"]]
@@ -65,11 +65,14 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     costs |= {"peak_memory_mb": "peak memory {:.0f} MB"}
     # Models of other programs need not state theirs.
     known = [form.format(metrics[key]) for key, form in costs.items() if math.isfinite(metrics[key])]
-    print(", ".join([f"split {metrics['split']}", f"{metrics['n_train']} training rows", *known]))
-    if folds := metrics.get("cross_validated"):
+    of_folds, folds = rows_of_folds(metrics.get("n_train_of_folds", ())), metrics.get("cross_validated")
+    # With the split "none" the model is fitted to all rows.
+    rows = of_folds if of_folds and not folds else f"{metrics['n_train']} training rows"
+    print(", ".join([f"split {metrics['split']}", rows, *known]))
+    if folds:
         print(
             f"scores are cross-validated: each row is predicted by a fit to the other {folds['folds'] - 1} of "
-            f"{folds['folds']} folds; the model is fitted to all rows"
+            f"{of_folds or str(folds['folds']) + ' folds'}; the model is fitted to all rows"
         )
     if line := unbeaten(metrics):
         print(line)

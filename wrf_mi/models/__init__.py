@@ -47,10 +47,16 @@ def register(model: Model) -> None:
     MODELS.add(model.name, model)
 
 
+def no_model(name: str) -> InputError:
+    """Error of a name that no model has."""
+    remedy = f"choose from {', '.join(MODELS)}, or add yours by wrf_mi.models.register or an entry point"
+    return InputError(f"model {name!r}: no such model; {remedy} (docs/howto/extend.md)")
+
+
 def known_model(name: str) -> Model:
     """The model of a name (InputError: there is none)."""
     if name not in MODELS:
-        raise InputError(f"model {name!r}: no such model; choose from {', '.join(MODELS)}")
+        raise no_model(name)
     return MODELS[name]
 
 

@@ -36,7 +36,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
 
     Runs on the same data set are compared on the same test rows, with their references (`wrf_mi.tasks.TASKS`). Writes
     into ``out``, whole or not at all: ``compare.csv``, one row per run and reference; ``differences.csv``, paired
-    differences of each run and the best one, and its reference, on common rows; for each data set pictures
+    differences of each run and its reference and of all pairs of runs, on common rows; for each data set pictures
     ``<data set>-*.png`` of score distributions (``cdf``), ``samples`` with the truth beside each prediction, ``time``
     against error, where positions are known ``errors`` over them and the ``best`` run at each, ``scene`` if one was
     traced and ``training`` if one was trained; and ``index.html``, one file with all of it that needs no network.

@@ -19,15 +19,29 @@ from PIL import Image
 
 from ..core import AntennaOptions
 from ..core.settings import flat
+from ..core.yaml_files import read_yaml
 from ..datasets.registry import KNOWN
 from ..models.model import default_settings
 from ..tasks import TASKS
-from .compare_tables import BETTER, COLUMNS, DIFFERENCES, WORSE, Difference, best_run, common, difference_rows
-from .folder import RunConfig, known_config, stored_versions
+from .compare_tables import (
+    BETTER,
+    COLUMNS,
+    DIFFERENCES,
+    OTHER_ROWS,
+    WORSE,
+    Difference,
+    best_run,
+    common,
+    difference_rows,
+    first_differences,
+)
+from .folder import CONFIG, RunConfig, known_config, stored_versions
 from .results import Results
 
 NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
+PREDICTIONS = "predictions"  # key in ``metrics.json`` of the file of another program
 CONSTANT = ("dataset", "metric")  # columns that are equal in a section, whose heading states them
+MOST_RUNS = 8  # largest number of runs of which the page lists all pairs
 FIRST = ("run", "median", "mean", "common_mean")  # columns that narrow screens show without scrolling
 
 
@@ -78,25 +92,30 @@ def page(sections: Sequence[Section], folder: Path) -> str:
 
 def _section(section: Section) -> str:
     shown = {key: COLUMNS[key] for key in dict.fromkeys((*FIRST, *COLUMNS)) if key not in CONSTANT}
-    gains = _table(DIFFERENCES, difference_rows(section.differences), frozenset(("rows", "difference", "low", "high")))
+    listed, words = section.differences, ""
+    if len(section.runs) > MOST_RUNS:
+        listed, words = first_differences(section.runs, listed), " Further pairs are in differences.csv."
+    gains = _table(DIFFERENCES, difference_rows(listed), frozenset(("rows", "blocks", "difference", "low", "high")))
     images = "\n".join(_image(path, title) for path, title in section.pictures)
     best = best_run(section.runs).name
-    configs = [(run, known_config(run.path)) for run in section.runs]
-    lines = [f"# {run.name}: config.yaml is missing" if c is None else command(c, run.path) for run, c in configs]
-    rival = f"the best run by mean score on common rows, {best}, and against " if len(section.runs) > 1 else ""
+    lines = [_command(run) for run in section.runs]
+    others = f" and the best run by mean score on common rows, {best}; then all other pairs"
+    others = others if len(section.runs) > 1 else ""
     return f"""
 <h2 id="{_text(section.slug)}">{_text(section.title)}</h2>
 {_facts(section.runs)}
 <h3>Models</h3>
 {_models(section.runs)}
 <h3>Scores</h3>
-<p class="note">{_text(TASKS[section.runs[0].task].label)}, {_better(section.runs[0])}. Click a heading to sort.</p>
+<p class="note">{_text(TASKS[section.runs[0].task].label)}, {_better(section.runs[0])}. Click a heading to sort.
+The median comes first here, the verdicts below are of differences of means: they may rank runs differently.</p>
 {_table(shown, section.scores, NUMERIC)}
 <h3>Paired differences</h3>
-<p class="note">Each run against {_text(rival)}its reference, on the test rows that both have: mean difference per row,
-positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of rows. {BETTER} and {WORSE}: the
-interval excludes zero, in all seeds; else a tie. Rows along a path resemble each other, and the interval is then too
-narrow.</p>
+<p class="note">Each run against its reference{_text(others)}, on the test rows that both have: mean difference per row,
+positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of blocks of rows: clusters of their
+positions, since near rows resemble each other, or else stretches of consecutive rows. {BETTER} and {WORSE}: the
+interval excludes zero, in all seeds; else a tie. {OTHER_ROWS}: differences would be those of the training
+rows.{words}</p>
 {gains}
 {images}
 <h3>Commands</h3>
@@ -112,11 +131,12 @@ def _facts(runs: Sequence[Results]) -> str:
     first, task = runs[0], TASKS[runs[0].task]
     origins = {known.name: f" ({known.licence}; {known.origin})" for known in KNOWN}
     origin = (first.dataset or "unknown") + origins.get(first.dataset, "")
-    form = "{split}: {n_train} training rows, {n_test} test rows"
     receivers = f"{len(first.receivers)} receiver{'s' if len(first.receivers) > 1 else ''}"
     facts = {"data": origin, "task": f"{task.heading}, {receivers}"}
     facts["score"] = f"{task.label}, {_better(first)}. {task.note}"
-    facts["rows"] = _distinct(form.format_map(run.metrics) for run in runs)
+    facts["rows"] = _distinct(
+        f"{run.metrics['split']}: {run.training_rows}, {run.metrics['n_test']} test rows" for run in runs
+    )
     if len(runs) > 1:
         count = len({row for _, row in common(runs)})
         text = "; pairs are compared on the rows that both have" if count else ", so means differ in rows"
@@ -143,7 +163,10 @@ def _models(runs: Sequence[Results]) -> str:
     for run in runs:
         config = known_config(run.path)
         if config is None:
-            rows.append({"run": run.name, "model": run.metrics["model"], "settings": "not stored", "scene": None})
+            outside = PREDICTIONS in run.metrics
+            settings = "predictions of another program; training rows as stated by their author" if outside else None
+            row = {"run": run.name, "model": run.metrics["model"], "settings": settings or "not stored"}
+            rows.append(row)
             continue
         changed = ", ".join(f"{name}={value}" for name, value in changed_settings(config).items())
         described = config.entry.described(config.scene is not None)
@@ -179,7 +202,7 @@ def _class(key: str, numeric: frozenset[str]) -> str:
 
 def _cell(key: str, value: Any, numeric: frozenset[str]) -> str:
     """A value with four significant digits, empty where unknown; verdicts are coloured."""
-    if value is None:
+    if value is None or value != value:  # NaN: not stated by another program
         return f"<td{_class(key, numeric)}></td>"
     if key == "verdict":
         return f'<td class="{_text(str(value).partition(" ")[0])}">{_text(value)}</td>'
@@ -220,6 +243,20 @@ def _options(config: RunConfig) -> dict[str, Any]:
         if name in config.entry.train_arguments and getattr(config.settings, name) != getattr(standard, name):
             options[option] = getattr(config.settings, name)
     return options | {"seed": config.seed or None}
+
+
+def _command(run: Results) -> str:
+    """The line that repeats a run, or a comment on what is missing for it."""
+    config, metrics = known_config(run.path), run.metrics
+    if config is not None:
+        return command(config, run.path)
+    if PREDICTIONS not in metrics:
+        return f"# {run.name}: {CONFIG} is missing, or of a model that this version lacks"
+    stated = read_yaml(run.path / CONFIG) if (run.path / CONFIG).exists() else {}
+    options = {"predictions": metrics[PREDICTIONS], "dataset": metrics["dataset"], "name": metrics["model"]}
+    options |= {"split": metrics["split"], "n-train": stated.get("n_train"), "seed": run.seed or None}
+    words = [word for key, value in options.items() if value is not None for word in (f"--{key}", str(value))]
+    return shlex.join(["wrf-mi", "evaluate", *words, "--out", str(run.path)])
 
 
 def command(config: RunConfig, folder: Path) -> str:

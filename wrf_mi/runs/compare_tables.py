@@ -4,28 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cache, lru_cache
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 from ..tasks import TASKS
-from ..tasks.scores import bootstrap
+from ..tasks.scores import block_bootstrap
+from ..training.selection import clusters
 from .folder import known_config
-from .results import Results
+from .results import CONSTANT, Results
 
 COLUMNS = {"run": "run", "model": "model", "dataset": "data set", "split": "split", "seed": "seed"}
-COLUMNS |= {"n_train": "training rows", "n_test": "test rows", "metric": "score"}
+COLUMNS |= {"n_train": "training rows (mean of folds)", "n_test": "test rows", "metric": "score"}
 COLUMNS |= {key: key for key in ("median", "mean", "p10", "p90")} | {"common_mean": "mean, common rows"}
 COLUMNS |= {"inside_90": "inside 90 %", "crps": "CRPS", "ms_per_sample": "ms per sample"}
 COLUMNS |= {"train_seconds": "training (s)", "peak_memory_mb": "peak memory (MB)"}
 """Columns of ``compare.csv`` and their headings on the page."""
 DIFFERENCES = {key: key for key in ("run", "against", "verdict", "difference")}
-DIFFERENCES |= {"low": "95 % from", "high": "to", "rows": "common rows"}
+DIFFERENCES |= {"low": "95 % from", "high": "to", "rows": "common rows", "blocks": "blocks"}
 """Columns of ``differences.csv`` and their headings on the page; positive differences are in favour of the run."""
 BETTER, TIE, WORSE, SAME, FEW = "better", "tie", "worse", "another seed", "too few rows"
+OTHER_ROWS, UNKNOWN_ROWS = "not comparable: trained on other rows", "not comparable: training rows are not stored"
 FEWEST = 2  # least number of common rows of a difference with an interval
+MOST_BLOCKS, ROWS_OF_BLOCK, LEAST_BLOCKS = 20, 5, 10
+"""Blocks of the bootstrap: one of five rows, twenty at most; ten, or each row, where rows are few, since percentile
+intervals of fewer blocks are too narrow."""
 
 
 @dataclass(frozen=True)
@@ -35,24 +43,20 @@ class Difference:
     run: str  # name of the run
     against: str  # name of the other run or of the reference
     rows: int  # number of common rows
-    verdict: str  # `BETTER`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`
-    # difference, low, high: mean difference of the score per row with its 95 % interval; None: too few rows
+    verdict: str  # `BETTER`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`, `OTHER_ROWS`, `UNKNOWN_ROWS`
+    # difference, low, high: mean difference of the score per row with its 95 % interval; None: too few rows, or not
+    # comparable
     difference: float | None = None
     low: float | None = None
     high: float | None = None
+    blocks: int | None = None  # number of blocks of rows that are resampled
     seeds: int = 1  # number of seeds of which the verdict is
 
 
 def common(runs: Sequence[Results]) -> list[tuple[str, int]]:
     """Receiver and row of the observations that all runs score, with the same truth."""
-    first, rows = runs[0], [run.scored for run in runs]
-
-    def same(key: tuple[str, int]) -> bool:
-        truth = first.truth[rows[0][key]]
-        others = zip(runs[1:], rows[1:], strict=True)
-        return all(key in of and np.array_equal(run.truth[of[key]], truth, equal_nan=True) for run, of in others)
-
-    return [key for key in rows[0] if same(key)]
+    first, *others = (run.truth_digests for run in runs)
+    return [key for key, digest in first.items() if all(other.get(key) == digest for other in others)]
 
 
 def common_means(runs: Sequence[Results]) -> dict[str, float]:
@@ -69,66 +73,112 @@ def best_run(runs: Sequence[Results]) -> Results:
 
 
 def differences(runs: Sequence[Results]) -> list[Difference]:
-    """Each run against its reference and, of several runs, against the best one.
+    """Each run against the best one, of several runs, and against its reference; then all other pairs of runs.
 
-    "Better" and "worse": the 95 % interval of the difference, resampled over test rows, excludes zero in all seeds; all
-    else is a tie. Runs that differ in their seed alone are seeds of one method.
+    "Better" and "worse": the 95 % interval of the difference, of resampled blocks of test rows, excludes zero in all
+    seeds; all else is a tie. Runs that differ in their seed alone are seeds of one method; methods are compared by runs
+    of the same seed. Runs that predict the common rows from other training rows are not comparable.
     """
-    best, methods = best_run(runs), {run.name: _method(run) for run in runs}
+    best, methods, by_name = best_run(runs), {run.name: _method(run) for run in runs}, {run.name: run for run in runs}
 
     def seeds_of(run: Results) -> list[Results]:
         return [other for other in runs if methods[other.name] == methods[run.name]]
 
-    def to_best(run: Results) -> tuple[str, FloatArray]:
-        rival = next((other for other in seeds_of(best) if other.seed == run.seed), best)
-        return rival.name, _paired(run, rival)
+    @cache  # of several seeds each pair is in the verdict of each
+    def pair(run: str, other: str, is_method: bool) -> Difference:
+        return _of_pair(by_name[run], by_name[other], is_method)
+
+    def between(run: Results, other: Results) -> Difference:
+        if methods[run.name] == methods[other.name]:
+            return replace(pair(run.name, other.name, False), verdict=SAME)
+
+        def to_rival(seed: Results) -> Difference:
+            rival = next((each for each in seeds_of(other) if each.seed == seed.seed), other)
+            return pair(seed.name, rival.name, True)
+
+        return _of_seeds(run, seeds_of(run), to_rival)
 
     of_runs: list[Difference] = []
     for run in runs:
-        if run is not best and methods[run.name] == methods[best.name]:
-            of_runs.append(replace(_of_rows(run, best.name, _paired(run, best)), verdict=SAME))
-        elif run is not best:
-            of_runs.append(_of_seeds(run, seeds_of(run), to_best))
+        of_runs += [between(run, best)] if run is not best else []
         of_runs.append(_of_seeds(run, seeds_of(run), _to_reference))
+    listed = {frozenset((gain.run, gain.against)) for gain in of_runs}
+    for run, other in combinations(runs, 2):
+        gain = between(run, other)
+        of_runs += [gain] if (names := frozenset((gain.run, gain.against))) not in listed else []
+        listed.add(names)
     return of_runs
 
 
-def _of_seeds(
-    run: Results, seeds: Sequence[Results], paired: Callable[[Results], tuple[str, FloatArray]]
-) -> Difference:
-    by_run = {seed.name: _of_rows(seed, *paired(seed)) for seed in seeds}
-    words = {seed.verdict for seed in by_run.values()}
-    return replace(by_run[run.name], verdict=words.pop() if len(words) == 1 else TIE, seeds=len(seeds))
+def first_differences(runs: Sequence[Results], gains: Sequence[Difference]) -> Sequence[Difference]:
+    """Of `differences` those against the best run and the references."""
+    return gains[: 2 * len(runs) - 1]
 
 
-def _of_rows(run: Results, against: str, rows: FloatArray) -> Difference:
-    """Difference from the differences of rows, in favour of the run where positive."""
-    if len(rows) < FEWEST:
-        return Difference(run.name, against, len(rows), FEW)
-    interval = bootstrap(rows, statistic=np.mean)
-    verdict = BETTER if interval.low > 0 else WORSE if interval.high < 0 else TIE
-    return Difference(run.name, against, len(rows), verdict, interval.value, interval.low, interval.high)
+def _of_seeds(run: Results, seeds: Sequence[Results], against: Callable[[Results], Difference]) -> Difference:
+    by_run = {seed.name: against(seed) for seed in seeds}
+    words = {gain.verdict for gain in by_run.values() if gain.difference is not None}
+    gain = by_run[run.name]
+    if gain.difference is None:
+        return gain
+    compared = sum(each.difference is not None for each in by_run.values())
+    return replace(gain, verdict=words.pop() if len(words) == 1 else TIE, seeds=compared)
 
 
-def _paired(run: Results, other: Results) -> FloatArray:
+def _of_pair(run: Results, other: Results, is_method: bool) -> Difference:
+    """Difference of two runs on common rows; without a value where methods have other training rows."""
     keys = common([run, other])
+    rows = [row for _, row in keys]
+    trained = [(run.training_digests.get(key), other.training_digests.get(key)) for key in keys]
+    if is_method and any(one != another or one is None for one, another in trained):
+        unknown = any(None in pair for pair in trained)
+        return Difference(run.name, other.name, len(set(rows)), UNKNOWN_ROWS if unknown else OTHER_ROWS)
     change = [run.score[run.scored[key]] - other.score[other.scored[key]] for key in keys]
-    return _per_row(run, [row for _, row in keys], change)
+    return _of_rows(run, other.name, rows, change)
 
 
-def _to_reference(run: Results) -> tuple[str, FloatArray]:
+def _to_reference(run: Results) -> Difference:
+    """Difference of a run and its reference, which has the same training rows."""
     known = np.argwhere(np.isfinite(run.score) & np.isfinite(run.reference_score))
     change = [run.score[r, m] - run.reference_score[r, m] for r, m in known]
-    return run.reference_name, _per_row(run, run.row[known[:, 1]].tolist(), change)
+    return _of_rows(run, run.reference_name, run.row[known[:, 1]].tolist(), change)
 
 
-def _per_row(run: Results, row: Sequence[int], change: Sequence[Any]) -> FloatArray:
-    """Mean over the receivers of each row, since what they observe is not independent; positive is better."""
-    if not len(row):
-        return np.zeros(0)
-    _, which = np.unique(row, return_inverse=True)
+def _of_rows(run: Results, against: str, row: Sequence[int], change: Sequence[Any]) -> Difference:
+    """Difference from those of observations, given their rows; in favour of the run where positive."""
+    rows, which = np.unique(np.asarray(row, int), return_inverse=True)
+    if len(rows) < FEWEST:
+        return Difference(run.name, against, len(rows), FEW)
+    # Mean over the receivers of each row, since what they observe is not independent.
     means = np.bincount(which, np.asarray(change, float)) / np.bincount(which)
-    return np.asarray(means if TASKS[run.task].higher_is_better else -means)
+    place = {row: m for m, row in enumerate(run.row.tolist())}
+    tx_pos_m = run.tx_pos_m[[place[row] for row in rows.tolist()]]
+    blocks = row_blocks(tx_pos_m)
+    interval = block_bootstrap(means if TASKS[run.task].higher_is_better else -means, blocks)
+    verdict = BETTER if interval.low > 0 else WORSE if interval.high < 0 else TIE
+    stated = interval.value, interval.low, interval.high, len(np.unique(blocks))
+    return Difference(run.name, against, len(rows), verdict, *stated)
+
+
+def row_blocks(tx_pos_m: FloatArray) -> IntArray:
+    """Number of the block of each row [n] for `block_bootstrap`: k-means clusters of the positions [n, 3].
+
+    Rows whose positions are not all known, or all the same, fall into stretches of consecutive rows.
+    """
+    return _row_blocks(np.asarray(tx_pos_m, float).tobytes())
+
+
+@lru_cache(maxsize=64)  # most pairs of runs have the same rows
+def _row_blocks(stored_m: bytes) -> IntArray:
+    tx_pos_m = np.frombuffer(stored_m).reshape(-1, 3)
+    n = len(tx_pos_m)
+    count = min(MOST_BLOCKS, max(n // ROWS_OF_BLOCK, min(n, LEAST_BLOCKS)))
+    distinct, place = np.unique(tx_pos_m, axis=0, return_inverse=True)
+    if np.isfinite(distinct).all() and len(distinct) > 1:
+        few = len(distinct) <= count
+        labels = np.arange(len(distinct)) if few else clusters(distinct, count, np.random.default_rng(0))
+        return np.asarray(labels[place.reshape(-1)], np.int64)
+    return np.arange(n) * count // n
 
 
 def _method(run: Results) -> Any:
@@ -153,8 +203,21 @@ def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
     for name, (run, key) in references(runs).items():
         counts = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
         rows.append(counts | run.metrics["reference"][key] | {"run": name, "model": key})
+    rows += _constants(runs)
     shared = {"dataset": Path(runs[0].dataset).name or runs[0].dataset, "metric": task.label}
     return [{column: (row | shared).get(column) for column in COLUMNS} for row in rows]
+
+
+def _constants(runs: Sequence[Results]) -> list[dict[str, Any]]:
+    """Rows of the constant prediction (`wrf_mi.tasks.Task.constant`), once for runs with the same scores of it."""
+    by_name: dict[str, dict[str, Any]] = {}
+    for run in (run for run in runs if CONSTANT in run.metrics):
+        shown = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
+        shown |= {key: run.metrics[CONSTANT][key] for key in ("median", "mean", "p10", "p90")} | {"model": CONSTANT}
+        if shown not in by_name.values():
+            name = f"{TASKS[run.task].constant_words.removeprefix('the ')}, {run.metrics['split']}"
+            by_name[f"{name} of {run.name}" if name in by_name else name] = shown
+    return [{"run": name} | shown for name, shown in by_name.items()]
 
 
 def difference_rows(differences: Sequence[Difference]) -> list[dict[str, Any]]:

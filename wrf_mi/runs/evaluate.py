@@ -44,6 +44,7 @@ NOT_SCORED = "n_not_scored"
 FEW = "receivers_with_few_rows"
 """Key of the receivers with fewer than `FEW_ROWS` training rows, each with its number of them."""
 PLACES = "receiver_places"  # key of positions that were estimated, with their standard deviations, metres
+N_TRAIN_OF_FOLDS = "n_train_of_folds"  # key of the numbers of training rows of the folds that the scores are of
 LEFT_OUT = "receivers_left_out"
 """Key of the receivers that have too few training rows to be fitted, each with its number of them."""
 CROSS_VALIDATED = "cross_validated"
@@ -178,7 +179,7 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
 def pool(parts: Sequence[Scores]) -> Scores:
     """Metrics and predictions of several folds together: every row's score counts once.
 
-    ``n_train`` is the mean over the folds, ``ms_per_sample`` the median.
+    ``n_train`` is the mean over the folds, ``n_train_of_folds`` lists them; ``ms_per_sample`` is the median.
     """
     blocks, every = zip(*parts, strict=True)
     arrays = {
@@ -192,6 +193,7 @@ def pool(parts: Sequence[Scores]) -> Scores:
         NOT_SCORED: sum(m[NOT_SCORED] for m in blocks),
         **({FEW: few} if few else {}),
         "n_train": round(float(np.mean([m["n_train"] for m in blocks]))),
+        N_TRAIN_OF_FOLDS: [m["n_train"] for m in blocks],
         "ms_per_sample": float(np.median([m["ms_per_sample"] for m in blocks])),
     }
     return metrics, arrays

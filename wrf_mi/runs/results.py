@@ -17,10 +17,11 @@ from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays
 from ..core.files import readable
 from ..core.types import IntArray
+from ..datasets import load_split
 from ..tasks import TASKS, Task
 from ..tasks.scores import summary
 from ..training.checkpoint import LOG
-from .folder import METRICS, PREDICTIONS, check_format
+from .folder import METRICS, PREDICTIONS, SPLIT, check_format, run_parts
 
 Observations = NDArray[np.float32] | NDArray[np.complex64]
 """Grey values, powers in dBm or channel coefficients (`wrf_mi.core.Record`)."""
@@ -62,6 +63,7 @@ class Results:
     reception: NDArray[np.float32] | None
     # pairs (seconds, score on validation rows while they were held out) by name of the fold, "" without folds
     validation: dict[str, list[tuple[float, float]]]
+    splits: Sequence[Split] = ()  # splits with test rows, one or those of the folds; empty: not stored
 
     @cached_property
     def score(self) -> FloatArray:
@@ -73,6 +75,27 @@ class Results:
         """Receiver and column in `score` of each observation that is scored, by the receiver's name and the row."""
         known = np.argwhere(np.isfinite(self.score))
         return {(self.receivers[r], int(self.row[m])): (int(r), int(m)) for r, m in known}
+
+    @cached_property
+    def truth_digests(self) -> dict[tuple[str, int], int]:
+        """Digest of the truth of each observation that is scored, by the receiver's name and the row."""
+        return {key: hash(self.truth[place].tobytes()) for key, place in self.scored.items()}
+
+    @cached_property
+    def training_digests(self) -> dict[tuple[str, int], int]:
+        """Digest of the training rows behind each test observation's prediction, by the receiver's name and the row."""
+        digests: dict[tuple[str, int], int] = {}
+        for split in self.splits:
+            digest = hash((split.all_train.tobytes(), split.held_receivers, split.left.tobytes()))
+            names = [self.receivers[r] for r in split.held_receivers or range(len(self.receivers))]
+            digests |= {(name, row): digest for name in names for row in split.test.tolist()}
+        return digests
+
+    @property
+    def training_rows(self) -> str:
+        """Number of training rows in words, of each fold where there are several."""
+        text = rows_of_folds([len(split.all_train) for split in self.splits])
+        return text or f"{self.metrics['n_train']} training rows"
 
     @cached_property
     def reference_scores(self) -> dict[str, FloatArray]:
@@ -124,7 +147,20 @@ def read_run(path: str | Path, name: str | None = None) -> Results:
         std=arrays.get("std"),
         reception=arrays.get(RECEPTION),
         validation=_read_logs(folder),
+        splits=[split for part in run_parts(folder) if len((split := load_split(part / SPLIT)).test)],
     )
+
+
+def rows_of_folds(counts: Sequence[int]) -> str:
+    """Numbers of training rows of folds in words; empty of fewer than two folds.
+
+    >>> rows_of_folds([110, 184, 160])
+    '3 folds of 110 to 184 training rows'
+    """
+    if len(counts) < 2:
+        return ""
+    least, most = min(counts), max(counts)
+    return f"{len(counts)} folds of {least}{f' to {most}' if most > least else ''} training rows"
 
 
 def read_runs(paths: Sequence[str | Path]) -> list[Results]:

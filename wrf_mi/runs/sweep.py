@@ -29,6 +29,7 @@ from ..core import AntennaOptions, InputError
 from ..core.digest import content_digest
 from ..core.files import one_line, readable, write_atomically, write_csv
 from ..datasets.registry import locate
+from ..models import MODELS
 from ..parallel import Scheduler, run_module
 from ..synthetic import load_record
 from ..tasks import TASKS
@@ -95,7 +96,7 @@ def plan_sweep(
         out: folder of the sweep.
         vary: ``KEY=VALUE,VALUE,...`` each; a key is one of `OPTIONS`, one of `FLAGS` with ``true`` and ``false``, or a
             setting as for ``--set``. Where a value has commas, semicolons separate the values.
-        options: options of all runs, keys from `OPTIONS`.
+        options: options of all runs, keys from `OPTIONS`; ``preset`` is that of varied models that have presets.
         settings: ``KEY=VALUE`` of all runs.
         flags: further arguments of all runs, such as ``--deterministic``.
 
@@ -104,6 +105,8 @@ def plan_sweep(
     """
     fixed = {setting.partition("=")[0].strip() for setting in settings} | set(options)
     choices = _choices(vary, fixed | {flag.removeprefix("--") for flag in flags})
+    # A preset of all runs is that of the models that have some.
+    with_presets = {name for name in choices.get("model", ()) if name in MODELS and MODELS[name].presets}
     runs: dict[str, SweepRun] = {}
     for chosen in itertools.product(*choices.values()):
         varied = dict(zip(choices, chosen, strict=True))
@@ -111,7 +114,10 @@ def plan_sweep(
         name = ",".join(map("=".join, zip(choices, words, strict=True)))
         if name in runs:
             raise InputError(f"sweep: two runs would be named {name}; choose values that differ in letters or digits")
-        runs[name] = SweepRun(Path(out) / name, varied, _arguments({**options, **varied}, settings, flags))
+        stated = {**options, **varied}
+        if with_presets and "preset" in options and varied.get("model") not in with_presets:
+            del stated["preset"]
+        runs[name] = SweepRun(Path(out) / name, varied, _arguments(stated, settings, flags))
     shared = {"vary": sorted(choices), "options": dict(options), "settings": list(settings), "flags": list(flags)}
     return Sweep(Path(out), shared, tuple(runs.values()))
 

@@ -230,6 +230,27 @@ def bootstrap(*samples: ArrayLike, statistic: Callable[..., Any] = np.median, se
     return Interval(float(statistic(*sets, axis=-1)), float(low), float(high))
 
 
+def block_bootstrap(values: ArrayLike, block: ArrayLike, seed: int = 0) -> Interval:
+    """Mean of values [n] with its 95 % percentile interval from resamples of whole blocks.
+
+    Values of a block may depend on each other; a resample has as many blocks as there are, and its mean is over all
+    their values.
+
+    Args:
+        values: finite values [n], one at least.
+        block: number of the block of each value [n].
+        seed: seed of the resamples.
+
+    Source: bootstrap of clusters, Davison and Hinkley, "Bootstrap Methods and their Application" (1997), section 3.8;
+    with blocks of positions, Lahiri, "Resampling Methods for Dependent Data" (2003), chapter 12.
+    """
+    values, (_, which) = np.asarray(values, float), np.unique(block, return_inverse=True)
+    total, count = np.bincount(which, values), np.bincount(which)
+    drawn = np.random.default_rng(seed).integers(len(count), size=(RESAMPLES, len(count)))
+    low, high = np.percentile(total[drawn].sum(axis=1) / count[drawn].sum(axis=1), [2.5, 97.5])
+    return Interval(float(values.mean()), float(low), float(high))
+
+
 DB = 10 / np.log(10)  # Decibels of a factor e
 CERTAIN = 1e8  # Largest parameter of the distribution: a standard deviation of 4e-4 dB, below any that is stated
 
