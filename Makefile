@@ -19,6 +19,7 @@ help:
 	@echo "make clean      remove .venv, caches and packages; runs stay"
 
 setup: $(READY)
+	@echo "ready; next: make demo, or . .venv/bin/activate and your own data (docs/howto/own-data.md)"
 
 # Only what is declared in pyproject.toml can change what is installed.
 $(READY): pyproject.toml .ci/setup.sh

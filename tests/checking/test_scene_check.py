@@ -162,6 +162,14 @@ def test_sheet_before_a_solid_is_a_fault_and_neighbouring_houses_are_not(tmp_pat
         assert kinds(xml, "fault") == expected
 
 
+def test_integrator_is_noted_but_in_folders_that_mesh_makes(tmp_path):
+    (tmp_path / "plan.csv").write_text("x,y\n0,0\n4,0\n4,3\n0,3\n0,0\n")
+    made = make_scene(tmp_path / "plan.csv", tmp_path / "room", height_m=2.7).folder
+    assert "pictures" not in kinds(made)
+    (made / "scene.yml").unlink()
+    assert "pictures" in kinds(made / "scene.xml")
+
+
 def test_equal_faults_are_printed_once(tmp_path):
     path = scene_file(tmp_path, "ply")
     gone = '<string name="filename" value="gone.ply"/>'

@@ -227,7 +227,8 @@ def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path)
         stdout, stderr = process.communicate(timeout=SECONDS_TO_START)
     assert process.returncode == 130, stderr
     assert stdout == ""
-    assert stderr.splitlines()[0] == "stopping after this step; Ctrl-C again ends at once"
+    goes_on = f"then go on with: wrf-mi train --resume {out}"
+    assert stderr.splitlines()[0] == f"stopping after this step; Ctrl-C again ends at once; {goes_on}"
     step = int(read_checkpoint(out)["step"])
     assert 0 < step < 200
     assert stderr.splitlines()[-1].startswith(f"wrf-mi: stopped after step {step} of 200; go on with:")

@@ -106,14 +106,13 @@ def test_report_names_data_that_can_be_fetched(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setenv("WRF_MI_DATA", str(tmp_path / "data"))
     monkeypatch.setattr("wrf_mi.datasets.registry.user_cache", lambda: tmp_path / "none")
     found = doctor.report()
-    remedies = [entry["remedy"] for entry in found["problems"]]
-    assert "unset WRF_MI_DATA" in remedies
-    assert "wrf-mi data fetch rfid-lab" in remedies
+    assert [entry["remedy"] for entry in found["problems"]] == ["unset WRF_MI_DATA"]
+    assert "not on this machine (wrf-mi data fetch rfid-lab)" in doctor.render(found)
     (tmp_path / "data" / "rfid-lab").mkdir(parents=True)
     found = doctor.report()
     folders = {entry["name"]: entry["folder"] for entry in found["data"]["sets"]}
     assert folders["rfid-lab"] == str(tmp_path / "data" / "rfid-lab")
-    assert "wrf-mi data fetch rfid-lab" not in [entry["remedy"] for entry in found["problems"]]
+    assert "data fetch rfid-lab" not in doctor.render(found)
 
 
 def test_nothing_is_installed_where_a_backend_works(system: System) -> None:

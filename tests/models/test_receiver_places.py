@@ -1,4 +1,4 @@
-"""Receivers at unknown places are located by their training rows, and every model of strengths without a scene runs."""
+"""Receivers at unknown places are located by their training rows, and every model of strengths runs."""
 
 import json
 from dataclasses import replace
@@ -6,14 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from calling import call, strength_commands
 from made_building import FITS, TRAINED, building
 
 from wrf_mi.core import InputError, Record
-from wrf_mi.datasets import load, write_ble_folder
-from wrf_mi.models.receiver_places import place_of_receiver, placed
-from wrf_mi.runs.api import open_run, train
+from wrf_mi.correction import correct_scene
+from wrf_mi.datasets import load, make_splits, write_ble_folder
+from wrf_mi.models import Problem
+from wrf_mi.models.receiver_places import place_of_receiver, placed, placed_problem
+from wrf_mi.runs.api import open_run, resume, train
 from wrf_mi.scene.make import make_scene
+from wrf_mi.tracing import load_trace
 
 UNKNOWN_M = np.full(3, np.nan)
 
@@ -102,14 +106,54 @@ def test_folds_locate_by_their_own_rows(tmp_path: Path) -> None:
     assert len(places) == len(files) > 1
 
 
-def test_paths_of_a_scene_need_stated_places(tmp_path: Path) -> None:
-    plan = tmp_path / "plan.csv"
-    plan.write_text("x,y\n-1,-1\n13,-1\n13,9\n-1,9\n-1,-1\n")
-    room = make_scene(plan, tmp_path / "room", height_m=2.7).folder
-    record = unmapped(building(), "lab", "hall")
-    for model in ("ray-tracing", "hybrid"):
-        with pytest.raises(InputError, match=r"receiver hall, lab unknown; .* give x, y, z, or omit --scene"):
-            train(record, model, out=tmp_path / "run", scene=room)
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The building's outer walls, a floor and a ceiling at 2.7 m."""
+    folder = tmp_path_factory.mktemp("scene")
+    (folder / "plan.csv").write_text("x,y\n-1,-1\n13,-1\n13,9\n-1,9\n-1,-1\n")
+    return make_scene(folder / "plan.csv", folder / "room", height_m=2.7).folder
+
+
+@pytest.mark.parametrize(("model", "split"), [("ray-tracing", "none"), ("hybrid", "official")])
+def test_a_scene_is_traced_to_estimated_places(model: str, split: str, room: Path, tmp_path: Path) -> None:
+    record = unmapped(building(), "lab")
+    run = train(record, model, out=tmp_path / "run", scene=room, split=split)
+    place = run.metrics["receiver_places"]["lab"]
+    np.testing.assert_allclose(place["position_m"][:2], [6.0, 7.5], atol=1.0)
+    again = open_run(run.folder, record)
+    np.testing.assert_array_equal(again.problem.record.receivers[2].position_m, place["position_m"])
+    assert run.metrics["abs_error_db"]["mean"] < 3.0  # noise of 1 dB about a law that is not the scene's
+    tx_pos_m = [[1, 2, 1.3], [5, 5, 1.3]]
+    before = again.predict(tx_pos_m, "lab").mean
+    if model == "ray-tracing":
+        for folder in (run.folder, run.folder / "fold0"):  # paths lead to the places of each fold
+            stored = json.loads((folder / "receiver_places.json").read_text())["lab"]["position_m"]
+            np.testing.assert_array_equal(load_trace(folder / "paths.npz").receivers[2].position_m, stored)
+        (run.folder / "model.npz").unlink()  # as if stopped
+        np.testing.assert_allclose(resume(run.folder, record=record).predict(tx_pos_m, "lab").mean, before)
+
+
+def test_estimates_in_a_scene_are_beneath_its_ceiling_and_outside_of_solids(room: Path, tmp_path: Path) -> None:
+    record, rows = unmapped(building(), "lab"), np.arange(TRAINED)
+    # Estimated a metre above the rows, over the ceiling.
+    high = replace(record, tx_pos_m=record.tx_pos_m + np.array([0, 0, 0.8]))
+    assert placed(high, rows).receivers[2].position_m[2] > 2.7
+    moved_m = placed_problem(Problem(high, None, scene=str(room)), rows).record.receivers[2].position_m
+    assert 2.5 < moved_m[2] < 2.7
+    estimated_m = placed(record, rows).receivers[2].position_m
+    box = trimesh.creation.box((1.0, 1.0, 9.0), trimesh.transformations.translation_matrix(estimated_m))
+    box.export(tmp_path / "shaft.ply")
+    shaft = Problem(record, None, scene=str(tmp_path / "shaft.ply"), material="concrete")
+    moved_m = placed_problem(shaft, rows).record.receivers[2].position_m
+    np.testing.assert_allclose(np.linalg.norm(moved_m - estimated_m), 0.5, atol=0.06)
+
+
+def test_a_receiver_in_a_scene_without_position_and_rows_is_refused(room: Path, tmp_path: Path) -> None:
+    record = unmapped(building(cellar=(41, 42)), "cellar")
+    with pytest.raises(InputError, match=r"receiver cellar unknown, without a training row in split official; give x"):
+        train(record, "ray-tracing", out=tmp_path / "run", scene=room)
+    with pytest.raises(InputError, match=r"receiver cellar unknown; give x, y, z, or wrf-mi train --scene"):
+        correct_scene(room, record, make_splits(record, "official")[0])
 
 
 def test_commands_take_a_folder_without_positions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,6 +16,8 @@ from made_channels import channels
 from wrf_mi.core import InputError, Record
 from wrf_mi.core.array_files import CHECKSUM
 from wrf_mi.datasets import load, make_splits, write_nerf2_csi
+from wrf_mi.models import Session
+from wrf_mi.models.hybrid.scene_side import inside
 from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
@@ -104,7 +106,7 @@ def test_every_block_is_held_out_in_turn_and_a_stopped_run_goes_on(
     kept = (out / "fold0" / "model.npz").stat().st_mtime_ns
     command.refused(["evaluate", out], "model.npz: missing, the fit was stopped; finish it with train --resume")
     status, _, err = command(["train", "--resume", out])
-    assert (status, err.splitlines()) == (0, ["fold1: kriging: receivers"])
+    assert (status, err.splitlines()) == (0, ["fold 2 of 3: kriging: receivers"])
     assert (out / "fold0" / "model.npz").stat().st_mtime_ns == kept
     np.testing.assert_array_equal(read_run(out).prediction, whole.prediction)
     asked = ["--tx", positions_file(tmp_path / "tx.csv", [[0, 0, 0]]), "--out", tmp_path / "out.npz"]
@@ -115,11 +117,21 @@ def test_every_block_is_held_out_in_turn_and_a_stopped_run_goes_on(
 def test_a_stopped_run_keeps_the_folds_that_are_fitted(folder: Path, tmp_path: Path) -> None:
     out, stages = tmp_path / "run", list[str]()
     ends: dict[str, Any] = {"on_progress": lambda stage, share, _: stages.append(stage)}
-    ends["stop"] = lambda: stages[-1].startswith("fold1")
+    ends["stop"] = lambda: stages[-1].startswith("fold 2 of 3: ")
     with pytest.raises(Interrupted, match=rf"stopped in kriging: receivers; go on with: wrf-mi train --resume {out}"):
         train(folder, "kriging", out=out, split="blocked", **ends)
     assert [(out / f"fold{k}" / "model.npz").exists() for k in range(3)] == [True, False, False]
     assert sorted(read_run(resume(out).folder).row) == list(range(24))
+
+
+def test_progress_names_the_fold_and_a_stop_in_a_part_the_run_to_resume() -> None:
+    stages = list[str]()
+    session = Session(Path("run"), Path("run"), lambda stage, share, _: stages.append(stage), lambda: True)
+    folders = [Path("run/fold0"), Path("run/fold1"), Path("run")]
+    for folder in folders:
+        with pytest.raises(Interrupted, match=r"--resume run$"):
+            inside(session.of_part(folder, folders), "parts", "paths").report("tracing", 0.0)
+    assert stages == ["fold 1 of 2: tracing", "fold 2 of 2: tracing", "all rows: tracing"]
 
 
 SHORT = ("steps=20", "checkpoint_every=8", "log_every=4", "validate_every=4", "optimiser.warm_up=2", "batch=6")

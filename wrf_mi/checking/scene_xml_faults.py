@@ -18,6 +18,7 @@ from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 from ..core import InputError
 from ..core.files import MOST_NAME, inside, one_line
 from ..core.memory import require_memory
+from ..scene.folder import FACTS_FILE
 from ..scene.xml_file import DEEPEST, FILES, PLUGINS, VALUES, named_shapes, parsed_xml
 from .scene_findings import Finding
 
@@ -142,7 +143,9 @@ def xml_findings(scene: SceneXml) -> Iterator[Finding]:
     for name, shape in scene.shapes:
         yield from _shape(scene, name, shape)
         yield from _material(scene, name, shape)
-    if count := sum(element.tag in PICTURES for element in root):
+    # The integrator of a scene folder, of which `wrf-mi mesh` writes one, is for Mitsuba's own pictures.
+    ours = (path.parent / FACTS_FILE).is_file()
+    if count := sum(element.tag in PICTURES and not (ours and element.tag == "integrator") for element in root):
         yield Finding("pictures", path, "", f"{count} emitters, sensors or integrators", "nothing to do: not traced")
 
 

@@ -41,8 +41,8 @@ def report() -> dict[str, Any]:
         (package to version or None), ``threads`` (cores this process may use), ``memory_gb`` (free memory, 1e9 bytes),
         ``extras`` (packages of each of `EXTRAS` that are not installed), ``backend`` (the fields of
         `wrf_mi.backend.Backend`, or None), ``llvm`` (a list of path, version, usable, reason), ``gpu`` (driver,
-        usable, reason, device), ``data`` (home, cache, sets: a list of name, task, folder or None) and ``problems`` (a
-        list of problem, remedy).
+        usable, reason, device), ``data`` (home, cache, sets: a list of name, task, folder or None, and fetch, the
+        command, or None) and ``problems`` (a list of problem, remedy).
     """
     problems: list[dict[str, str]] = []
     versions = {name: installed_version(name) for name in _PACKAGES}
@@ -108,7 +108,9 @@ def render(state: dict[str, Any]) -> str:
         text = f"not installed: {', '.join(missing)} (pip install '.[{extra}]')" if missing else "installed"
         lines.append((f"extra {extra}", text))
     lines.append(("data", state["data"]["home"]))
-    lines += [(f"  {entry['name']}", entry["folder"] or "not on this machine") for entry in state["data"]["sets"]]
+    for entry in state["data"]["sets"]:
+        absent = f"not on this machine ({entry['fetch']})" if entry["fetch"] else "not on this machine"
+        lines.append((f"  {entry['name']}", entry["folder"] or absent))
     width = max(len(label) for label, _ in lines) + 2
     rows = [f"{label:<{width}}{value}" for label, value in lines]
     for entry in state["problems"]:
@@ -167,7 +169,7 @@ def _gpu() -> dict[str, Any]:
 
 
 def _data(problems: list[dict[str, str]]) -> dict[str, Any]:
-    """Folders of data sets; a problem for each that can be fetched."""
+    """Folders of data sets, and commands that fetch them; none of them is needed."""
     from ..datasets import data_home, datasets, user_cache
 
     home = data_home()
@@ -176,10 +178,9 @@ def _data(problems: list[dict[str, str]]) -> dict[str, Any]:
     sets = []
     for entry in datasets():
         name, folder = entry.dataset.name, entry.location
-        sets.append({"name": name, "task": entry.dataset.task, "folder": str(folder) if folder else None})
-        if folder is None and entry.dataset.base_url is not None:
-            problem = f"the data set {name} is not on this machine"
-            problems.append({"problem": problem, "remedy": f"wrf-mi data fetch {name}"})
+        fetched = None if entry.dataset.base_url is None else f"wrf-mi data fetch {name}"
+        location = {"folder": str(folder) if folder else None, "fetch": fetched}
+        sets.append({"name": name, "task": entry.dataset.task, **location})
     return {"home": str(home), "cache": str(user_cache()), "sets": sets}
 
 

@@ -121,11 +121,11 @@ class Watch:
     """Progress on standard error, a bar on a terminal, else plain lines, and a stop on Ctrl-C.
 
     The first Ctrl-C lets the current step of ``resumable`` work, which asks `stop` and can go on later, finish and
-    write a checkpoint; a second one ends at once.
+    write a checkpoint; a second one ends at once. ``run`` is the folder that the work can go on with.
     """
 
-    def __init__(self, resumable: bool = False) -> None:
-        self._resumable = resumable
+    def __init__(self, resumable: bool = False, run: str | None = None) -> None:
+        self._resumable, self._run = resumable or run is not None, run
         self._console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"), console=self._console
@@ -151,7 +151,8 @@ class Watch:
         if self._stop:
             raise KeyboardInterrupt
         self._stop = True
-        print("stopping after this step; Ctrl-C again ends at once", file=sys.stderr)
+        go_on = "" if self._run is None else f"; then go on with: wrf-mi train --resume {self._run}"
+        print(f"stopping after this step; Ctrl-C again ends at once{go_on}", file=sys.stderr)
 
     def stop(self) -> bool:
         """Whether Ctrl-C was pressed."""

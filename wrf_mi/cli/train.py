@@ -71,7 +71,7 @@ def run_training(a: Arguments, **more: Any) -> int:
     request = training_request(a)
     from ..runs.api import train
 
-    with Watch(resumable=True) as watch:
+    with Watch(run=a.out) as watch:
         session: dict[str, Any] = {"on_progress": watch.on_progress, "stop": watch.stop, **more}
         run = train(a.dataset, out=a.out, **vars(request), **session, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
@@ -83,7 +83,7 @@ def _resume(a: Arguments) -> int:
             init("llvm", threads=1)
     from ..runs.api import resume
 
-    with Watch(resumable=True) as watch:
+    with Watch(run=a.resume) as watch:
         run = resume(a.resume, watch.on_progress, watch.stop, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
 

@@ -162,7 +162,7 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     """
     remove_leftovers(path.parent, path.name)
     if path.exists() and not replace:
-        raise InputError(f"{path}: exists; remove it or choose another folder")
+        raise InputError(f"{path}: exists; remove it, choose another folder, or give --replace")
     part, old = (path.with_name(f".{path.name}.{os.getpid()}.{end}") for end in ("part", "old"))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

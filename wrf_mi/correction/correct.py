@@ -151,6 +151,10 @@ def _checked(
 ) -> tuple[Record, Split, CorrectionOptions]:
     """The rows and receivers that may be used, and options that suit the task; an `InputError` where there are none."""
     record = record.seen(split)
+    lacking = [receiver.name for receiver in record.receivers if not np.isfinite(receiver.position_m).all()]
+    if lacking and task_of(record).in_decibel:
+        text = f"position of receiver {', '.join(lacking)} unknown; give x, y, z"
+        raise InputError(f"{record.source or record.name}: {text}, or wrf-mi train --scene, which estimates them")
     numbers, left_out = fitted_receivers(record, [split])
     warn_of_left_out(record, left_out)
     record, split = record.at_receivers(numbers), split.at_receivers(numbers)

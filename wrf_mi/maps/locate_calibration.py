@@ -29,7 +29,7 @@ from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import readable, write_atomically
 from ..core.types import IntArray
 from ..models import Fitted, Session
-from ..models.held_out import fit_fold, labelled
+from ..models.held_out import fit_fold
 from ..models.model import Inputs
 from ..runs.folder import load_rows
 from ..runs.run import Run
@@ -121,8 +121,11 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
         return Calibration(Likelihood())
     parts, most = [], max(1, MOST_ROWS // len(folds))
     for number, fold in enumerate(folds):
-        label, folder = f"calibrating, fold {number + 1} of {len(folds)}", run.folder / FOLDER / f"fold{number}"
-        receivers, predicted = _predicted_fold(run, fold, folder, candidates, session, label)
+        # One line for all folds: a hybrid has some twenty stages in each.
+        show = partial(session.on_progress, f"calibrating by {len(folds)} folds", number / len(folds))
+        of_fold = replace(session, on_progress=lambda *_, show=show: show())
+        folder = run.folder / FOLDER / f"fold{number}"
+        receivers, predicted = _predicted_fold(run, fold, folder, candidates, of_fold)
         test = fold.test[np.isfinite(record.observation[receivers][:, fold.test]).any(axis=0)]
         test = np.sort(np.random.default_rng([run.problem.seed, 11]).permutation(test)[:most])
         parts.append(Located(predicted, receivers, test, candidates.nearest(record.tx_pos_m[test])))
@@ -135,7 +138,7 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
 
 
 def _predicted_fold(
-    run: Run, fold: Split, folder: Path, candidates: Candidates, session: Session, label: str
+    run: Run, fold: Split, folder: Path, candidates: Candidates, session: Session
 ) -> tuple[IntArray, NDArray[np.float32]]:
     """Receivers of a fold and predictions at the candidates by a model fitted to it; a finished fold is read."""
     file = folder.with_suffix(".npz")
@@ -143,11 +146,12 @@ def _predicted_fold(
     if "predicted" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        inner = labelled(replace(session, folder=folder, run=folder), label)
+        inner = replace(session, folder=folder, run=folder)
         with threadpool_limits(1, "blas"):
             fitted, numbers = fit_fold(run.model, run.problem, fold, inner)
-            report = partial(session.report, f"{label}: map")
-            predicted = predict_candidates(fitted, len(numbers), headings_of(run), candidates, report)
+            predicted = predict_candidates(
+                fitted, len(numbers), headings_of(run), candidates, partial(inner.report, "map")
+            )
         shutil.rmtree(folder)
         arrays = {"predicted": predicted, "positions_m": candidates.positions_m, "receivers": numbers}
         write_arrays(file, arrays)

@@ -228,9 +228,15 @@ def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int, FloatArray | Non
     return tracer.trace(part[0], False, *part[1:])
 
 
+def _paths_folder(record: Record, session: Session) -> Path:
+    """Folder of stored paths, which folds share unless each estimates positions of receivers."""
+    estimated = any(receiver.position_std_m is not None for receiver in record.receivers)
+    return session.folder if estimated else session.run
+
+
 def _trace_of_fit(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult:
     """Stored paths of all rows, else new ones, which are stored (Interrupted: stopped after them)."""
-    path = session.run / PATHS
+    path = _paths_folder(problem.record, session) / PATHS
     traced = _stored_trace(path, problem.record) if path.exists() else None
     if traced is None or len(traced.receivers) < len(problem.record.receivers):  # of a fold that left some out
         traced = _trace(tracer, problem, session)
@@ -286,7 +292,8 @@ class RayTracing(Model):
             calibrated = self.load(graph.arrays(), problem, session.folder)
             calibrated.train_seconds = graph.train_seconds
             return calibrated
-        record, path, start = problem.record, session.run / PATHS, time.perf_counter()
+        record, start = problem.record, time.perf_counter()
+        path = _paths_folder(record, session) / PATHS
         assert problem.scene is not None
         settings: TracingSettings = problem.settings
         tracer = RayTracer(problem.scene, _instrument(record), settings.options, problem.material)

@@ -13,21 +13,26 @@ Optimization" (2006), chapter 10.
 from __future__ import annotations
 
 import json
+import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 from scipy.spatial.distance import cdist
 
-from ..core import InputError, Record
+from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
 from ..core.files import readable, write_atomically
 from ..core.types import IntArray
 from ..tasks import task_of
 from .model import Problem
+
+logger = logging.getLogger(__name__)
 
 PLACES = "receiver_places.json"  # file of a run with estimated positions
 
@@ -40,6 +45,8 @@ CORRELATED = 0.7  # share of the rows' deviation from the law that shadowing has
 MOST_PLACES = 400  # places in the fit at most, evenly spaced
 STARTS = 4  # places at the strongest rows, from which the search starts beside the middle of all
 STATED_M = 0.01  # standard deviation of a coordinate that is stated
+MARGIN_M = 0.1  # distance from the scene's box to which estimated coordinates beyond it are moved
+AWAY_M = np.arange(0.05, 2.0, 0.05)  # distances at which a place outside of solids is searched for
 LOUD_DB = 100.0  # standard deviation of the power at one metre, about the strongest row: any unit of decibels
 
 
@@ -125,13 +132,44 @@ def placed(record: Record, rows: IntArray) -> Record:
 
 
 def placed_problem(problem: Problem, rows: IntArray) -> Problem:
-    """The problem of `placed` receivers; the problem itself where all are known."""
-    return _with_record(problem, placed(problem.record, rows))
+    """The problem of `placed` receivers, in a scene where antennas can be; the problem itself where all are known."""
+    located = _with_record(problem, placed(problem.record, rows))
+    if located is problem or problem.scene is None:
+        return located
+    return _with_record(located, _in_scene(located.record, located.opened_scene))
+
+
+def _in_scene(record: Record, scene: Any) -> Record:
+    """The record with estimated positions inside the scene's box, by two deviations at most, and outside of solids."""
+    from ..scene.mesh.surfaces import bounds  # imported where there is a scene
+    from ..tracing.paths.solve import Prepared
+    from ..tracing.search.devices import solid_around
+
+    surfaces, receivers = Prepared(scene).surfaces, list(record.receivers)
+    box = bounds(surfaces.triangles)
+    low, high = box[0] + MARGIN_M, box[1] - MARGIN_M
+    # A ceiling above all rows is above their receivers, too; the height of the ground bounds nothing.
+    encloses = (low <= np.nanmin(record.tx_pos_m, axis=0)) & (np.nanmax(record.tx_pos_m, axis=0) <= high)
+    angle = np.arange(0, 2 * np.pi, np.pi / 8)
+    around = AWAY_M[:, None, None] * np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=1)
+    around = np.concatenate([np.zeros((1, 3)), around.reshape(-1, 3)])
+    for number, receiver in enumerate(receivers):
+        if (std_m := receiver.position_std_m) is not None and np.isfinite(receiver.position_m).all():
+            inside_m = np.clip(receiver.position_m, low, high)
+            near = encloses & (np.abs(inside_m - receiver.position_m) <= 2 * std_m)
+            tried_m = np.where(near, inside_m, receiver.position_m) + around * (std_m > 0)
+            outside = int(np.argmax(solid_around(surfaces, tried_m) < 0))  # the first: the nearest
+            receivers[number] = replace(receiver, position_m=tried_m[outside])
+    return replace(record, receivers=tuple(receivers))
 
 
 def _with_record(problem: Problem, record: Record) -> Problem:
-    # A new problem would open its scene anew.
-    return problem if record is problem.record else replace(problem, dataset=record, antennas=AS_STATED, left_out=())
+    if record is problem.record:
+        return problem
+    changed = replace(problem, dataset=record, antennas=AS_STATED, left_out=())
+    if "opened_scene" in vars(problem):  # which would be opened anew
+        vars(changed)["opened_scene"] = problem.opened_scene
+    return changed
 
 
 def write_places(folder: Path, record: Record) -> None:
@@ -165,13 +203,27 @@ def stored_problem(problem: Problem, folder: Path) -> Problem:
     return _with_record(problem, replace(problem.record, receivers=tuple(receivers)))
 
 
-def check_surveyed(record: Record) -> None:
-    """Refuse receivers at unknown places, where paths of a scene are traced.
+def check_placeable(problem: Problem, splits: Sequence[Split]) -> None:
+    """Refuse receivers in a scene at unknown places that no training row of a split tells.
 
     Raises:
         InputError: naming them.
     """
-    lacking = [receiver.name for receiver in record.receivers if not receiver.is_surveyed]
-    if lacking and task_of(record).in_decibel:
-        text = f"position of receiver {', '.join(lacking)} unknown; paths of a scene lead to stated positions"
-        raise InputError(f"{record.source or record.name}: {text}: give x, y, z, or omit --scene")
+    record = problem.record
+    for split in splits if problem.scene is not None and task_of(record).in_decibel else ():
+        received = np.isfinite(record.seen(split).observation[:, split.all_train])
+        lacking = [k for k, receiver in enumerate(record.receivers) if not (receiver.is_surveyed or received[k].any())]
+        if lacking:
+            names = ", ".join(record.receivers[number].name for number in lacking)
+            text = f"position of receiver {names} unknown, without a training row in split {split.name}"
+            raise InputError(f"{record.source or record.name}: {text}; give x, y, z, or omit --scene")
+
+
+def tell_places(problem: Problem) -> None:
+    """Log the estimated positions of receivers in a scene."""
+    for receiver in problem.record.receivers if problem.scene is not None else ():
+        if receiver.position_std_m is not None:
+            x, y, z = receiver.position_m
+            deviations = ", ".join(f"{std:.1f}" for std in receiver.position_std_m)
+            text = "receiver %s: estimated at x %.1f, y %.1f, z %.1f m with standard deviations %s m; used in the scene"
+            logger.warning(text, receiver.name, x, y, z, deviations)

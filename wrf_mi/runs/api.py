@@ -27,7 +27,7 @@ from ..datasets.splits import NONE, default_split, splits_below
 from ..models import MODELS, Model, Problem, Session, known_model
 from ..models.checks import check_held_receivers, check_record
 from ..models.model import default_settings
-from ..models.receiver_places import check_surveyed, placed_problem, write_places
+from ..models.receiver_places import check_placeable, placed_problem, tell_places, write_places
 from ..parallel import Scheduler
 from ..scene.correction_data import read_correction_data
 from ..synthetic import load_record
@@ -72,17 +72,18 @@ def plan_run(
         seed, deterministic = settings.seed, settings.deterministic
     split = _split_of(record, request)
     record, splits, left_out = _split_rows(record, split, seed, request.n_train, _least_rows(record, request))
-    if scene is not None:
-        check_surveyed(record)
     for rows in splits:
         check_held_receivers(record, rows, model, MODELS.values())
         check_observations(record, rows, model.complete, may_be_silent=TASKS[record.task].in_decibel)
     problem = Problem(record, settings, seed, scene, request.material, request.antennas)
+    check_placeable(problem, splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = split.name if isinstance(split, Split) else split
     options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
     config = RunConfig(request.model, source, record.task, name, request.n_train, *options)
-    config.entry.check(placed_problem(problem.seen(splits[0]), splits[0].all_train), splits)
+    placed = placed_problem(problem.seen(splits[-1]), splits[-1].all_train)
+    config.entry.check(placed, splits)
+    tell_places(placed)
     return problem, config, splits
 
 
@@ -324,8 +325,7 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
     folders = run_parts(folder)
     splits = [load_rows(part, problem.record) for part in folders]
     if not all((part / FITTED).exists() for part in folders):
-        prepared = placed_problem(problem, splits[0].all_train)
-        problem.settings = config.entry.prepare(prepared, splits, session)
+        problem.settings = config.entry.prepare(placed_problem(problem, splits[0].all_train), splits, session)
         if problem.settings != config.settings:
             config = replace(config, settings=problem.settings)
             write_configs(folder, config, splits)
@@ -336,7 +336,7 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             # Matrices of a few hundred rows: threads of BLAS would mostly wait for each other.
             with threadpool_limits(1, "blas"):
                 placed = placed_problem(problem.seen(rows), rows.all_train)
-                fitted = config.entry.fit(placed, rows, replace(session, folder=part))
+                fitted = config.entry.fit(placed, rows, session.of_part(part, folders))
             write_places(part, placed.record)
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)

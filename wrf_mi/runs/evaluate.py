@@ -247,8 +247,7 @@ def _evaluate_part(problem: Problem, part: FittedPart) -> Scores:
         return fitted.predict_rows(rows, receiver) or single(rows, receiver)
 
     metrics, arrays = evaluate(record, part.split, predict, single)
-    places = stored_places(part.folder)
-    return metrics | ({PLACES: places} if places else {}) | _stage_scores(record, part, metrics, arrays), arrays
+    return metrics | _stage_scores(record, part, metrics, arrays), arrays
 
 
 def _stage_scores(record: Record, part: FittedPart, metrics: dict[str, Any], arrays: dict[str, Any]) -> dict[str, Any]:
@@ -286,6 +285,7 @@ def _header(folder: Path, config: RunConfig, parts: Sequence[FittedPart]) -> dic
     known: dict[str, Any] = {key: getattr(config, key) for key in ("model", "dataset", "split", "seed")}
     known |= {} if config.scene is None else {"scene": config.scene}
     known |= {LEFT_OUT: dict(config.left_out)} if config.left_out else {}
+    known |= {PLACES: places} if (places := stored_places(folder)) else {}
     # The peak of the fit, if it is stored already.
     memory_mb = stored_metrics(folder).get("peak_memory_mb", peak_memory_mb())
     seconds = sum(part.seconds for part in parts)

@@ -141,7 +141,7 @@ def make_scene(
 
 def _check_options(file: Path, out: Path, replace: bool, up: Up | None) -> None:
     if out.exists() and not replace:
-        raise InputError(f"{out}: exists; remove it or choose another folder")
+        raise InputError(f"{out}: exists; remove it, choose another folder, or give --replace")
     if up not in (None, "y", "z"):
         raise InputError(f"{file}: {up!r} is up: give y or z")
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, Self
 
 if TYPE_CHECKING:
     from .loop import Progress
@@ -38,22 +38,24 @@ class FitSession:
     run: Path | None = None  # the run folder, for files that all folds share
     on_progress: OnProgress = quiet  # progress callback
     stop: Callable[[], bool] = lambda: False  # stop condition, called wherever nothing would be lost
+    # the run folder that ``train --resume`` goes on with, where ``run`` is the folder of a part; None: ``run``
+    root: Path | None = field(default=None, kw_only=True)
 
-    @property
-    def fold(self) -> str:
-        """Name of the fold; "" where there is one split."""
-        return "" if self.folder is None or self.folder == self.run else self.folder.name
-
-    def tell(self, stage: str, share: float, progress: Progress | None = None) -> None:
-        """Report progress of a stage, named after its fold."""
-        self.on_progress(f"{self.fold}: {stage}" if self.fold else stage, share, progress)
+    def of_part(self, folder: Path, folders: Sequence[Path]) -> Self:
+        """Session of one of the folders of a run: of a fold, or of the fit to all rows, named in its progress."""
+        if len(folders) == 1:
+            return replace(self, folder=folder, root=self.run)
+        count = len(folders) - (self.run in folders)
+        name = "all rows" if folder == self.run else f"fold {folders.index(folder) + 1} of {count}"
+        on_progress, named = self.on_progress, replace(self, folder=folder, root=self.run)
+        return replace(named, on_progress=lambda stage, *more: on_progress(f"{name}: {stage}", *more))
 
     def report(self, stage: str, share: float, progress: Progress | None = None, /) -> None:
         """Report progress of a fit without checkpoints (Interrupted: the stop condition holds)."""
-        self.tell(stage, share, progress)
+        self.on_progress(stage, share, progress)
         if self.stop():
             raise self.interrupted(f"in {stage}")
 
     def interrupted(self, where: str) -> Interrupted:
         """The error that ends a fit which was stopped."""
-        return Interrupted(f"stopped {where}; go on with: wrf-mi train --resume {self.run}")
+        return Interrupted(f"stopped {where}; go on with: wrf-mi train --resume {self.root or self.run}")

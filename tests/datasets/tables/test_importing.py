@@ -182,6 +182,21 @@ def test_receivers_of_a_scan_have_their_carriers(tmp_path: Path) -> None:
     assert len(record) == len(PLACES_M)
 
 
+def test_hardware_addresses_match_in_any_case_and_notation(tmp_path: Path) -> None:
+    first, second, other = "B4:FB:E4:71:0D:A8", "00:1a:1e:4f:9c:20", "hall"
+    frame = pandas.DataFrame({"x": [0.0, 0, 1, 1, 1], "y": [0.0, 0, 0, 0, 0], "rssi": [-50, -60, -52, -61, -70]})
+    frame["bssid"] = [first, second, first.lower().replace(":", "-"), second.replace(":", ""), other]
+    anchors = pandas.DataFrame({"id": [first.lower(), second.upper(), "Hall"], "x": [1, 2, 3], "y": 0, "z": 2})
+    anchors.to_csv(tmp_path / "anchors.csv", index=False)
+    record = imported(tmp_path, frame, anchors=tmp_path / "anchors.csv")
+    by_name = {receiver.name: receiver.position_m[0] for receiver in record.receivers}
+    assert {name: by_name[name] for name in (first, second)} == {first: 1, second: 2}
+    assert np.isnan(by_name[other]), "names are not addresses"
+    anchors.assign(id=[first, first.replace(":", "_"), other]).to_csv(tmp_path / "anchors.csv", index=False)
+    message = r"anchors\.csv: row 2: receiver B4:FB:E4:71:0D:A8 is in an earlier row, too"
+    refusal(imported, tmp_path, frame, message, anchors=tmp_path / "anchors.csv")
+
+
 def test_sectors_keep_orientation_antenna_and_carrier(tmp_path: Path) -> None:
     anchors = pandas.DataFrame({"id": ["hall", "kitchen", "7"], "x": [1, 2, 3], "y": 0, "z": 20, "mast": "a"})
     sectors = {"azimuth_deg": [90, 0, np.nan], "pattern": ["tr38901", "", ""], "frequency_hz": [3.56e9, 3.6e9, 3.69e9]}

@@ -104,7 +104,7 @@ def import_measurements(
     if unknown := set(options) - {attribute.name for attribute in dataclasses.fields(ImportOptions)}:
         raise InputError(f"import_measurements: no option {min(unknown)}; see ImportOptions")
     if Path(out).exists() and not replace:
-        raise InputError(f"{out}: exists; remove it or choose another folder")
+        raise InputError(f"{out}: exists; remove it, choose another folder, or give --replace")
     chosen_options = ImportOptions(**options)
     files = [files] if isinstance(files, str | Path) else list(files)
     return _Import(files, Path(out), chosen_options).run(replace)

@@ -56,6 +56,12 @@ def normal_id(text: str) -> str:
     return re.sub(r"[/\\]", "-", plain_id(one_line(text)))
 
 
+def id_key(name: str) -> str:
+    """What ids of one receiver share: the digits of a hardware address in any case and notation, else the id."""
+    digits = re.sub("[:_-]", "", name).lower()
+    return digits if re.fullmatch("[0-9a-f]{12}", digits) else name
+
+
 def read_readings(table: Table, columns: Columns) -> Readings:
     """All readings of a table that are not empty, in the order of its rows."""
     if "rssi" in columns.of and not columns.strengths:
@@ -78,10 +84,13 @@ def read_readings(table: Table, columns: Columns) -> Readings:
 
 
 def _distinct(readings: Readings) -> Readings:
-    """Readings in which receivers with one id (7 and 7.0) are one."""
-    number_of = {name: number for number, name in enumerate(dict.fromkeys(readings.ids))}
-    number = np.array([number_of[name] for name in readings.ids], np.int64)
-    return replace(readings, ids=tuple(number_of), receiver=number[readings.receiver])
+    """Readings in which receivers with one id (7 and 7.0, AA:BB:... and aa-bb-...) are one, as it is first written."""
+    names: dict[str, str] = {}
+    for name in readings.ids:
+        names.setdefault(id_key(name), name)
+    number_of = {key: number for number, key in enumerate(names)}
+    number = np.array([number_of[id_key(name)] for name in readings.ids], np.int64)
+    return replace(readings, ids=tuple(names.values()), receiver=number[readings.receiver])
 
 
 def without_not_heard(readings: Readings, stated: Sequence[float] | None) -> tuple[Readings, list[str], list[float]]:

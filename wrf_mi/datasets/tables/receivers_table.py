@@ -17,7 +17,7 @@ from ..unknown import RECEIVER, listed, name_words
 from .columns import named_columns, shown_names, unit_of
 from .files import Table
 from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale
-from .readings import normal_id
+from .readings import id_key, normal_id
 
 POSES = tuple(name for name in COLUMNS if name not in ("id", "x", "y", "z", *TX_COLUMNS))
 """Columns of the layout that are taken over as they are: orientation, carrier and antenna."""
@@ -43,7 +43,7 @@ def read_receivers(
         text = "positions of the receivers are unknown, their fields empty; --anchors FILE states them"
         return tuple(unknown.values()), [text]
     table = _with_ids(table)
-    stated = _stated(table, frame, units, height_m)
+    stated = _stated(table, frame, units, height_m, {id_key(name): name for name in ids})
     receivers = unknown | {name: receiver for name, receiver in stated.items() if name in unknown}
     notes = _notes(table, receivers, stated)
     if "z" not in named_columns(list(table.frame.columns), {}):
@@ -65,7 +65,10 @@ def _notes(table: Table, receivers: Mapping[str, Receiver], stated: Mapping[str,
     return [f"{file}: {what} ({len(names)}): {listed(names)}" for what, names in groups.items() if names]
 
 
-def _stated(table: Table, frame: LocalFrame, units: str, height_m: float) -> dict[str, Receiver]:
+def _stated(
+    table: Table, frame: LocalFrame, units: str, height_m: float, measured: Mapping[str, str]
+) -> dict[str, Receiver]:
+    """Receivers by name; those of the measurements have the names there, ``measured`` by `id_key`."""
     places = _stated_positions(table, frame, units, height_m).round(POSITION_DIGITS)
     names = [name for name in POSES if name in table.frame]
     fields = table.frame[names].astype(object).where(table.frame[names].notna(), "").astype(str)
@@ -76,7 +79,8 @@ def _stated(table: Table, frame: LocalFrame, units: str, height_m: float) -> dic
         carriers = poses.numbers(FREQUENCY, may_be_empty=True)
     receivers: dict[str, Receiver] = {}
     for row, text in enumerate(table.frame["id"].astype(str)):
-        if (name := normal_id(text)) in receivers:
+        name = measured.get(id_key(normal_id(text)), normal_id(text))
+        if name in receivers:
             raise table.fault(f"receiver {name} is in an earlier row, too; remove one of them", row)
         hz = None if np.isnan(carriers[row]) else float(carriers[row])
         receivers[name] = receiver_of(name, places[row], orientations[row], antennas[row], hz)

@@ -214,7 +214,7 @@ class GaussianField(Model):
 
         def on_progress(progress: Progress) -> None:
             append_log(folder, progress)
-            session.on_progress(session.fold or "training", progress.step / config.steps, progress)
+            session.on_progress("training", progress.step / config.steps, progress)
 
         if not trainer.run(on_progress, partial(write_checkpoint, folder, trainer), session.stop):
             raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")

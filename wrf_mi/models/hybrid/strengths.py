@@ -77,8 +77,9 @@ def _chosen(
         if before >= best:
             problem, best = stated, before
     mean = None
-    if record.tx_heading_rad is None:
-        # Whoever turns carries the antenna beside the stated position; elsewhere, positions may be exact.
+    if record.tx_heading_rad is None and all(receiver.is_surveyed for receiver in record.receivers):
+        # Whoever turns carries the antenna beside the stated position; elsewhere, positions may be exact, unless
+        # receivers' are estimates, which each hold-out makes anew.
         exact = _traced(problem)
         mean = exact if score(problem, exact) > best else None
     judged = _Remembering(_searched(mean), mean)

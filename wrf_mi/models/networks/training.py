@@ -152,7 +152,7 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
             write_checkpoint(folder, trainer, beside)
 
     def on_progress(progress: Progress) -> None:
-        session.tell(network.name, progress.step / config.steps, progress)
+        session.on_progress(network.name, progress.step / config.steps, progress)
 
     if not trainer.run(on_progress, save, session.stop):
         raise session.interrupted(f"after step {trainer.state.step} of {config.steps} of {network.name}")
