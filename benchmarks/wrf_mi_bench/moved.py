@@ -2,8 +2,9 @@
 
 In each of eight random rooms spectra are measured before, with the scan of `wrf_mi_bench.random_room`. Then pieces of
 furniture move; the parts of the scan that stand where a piece stood move with it, as a person states by
-``wrf-mi edit``. Test rows are measured afterwards, at places that are free in both states. Rooms are those of the seeds
-401 to 408; nothing was tuned on them.
+``wrf-mi edit``. Test rows are measured afterwards, at places that are free in both states. Rooms are those of the first
+eight seeds from 401 on with at most eight pieces of furniture, whose fits take half a minute; nothing was tuned on
+them.
 """
 
 import shutil
@@ -37,7 +38,7 @@ from .rooms import PREDICTION, array_at
 from .sources import fit_key, source_files
 
 RUNS = Path("runs/bench/moved")
-SEEDS = range(401, 409)
+SEEDS = 403, 404, 406, 407, 408, 411, 414, 415
 CARRIER_HZ = 0.92e9
 SIZE = 30, 120  # elevations and azimuths of a spectrum: a tenth of the width of the array's lobes
 BEFORE, TEST = 40, 60  # rows measured before, and test rows
@@ -179,21 +180,14 @@ def main() -> dict[str, Any]:
     place = RUNS / fit_key(source_files())
     parts = {seed: stored_part("moved", str(seed), partial(measure, seed, place)) for seed in SEEDS}
     scores = {name: np.array([part["ssim"][name] for part in parts.values()]) for name in parts[SEEDS[0]]["ssim"]}
-    rows, gains = (
-        list[dict[str, Any]](),
-        {name: bootstrap(scores[OURS] - ssim, statistic=np.mean) for name, ssim in scores.items()},
-    )
+    gains = {name: bootstrap(scores[OURS] - ssim, statistic=np.mean) for name, ssim in scores.items()}
+    rows = list[dict[str, Any]]()
     for name, ssim in scores.items():
         mean, gain = bootstrap(ssim, statistic=np.mean), gains[name]
         figures = {"ssim": ssim.tolist(), "mean": astuple(mean), "gain": astuple(gain)}
         rows.append({**line(name, f"mean SSIM {mean}", "" if name == OURS else f"{OURS} better by {gain}"), **figures})
-    rooms = {str(seed): part["room"] for seed, part in parts.items()}
-    result: dict[str, Any] = {
-        "rows": rows,
-        "rooms": rooms,
-        "saved": saved(rows),
-        "measured": measured_on(parts.values()),
-    }
+    result: dict[str, Any] = {"rows": rows, "saved": saved(rows), "measured": measured_on(parts.values())}
+    result["rooms"] = {str(seed): part["room"] for seed, part in parts.items()}
     worse = [name for name in (f"{TRACED}, edited scan", f"{HYBRID} from before") if gains[name].low <= 0]
     return result | ({"failed": f"{OURS}: not clearly better than {', '.join(worse)}"} if worse else {})
 
