@@ -120,6 +120,7 @@ _OWN: Mapping[str, Check] = {
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="page_tables:rooms"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
     "reception": _here("reception", "reception:main", FLAT, resumes=True, table="page_tables:reception"),
+    "moved": _here("furniture moved", "moved:main", resumes=True, table="moved:table"),
     "phase-error": _here("spectra from scans", "rooms:phase_errors", resumes=True, table="rooms:phase_table"),
     "closed-forms": _here("traced channels against closed forms", "closed_forms:main", table="closed_forms:table"),
     "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),

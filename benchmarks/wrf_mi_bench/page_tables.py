@@ -62,9 +62,9 @@ def reception(rows: Sequence[Mapping[str, Any]]) -> str:
     for cell in dict.fromkeys(row["cell"] for row in rows):
         by_model = {row["model"]: row for row in rows if row["cell"] == cell}
         _, *references = by_model[models[0]]["log_loss"]
-        losses = [*(by_model[model]["log_loss"][0] for model in models), *references]
-        shown = [f"{loss:.3f}" for loss in losses]
-        cells = [f"**{text}**" if text == min(shown) else text for text in shown]
+        losses = [by_model[model]["log_loss"][0] if model in by_model else None for model in models] + references
+        shown = ["" if loss is None else f"{loss:.3f}" for loss in losses]
+        cells = [f"**{text}**" if text == min(filter(None, shown)) else text for text in shown]
         lines.append([f"{cell} ({by_model[models[0]]['received']:.0%} received)", *cells])
     return markdown_table(["data, split, rows", *models, "rate", "nearest"], lines)
 

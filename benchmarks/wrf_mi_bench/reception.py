@@ -1,7 +1,8 @@
-"""Probability of reception of three models beside the constant rate of each receiver and the nearest training rows.
+"""Probability of reception of four models beside the constant rate of each receiver and the nearest training rows.
 
 Every cell is a run of ``wrf-mi train`` on a data set as it was measured, or with a sensitivity at which a third of its
-values is missing: weaker ones are removed before anything is fitted. Each run is stored when it is measured
+values is missing: weaker ones are removed before anything is fitted. The hybrid is measured where it is fitted once, as
+its fits in a scene take minutes. Each run is stored when it is measured
 (`wrf_mi_bench.comparison.stored_part`).
 """
 
@@ -25,13 +26,13 @@ from wrf_mi.tasks.scores import bootstrap
 from .bench import FLAT
 from .comparison import data_folder, line, measured_on, say, stored_part
 from .sources import fit_key, source_files
-from .stages import ALONE, run_of_cell
+from .stages import ALONE, HYBRID, Alone, run_of_cell
 from .stages import Cell as Rows
 from .tables import scene_of_data
 
 RUNS = Path("runs/bench/reception")
 MISSING = 1 / 3  # share of missing values
-MODELS = ("idw", "kriging", "ray-tracing")
+MODELS = ("idw", "kriging", "ray-tracing")  # of all cells
 WORSE = 0.02  # largest loss against a reference that is allowed, nats
 SCORES = ("log_loss", "brier", "calibration_error")
 
@@ -49,6 +50,11 @@ class Cell(Rows):
     @property
     def title(self) -> str:
         return f"{super().title}, {'a third missing' if self.weak_are_missing else 'as measured'}"
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Models of the cell."""
+        return MODELS if self.split == "blocked" else (*MODELS, HYBRID)
 
     def record(self) -> Record:
         """Data of the cell."""
@@ -72,8 +78,9 @@ CELLS = (
 def measure(cell: Cell, model: str, place: Path) -> dict[str, Any]:
     """Block ``reception`` of a run, gains in log loss on both references by row, and the error of received rows."""
     scene = scene_of_data(cell.dataset, place)
-    alone = ALONE[model]
-    more: dict[str, Any] = {"scene": scene if alone.scene else None, "settings": alone.settings, "intervals": True}
+    alone = Alone(HYBRID, True) if model == HYBRID else ALONE[model]
+    more: dict[str, Any] = {"scene": scene if alone.scene else None, "settings": alone.settings}
+    more |= {"intervals": model != HYBRID}  # which has its own
     folder = place / cell.name / model
     run = run_of_cell(cell, cell.record(), folder, model, **more)
     arrays = stored_arrays(folder / PREDICTIONS)
@@ -106,7 +113,7 @@ def main() -> dict[str, Any]:
     data_folder(FLAT)
     place, rows, parts = RUNS / fit_key(source_files()), list[dict[str, Any]](), list[dict[str, Any]]()
     for cell in CELLS:
-        for model in MODELS:
+        for model in cell.models:
             say("reception", f"{cell.title}: {model}")
             parts.append(stored_part("reception", f"{cell.name}-{model}", partial(measure, cell, model, place)))
             rows.append(row_of(cell, model, parts[-1]))

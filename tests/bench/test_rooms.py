@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wrf_mi_bench import moved
 from wrf_mi_bench.page_tables import rooms
 from wrf_mi_bench.random_room import OPTIONS, SNR_DB, Survey, random_room_record
 from wrf_mi_bench.rooms import COLUMNS, clipped_cea_db, disagreement
@@ -41,6 +42,32 @@ def test_furniture_and_access_point_stand_apart():
                 assert np.maximum(low - other_high, other_low - high)[:2].max() > 0
         walls = np.concatenate([room.station_m, np.subtract(room.size_m, room.station_m)])
         assert walls.min() == pytest.approx(MOUNTED_M, abs=1e-4) if room.mount != "free" else walls.min() > MOUNTED_M
+
+
+def test_furniture_moves_to_free_places():
+    for seed, room in enumerate(ROOMS[:8], 200):
+        shifts, pieces = moved.displacements(room, seed), len(room.parts) - 6
+        assert 0 < len(shifts) <= pieces // 2
+        boxes = {name: mesh.bounds + shifts.get(name, 0) for name, (_, mesh) in room.parts.items() if "piece" in name}
+        for name, shift in shifts.items():
+            low, high = boxes.pop(name)
+            assert np.linalg.norm(shift) > moved.AT_LEAST_M
+            assert (low[:2] > 0).all() and (high[:2] < room.size_m[:2]).all()  # noqa: PT018
+            assert np.maximum(low - room.station_m, room.station_m - high).max() >= CLEAR_M - 1e-4
+            for other_low, other_high in boxes.values():
+                assert np.maximum(low - other_high, other_low - high)[:2].max() > 0
+
+
+def test_rows_are_saved_up_to_the_first_number_that_is_as_good():
+    counts = {moved.anew(name, n): n / 1000 for name, each in moved.ANEW.items() for n in each}
+    scores = counts | {moved.OURS: 0.05}
+    rows = [{"what": name, "mean": (m, m, m), "gain": (0.1, -0.1, 0.3)} for name, m in scores.items()]
+    assert moved.saved(rows) == {moved.KRIGING: 100, moved.HYBRID: None}
+    assert (
+        moved.table(rows).splitlines()[2]
+        == "| kriging anew, 10 rows | 0.010 (0.010 to 0.010) | 0.100 (-0.100 to 0.300) |"
+    )
+    assert moved.table(rows).splitlines()[-1].endswith("|  |")
 
 
 def test_rooms_differ_in_mount_and_materials():

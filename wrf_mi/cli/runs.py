@@ -93,6 +93,8 @@ def _add_predict(commands: Any) -> None:
     text = "file to write: FILE.npz, or FILE.csv (signal strengths; columns x, y, z in metres, NAME_dbm, NAME_std_db, "
     text += "NAME_received)"
     parser.add_argument("--out", required=True, metavar="FILE", help=text)
+    text = "edited copy of the scene that the run was trained in (wrf-mi edit), in which to predict; nothing is fitted"
+    parser.add_argument("--scene", metavar="SCENE", help=text)
     add_operator(parser)
     add_scheduler(parser)
 
@@ -106,7 +108,7 @@ def predict_command(a: Arguments) -> int:
     check_operator(a)
     inputs = read_inputs(a.tx, a.input)
     with open_scheduler(a.scheduler) as scheduler:
-        run = open_run(a.run, operator=not a.no_operator)
+        run = open_run(a.run, operator=not a.no_operator, scene=a.scene)
         shapes = run.predict_to_file(inputs, Path(a.out), scheduler if a.scheduler else None, progress=True)
     value = {"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}}
     return show(a.json, value, f"{shapes['tx_pos'][0]} predictions: {a.out}")

@@ -73,6 +73,11 @@ class FittedWithIntervals(Fitted):
         """As of the model: intervals change the size of errors, not where they are large."""
         return self.fitted.error_prior(receiver)
 
+    def in_scene(self, scene: str) -> FittedWithIntervals:
+        """The model in an edited scene, with the intervals of the scene that it was fitted in."""
+        other = self.fitted.in_scene(scene)
+        return FittedWithIntervals(other, self._record, self._rows, self._intervals, self._reception)
+
     @property
     def depends_on_heading(self) -> bool:
         """As the model."""

@@ -161,6 +161,14 @@ class Fitted(ABC):
         """Process that the errors of a receiver's predictions are taken to be; None: the model states none."""
         return None
 
+    def in_scene(self, scene: str) -> Fitted:
+        """The model in an edited copy of its scene (`wrf_mi.scene.edit`), without a new fit.
+
+        Raises:
+            InputError: it does not predict from the paths of a scene, or not of this one.
+        """
+        raise InputError("its predictions use no scene, and do not change with one; trace the edited scene")
+
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions by the stages up to each but the last, for a fit in stages (entry ``stages`` of `facts`)."""
         return {}

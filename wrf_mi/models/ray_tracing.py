@@ -85,7 +85,7 @@ class TracingSettings(LoopOptions, TraceOptions):  # type: ignore[misc]  # its f
 class FittedTracing(Fitted):
     """A traced scene with offsets that were fitted to training rows."""
 
-    def __init__(self, problem: Problem, arrays: Arrays, paths: Path) -> None:
+    def __init__(self, problem: Problem, arrays: Arrays, paths: Path | None) -> None:
         self._problem, self._arrays, self._paths = problem, arrays, paths
         self._last: tuple[Inputs, NDArray[Any], list[PathStatistics], set[int]] | None = None
         self._of_rows: tuple[IntArray, NDArray[Any]] | None = None
@@ -102,14 +102,17 @@ class FittedTracing(Fitted):
 
     @cached_property
     def _stored(self) -> TraceResult:
+        assert self._paths is not None
         return _stored_trace(self._paths, self._problem.record)
 
     def _reported(self, traced: TraceResult) -> NDArray[Any]:
         observed = self._tracer.observe(traced)
         return observed if self._offsets is None else self._offsets(observed)
 
-    def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
-        """Predictions from the stored paths."""
+    def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
+        """Predictions from the stored paths, which an edited scene has not."""
+        if self._paths is None:
+            return None
         # Receivers are predicted in turn.
         if self._of_rows is None or not np.array_equal(self._of_rows[0], rows):
             self._of_rows = rows, self._reported(self._stored.of_transmitters(rows))
@@ -130,6 +133,10 @@ class FittedTracing(Fitted):
             self._last = inputs, self._reported(traced), statistics, set()
         self._last[3].add(receiver)
         return Decomposition(Prediction(self._last[1][receiver]), paths=self._last[2][receiver])
+
+    def in_scene(self, scene: str) -> FittedTracing:
+        """Paths of an edited scene, with the offsets of strengths."""
+        return FittedTracing(replace(self._problem, scene=scene, material=None), self._arrays, None)
 
     def arrays(self) -> Arrays:
         """Numbers of rays and paths, duration of tracing, and offsets."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,7 @@ class Run:
         folder: run folder.
         record: data that the model was fitted to; None: the data set that the folder names.
         operator: learned fields predict by operator where they can.
+        scene: edited copy of the scene that the model was fitted in, to predict in; None: that scene.
         kept: what lives as long as the run, such as a scene in a temporary folder.
 
     >>> import wrf_mi
@@ -57,6 +58,7 @@ class Run:
     folder: Path
     record: Record | None = field(default=None, repr=False, compare=False)
     operator: bool = True
+    scene: str | Path | None = None
     kept: Any = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -81,20 +83,29 @@ class Run:
 
     @cached_property
     def problem(self) -> Problem:
-        """Data, scene and settings that the model was fitted to."""
+        """Data, scene and settings that the model was fitted to, with an edited scene in place of its own."""
         config = self.config
-        scene = config.scene, config.material, config.antennas
+        scene = (config.scene, config.material) if self.scene is None else (str(self.scene), None)
         data, left_out = self.record or config.dataset, tuple(config.left_out)
-        problem = Problem(data, config.settings, config.seed, *scene, self.operator, left_out)
+        problem = Problem(data, config.settings, config.seed, *scene, config.antennas, self.operator, left_out)
         return stored_problem(problem, self.folder)
 
     @cached_property
     def fitted(self) -> Fitted:
         """Fitted model; `InputError`: not a finished run, or a run with several splits."""
+        if self.scene is not None:
+            try:
+                return replace(self, scene=None).fitted.in_scene(str(self.scene))
+            except InputError as error:
+                raise InputError(f"{self.folder}: {error}") from None
         problem = self.problem
         if not (self.folder / SPLIT).exists():
             raise InputError(f"{self.folder}: one model for each block; choose one, e.g. {self.folder / 'fold0'}")
         return load_fitted(self.config, problem, self.folder)[0]
+
+    def in_scene(self, scene: str | Path | Any) -> Run:
+        """The run in an edited copy of its scene, a `wrf_mi.Scene` or folder; of hybrids, of the corrected scene."""
+        return replace(self, scene=getattr(scene, "folder", scene), kept=(self.kept, scene))
 
     @property
     def receivers(self) -> tuple[Receiver, ...]:
@@ -311,7 +322,8 @@ class Run:
                 collect(parts[part], receiver, prediction)
             predictions.clear()  # the scheduler keeps results to the end
 
-        opener, sizes = partial(open_run, self.folder, operator=self.operator), [p.stop - p.start for p in parts]
+        opener = partial(open_run, self.folder, operator=self.operator, scene=self.scene)
+        sizes = [p.stop - p.start for p in parts]
         chosen = [inputs.rows(rows) for rows in parts]
         scheduler.map(_predict_part, chosen, opener, what="predicting", sizes=sizes, each=each, lines=True)
 
@@ -341,7 +353,7 @@ def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted
         return config.entry.load(arrays, visible, part), seconds
 
 
-def open_run(folder: str | Path, record: Record | None = None, operator: bool = True) -> Run:
+def open_run(folder: str | Path, record: Record | None = None, operator: bool = True, scene: Any = None) -> Run:
     """Open a run: ``open_run(folder).predict(tx_pos_m, receiver)`` predicts what a receiver observes.
 
     Arguments are the attributes of `Run`; `InputError` where the folder is none of a run.
@@ -351,7 +363,7 @@ def open_run(folder: str | Path, record: Record | None = None, operator: bool = 
     >>> open_run(run.folder).config.model
     'idw'
     """
-    run = Run(Path(folder), record, operator)
+    run = Run(Path(folder), record, operator, scene)
     _ = run.config
     return run
 

@@ -24,6 +24,7 @@ from ...graph.receivers import GAPS, Form
 from ...graph.settings import TRACED_NAMES
 from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers, scene_carrier
+from ...tracing.paths.edited_scene import parameters_in
 from ...training.by_distance import Reach
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings
@@ -147,6 +148,19 @@ class FittedField(Fitted):
         gaussians = {} if self.field is None else {"gaussians": int(self.params["position"].shape[1])}
         phases = {PHASE_ERROR: float(self._arrays[PHASE_ERROR])} if PHASE_ERROR in self._arrays else {}
         return {"steps": self.config.steps} | gaussians | phases
+
+    def in_scene(self, scene: str) -> Fitted:
+        """Paths of an edited scene with the fitted parameters of its surfaces; Gaussians of the field stay."""
+        if self._problem.scene is None:
+            return super().in_scene(scene)
+        edited = replace(self._problem, scene=scene, material=None)
+        opened, stated = (problem.open_scene(self.form.carrier_hz) for problem in (edited, self._problem))
+        try:
+            params = parameters_in(opened, stated, self.params)
+        except InputError as error:
+            raise InputError(f"{scene}: {error}; trained in {self._problem.scene}") from None
+        other = {name: values for name, values in self._arrays.items() if not name.startswith(PARAM)}
+        return type(self)(other | keyed(PARAM, params), self.config, edited, self._store)
 
     def without_gaussians(self) -> FittedField:
         """The same paths without the Gaussians beside them."""

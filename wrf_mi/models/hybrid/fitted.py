@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -132,6 +132,12 @@ class FittedHybrid(Fitted):
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """The prediction, its traced and learned components, NaN where they have no weight, and the traced paths."""
         return self._of_inputs(inputs, receiver, lambda part, *of_part: part.decompose(*of_part), std)
+
+    def in_scene(self, scene: str) -> Fitted:
+        """The paths' part in an edited scene; residuals and weights stay."""
+        if PATHS not in self.parts:
+            return super().in_scene(scene)
+        return replace(self, parts=self.parts | {PATHS: self.parts[PATHS].in_scene(scene)})
 
     @property
     def depends_on_heading(self) -> bool:

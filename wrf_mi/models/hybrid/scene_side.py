@@ -81,6 +81,10 @@ class SceneSide(Fitted):
         """As of the fitted model."""
         return self.fitted.error_prior(receiver)
 
+    def in_scene(self, scene: str) -> SceneSide:
+        """The fitted model in an edited copy of the scene that it was fitted in."""
+        return type(self)(self.fitted.in_scene(scene), replace(self.problem, scene=scene, material=None))
+
     def arrays(self) -> Arrays:
         """Arrays of the fitted model."""
         return self.fitted.arrays()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
@@ -49,6 +50,15 @@ class FittedStrengths(SceneSide):
 
     fitted: Strengths
     unseen: HeldOutPrediction | None = None  # predictions of held-out rows
+
+    def in_scene(self, scene: str) -> FittedStrengths:
+        """Kriged differences from the power traced in the stated scene, about the power traced in an edited one."""
+        problem, field = replace(self.problem, scene=scene, material=None), copy(self.fitted.field)
+        exact = field.prior.traced is not None and field.prior.traced.exact
+        power = _traced(problem)(problem.record.receivers) if exact else _local_mean(problem)
+        # The posterior of the training rows is about the scene in which they were measured.
+        field.prior = replace(field.prior, traced=power)
+        return FittedStrengths(replace(self.fitted, field=field), problem)
 
     def held_out_at(self, held_out: HeldOut) -> HeldOutPrediction | None:
         """Predictions of the rows that were held out, see `SceneSide`."""
