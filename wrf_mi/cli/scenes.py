@@ -87,11 +87,11 @@ def _add_correct(commands: Any) -> None:
     add("dataset", metavar="DATASET", help=DATASET)
     add("--scene", required=True, metavar="SCENE", help=SCENE)
     add("--out", required=True, metavar="SCENE2", help="scene folder to make")
-    parts = "what is changed, from materials,planes,frame,hidden,gain,pose,patterns"
+    parts = "what is changed, from materials,planes,frame,hidden,phases,gain,pose,patterns"
     add(
         "--calibrate",
         metavar="LIST",
-        help=f"{parts} (default: the first four; for signal strengths materials and gain)",
+        help=f"{parts} (default: the first five; for signal strengths materials and gain)",
     )
     add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3; strengths: 6)")
     add("--reflections", type=int, metavar="N", help="largest number of reflections (default: 3; strengths: 2)")

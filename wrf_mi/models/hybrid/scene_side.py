@@ -22,7 +22,7 @@ from ...core import InputError, Prediction, Record, Split
 from ...core.files import write_atomically
 from ...core.settings import with_settings
 from ...correction import Correction, correct_scene, default_options, write_page
-from ...correction.options import FRAME, HIDDEN, PLANES
+from ...correction.options import FRAME, HIDDEN, PHASES, PLANES
 from ...scene.correction_data import FILE as CORRECTION
 from ...tasks import instrument_of, task_of
 from ...tracing import TraceOptions
@@ -128,8 +128,9 @@ def corrected(problem: Problem, split: Split, session: Session) -> tuple[Problem
 def _correct(problem: Problem, split: Split, session: Session) -> list[StageReport]:
     """Write the corrected scene where it gains; reports of its stages, none where it cannot be corrected."""
     record, options = problem.record, default_options(problem.record)
-    if CORRECTED not in problem.settings.wanted:
-        options = replace(options, parts=tuple(part for part in options.parts if part not in OF_GEOMETRY))
+    # Predictions need phases: materials that fit without them do not improve a score of channels.
+    left_out = {PHASES} if CORRECTED in problem.settings.wanted else {PHASES, *OF_GEOMETRY}
+    options = replace(options, parts=tuple(part for part in options.parts if part not in left_out))
     assert problem.scene is not None
     try:
         correction = correct_scene(problem.scene, record, split, options, problem.material, session.report)
