@@ -118,6 +118,8 @@ _OWN: Mapping[str, Check] = {
         **_STORED,
     ),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="page_tables:rooms"),
+    "fdtd": _here("Maxwell's equations in a toy scene", "fdtd:main", table="fdtd:table"),
+    "far-scans": _here("scans off by wavelengths", "far_scans:main", resumes=True, table="far_scans:table"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
     "reception": _here("reception", "reception:main", FLAT, resumes=True, table="page_tables:reception"),
     "moved": _here("furniture moved", "moved:main", resumes=True, table="moved:table"),

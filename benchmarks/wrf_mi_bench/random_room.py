@@ -54,7 +54,9 @@ DEFAULT = Survey()
 SCANNER_CLEAR_M = 0.35  # least distance of the LiDAR from surfaces, metres
 
 
-def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) -> tuple[Record, Path, Path]:
+def random_room_record(
+    seed: int, folder: str | Path, survey: Survey = DEFAULT, subcarriers_hz: FloatArray = SUBCARRIERS_HZ
+) -> tuple[Record, Path, Path]:
     """Measure the room of a seed: its channels, and a scene made from a scan of it; all files go into ``folder``.
 
     The official split is the first ``train`` rows and the rest; positions are drawn independently.
@@ -75,11 +77,11 @@ def random_room_record(seed: int, folder: str | Path, survey: Survey = DEFAULT) 
         "csi",
         positions,
         (Receiver("access-point", station, np.array(UPRIGHT)),),
-        np.zeros((1, count, len(SUBCARRIERS_HZ)), np.complex64),
+        np.zeros((1, count, len(subcarriers_hz)), np.complex64),
         official=(np.arange(survey.train), np.arange(survey.train, count)),
-        frequencies_hz=SUBCARRIERS_HZ,
+        frequencies_hz=subcarriers_hz,
     )
-    channel = RayTracer(true.parent, ChannelInstrument(record.receivers, SUBCARRIERS_HZ), OPTIONS)(positions)[0]
+    channel = RayTracer(true.parent, ChannelInstrument(record.receivers, subcarriers_hz), OPTIONS)(positions)[0]
     noisy = with_noise(channel[:, None], SNR_DB, np.random.default_rng([seed, 2]))[:, 0]
     poses = free_positions(scene, bounds, POSES, SCANNER_CLEAR_M, rng, seed)
     scan = write_arrays(folder / "scan.npz", {"points": _scan(true, poses, seed, survey).astype(np.float32)})

@@ -21,13 +21,14 @@ from wrf_mi.core.registry import resolve
 RESULTS = CHECKOUT / "benchmarks" / "results"
 NEEDS_NO_DATA = {
     *("damaged-scenes", "traced-and-splatted", "scaling", "operator", "stress", "pareto", "rooms", "phase-error"),
-    *("closed-forms", "elsewhere", "gpu", "robustness", "sentinels", "new-carriers", "moved"),
+    *("closed-forms", "elsewhere", "gpu", "robustness", "sentinels", "new-carriers", "moved", "far-scans"),
 }
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
     **dict.fromkeys(("operator", "waits"), "speed.md"),
     **dict.fromkeys(("stages", "intervals"), "hybrid.md"),
     **{"rooms": "correction.md", "locate": "locate.md", "moved": "scenes.md"},
+    **dict.fromkeys(("fdtd", "far-scans"), "correction.md"),
     **{"reception": "maps.md", "closed-forms": "numerics.md"},
 }
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""

@@ -88,8 +88,9 @@ def _add_correct(commands: Any) -> None:
     add("dataset", metavar="DATASET", help=DATASET)
     add("--scene", required=True, metavar="SCENE", help=SCENE)
     add("--out", required=True, metavar="SCENE2", help="scene folder to make")
-    parts = "what to fit to training rows, separated by commas: materials, planes, frame, hidden, gain, pose, patterns"
-    add("--calibrate", metavar="LIST", help=f"{parts} (default: the first four; for signal strengths materials, gain)")
+    parts = "what to fit to training rows, of materials,planes,frame,hidden,phases,gain,pose,patterns"
+    default = "materials,planes,frame,hidden; for signal strengths materials,gain"
+    add("--calibrate", metavar="LIST", help=f"{parts} (default: {default})")
     add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3; strengths: 6)")
     add("--reflections", type=int, metavar="N", help="largest number of reflections (default: 3; strengths: 2)")
     add("--rays", metavar="N", help="number of rays from each receiver (default: 65536), or auto as for train")

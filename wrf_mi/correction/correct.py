@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import rankdata
 from threadpoolctl import threadpool_limits
 
 from ..core import InputError, Record, Split
@@ -34,8 +35,9 @@ from ..tracing.paths.solve import Prepared
 from ..training.selection import hold_out_groups, improves, last_gain
 from .misfit import Misfit
 from .moves import Moves
-from .options import DEFAULTS, FRAME, GAIN, HIDDEN, MATERIALS, PLANES, STRENGTHS, CorrectionOptions, OnStage
+from .options import DEFAULTS, FRAME, GAIN, HIDDEN, MATERIALS, PHASES, PLANES, STRENGTHS, CorrectionOptions, OnStage
 from .state import LEAST_PATHS, ScenePosterior, State
+from .uncertain_phases import UncertainPhases
 
 LEVEL = 0.9  # level of the intervals for which errors of rows that a scene knows are enlarged
 NO_ROWS = np.zeros((0, 2), np.int64)  # no rows retained by receivers that are held out (`wrf_mi.core.Split`)
@@ -124,13 +126,14 @@ def correct_scene(
     judged = _judged_stages(trial, traced, held_out)
     units = ((stage, held_out.units(result.score)) for stage, result in judged.items())
     best_stage = last_gain(units, held_out.higher_is_better, confidence=CONFIDENCE)
+    if not _moves(best_stage):
+        best_stage = _by_uncertain_phases(trial, traced, held_out, judged, best_stage)
     # What is kept is fitted to all rows, along the paths of the scene that the trial found.
     best = judged[best_stage].state if best_stage else None
     final = traced.posterior(record, split.all_train, best)
     state, data, deviation = final.start(""), None, np.zeros(len(final.stated))
     if best:
-        state = best.at(final).solved()
-        deviation[state.free], left_out = state.uncertainty()
+        state, deviation, left_out = _by_all_rows(best, final)
         unseen = judged[best_stage].unseen
         before, after = held_out.vector_of(best, unseen), held_out.with_mean_gain(state.vector, final.misfit)
         data = CorrectionData(record.name, split.all_train, _error_ratio(unseen, before, final.misfit, after, left_out))
@@ -226,7 +229,7 @@ class _Judged(NamedTuple):
 def _judged_stages(trial: ScenePosterior, traced: _TracedScene, held_out: _HeldOut) -> dict[str, _Judged]:
     """States of the stated scene ("") and of each stage, by the known rows, and scores of those held out."""
     # Parts that are changed together: materials without planes, and all.
-    parts = trial.options.parts
+    parts = [part for part in trial.options.parts if part != PHASES]
     stages, still = ["+".join(parts)], [part for part in parts if part not in (PLANES, FRAME)]
     if MATERIALS in still and len(still) < len(parts):
         stages.insert(0, "+".join(still))
@@ -243,6 +246,38 @@ def _judged_stages(trial: ScenePosterior, traced: _TracedScene, held_out: _HeldO
             state = Moves(along_moved, stage).continued(state)
             judged[stage] = held_out.judged(state, traced.posterior(held_out.record, held_out.rows, state).misfit)
     return judged
+
+
+def _by_uncertain_phases(
+    trial: ScenePosterior, traced: _TracedScene, held_out: _HeldOut, judged: dict[str, _Judged], kept: str
+) -> str:
+    """The stage that is kept where planes are not resolved: ``kept``, or materials by uncertain phases (``judged``)."""
+    if PHASES not in trial.options.parts or not UncertainPhases.serves(trial.misfit):
+        return kept
+    stage = "+".join(part for part in trial.options.parts if part not in (PLANES, FRAME))
+    fit = UncertainPhases(trial)
+    judged[stage] = held_out.judged(fit.best(stage), judged[""].unseen)
+    # Predicted channels of wrong phases say nothing of materials: their likelihood with uncertain phases decides.
+    unseen = UncertainPhases(traced.posterior(held_out.record, held_out.rows), fit.noise)
+    vectors = (held_out.vector_of(judged[name].state, unseen.misfit) for name in (kept, stage))
+    before, after = (held_out.units(unseen.scores(vector)) for vector in vectors)
+    gain = (after - before)[np.isfinite(after - before)]
+    # Signed ranks (Wilcoxon, 1945): rows of which a path is missing in the scene have gains and losses of any size.
+    ranks = np.sign(gain) * rankdata(np.abs(gain))
+    units = (kept, np.zeros(len(gain))), (stage, ranks)
+    return last_gain(units, higher_is_better=True, confidence=CONFIDENCE)
+
+
+def _by_all_rows(best: State, final: ScenePosterior) -> tuple[State, FloatArray, FloatArray]:
+    """A state fitted to all rows, standard deviations [p], and residuals of each row by a fit to the others."""
+    if PHASES in best.stage.split("+"):
+        fit = UncertainPhases(final)
+        state = fit.refined(best.at(final))
+        # Residuals of unknown phases are those of all channels: a row that is left out changes them little.
+        return state, fit.deviation(state), final.misfit.residual(state.vector)
+    state, deviation = best.at(final).solved(), np.zeros(len(final.stated))
+    deviation[state.free], left_out = state.uncertainty()
+    return state, deviation, left_out
 
 
 def _moves(stage: str) -> bool:

@@ -16,9 +16,9 @@ from ..tracing.paths.instrument_parameters import TX_PATTERN
 from ..tracing.paths.scene_parameters import EXPONENT, PREFIX, QUANTITIES, SHIFT, TILT
 from ..tracing.paths.traced_field import TracedOptions
 
-FRAME, HIDDEN = "frame", "hidden"
+FRAME, HIDDEN, PHASES = "frame", "hidden", "phases"
 MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"
-PARTS = (MATERIALS, PLANES, FRAME, HIDDEN, GAIN, "pose", PATTERNS)  # what a correction may change
+PARTS = (MATERIALS, PLANES, FRAME, HIDDEN, GAIN, "pose", PATTERNS, PHASES)  # what a correction may change
 DEVIATIONS = {
     "permittivity": 0.7,  # of the logarithm of permittivity - 1
     "conductivity": 1.4,  # of logarithms, too
@@ -45,7 +45,8 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
     """Options of a correction.
 
     Attributes:
-        parts: parts that may change, of `PARTS`.
+        parts: parts that may change, of `PARTS`; with ``phases`` materials are fitted to channels whose paths have
+            uncertain phases where no change of planes is kept (`wrf_mi.correction.uncertain_phases`).
         rows: most training rows that are compared, of images over all receivers; of more, a random subset, seeded by
             the split.
         faint: the weakest paths of a transmitter are dropped while their amplitudes add up to less than this share.
@@ -75,6 +76,8 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
             if value != getattr(CorrectionOptions, name) and not {*parts} & {*self.parts}:
                 text = f"{name}={value:g}: of {' and '.join(parts)}, which {','.join(self.parts)} leaves"
                 raise InputError(f"correct: {text}; omit it")
+        if PHASES in self.parts and (MATERIALS not in self.parts or {PLANES, FRAME}.isdisjoint(self.parts)):
+            raise InputError(f"correct: {PHASES} needs {MATERIALS}, and {PLANES} or {FRAME}, whose errors phases have")
         if not self.parts:
             raise InputError(f"correct: nothing to change; choose of {', '.join(PARTS)}")
 

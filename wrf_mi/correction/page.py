@@ -32,7 +32,7 @@ from ..tasks import task_of
 from ..tracing.paths.corrected_scene import moved_triangles, write_corrected_scene
 from ..tracing.paths.scene_parameters import QUANTITIES, SHIFT, SURFACE, TILT, name_of
 from .correct import Correction
-from .options import FRAME, MATERIALS
+from .options import FRAME, MATERIALS, PHASES
 from .state import LEAST_PATHS, rigid_motion, scene_entries
 
 PAGE, PICTURE = "correction.md", "correction.png"
@@ -203,6 +203,9 @@ def _scores_text(correction: Correction, facts: dict[str, Any]) -> list[str]:
         "",
         *_table("scene | median | mean", "lrr", scores),
     ]
+    if PHASES in correction.kept.split("+"):
+        text = "No planes were resolved. Materials are those for which the channels are most probable with uncertain"
+        lines += [f"{text} phases of paths: powers are calibrated, phases are wrong.", ""]
     if correction.data is not None:
         ratio = f"{correction.data.error_ratio:.2f}"
         lines += [f"Errors at rows that the scene does not know are about {ratio} times those at the rows above.", ""]

@@ -198,13 +198,14 @@ class ScenePosterior:
         return np.sort(np.concatenate([np.zeros(0, np.int64), *free]))
 
     @property
-    def _has_frame(self) -> bool:
+    def has_frame(self) -> bool:
+        """Whether planes share a motion of the frame."""
         return FRAME in self.options.parts and SHIFT in self.misfit.parts
 
     def prior(self, mean: FloatArray, free: IntArray) -> Prior:
         """Prior of some entries about ``mean`` [p]; planes share the motions of the frame."""
         covariance = np.diag(np.square(self.prior_deviation[free]))
-        if self._has_frame:
+        if self.has_frame:
             # Shifts and tilts are the frame's motion M w plus each plane's deviation: covariance D + M S M^T.
             _, among, which = np.intersect1d(free, self.misfit.plane_entries, return_indices=True)
             motions = self.motions[which]
@@ -231,7 +232,7 @@ class ScenePosterior:
 
     def expected(self, vector: FloatArray, places: IntArray) -> FloatArray:
         """Entries by the rigid motion of the other planes that enough paths meet; those of materials as they are."""
-        if not self._has_frame:
+        if not self.has_frame:
             return vector[places].copy()
         # Without the entries themselves, which are to be judged.
         by_frame = vector.copy()
