@@ -259,11 +259,6 @@ def _corrections(
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of the energy that is not explained, and errors of power, at known receivers and the third."""
-    lines = []
-    for row in rows:
-        unexplained, power = row["unexplained_db"], row["power_db"]
-        cells = (*(f"{value:.1f}" for value in unexplained), *(f"{value:+.1f}" for value in power))
-        lines.append([row["what"], *cells])
-    head = ["scene", *(f"unexplained, {n} (dB)" for n in (1, 2, 3)), *(f"power, {n} (dB)" for n in (1, 2, 3))]
-    return markdown_table(head, lines)
+    """Markdown table of what is not explained, and of errors of power, at the receiver that calibrations do not know."""
+    lines = [[row["what"], f"{row['unexplained_db'][-1]:.1f}", f"{row['power_db'][-1]:+.1f}"] for row in rows]
+    return markdown_table(["scene", "unexplained (dB)", "power (dB)"], lines)

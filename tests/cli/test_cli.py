@@ -327,7 +327,8 @@ def test_demo_compares_models_in_a_held_out_region_and_in_a_measured_flat(
         assert text in out + err
     assert "median absolute error" in out
     table = rows_of(tmp_path / "demo" / "compare" / "compare.csv")
-    assert [row["model"] for row in table] == ["ray-tracing", "kriging", "idw4", "ray-tracing", "kriging", "idw100"]
+    models = ["ray-tracing", "kriging", "idw4", "constant", "ray-tracing", "kriging", "idw100", "constant"]
+    assert [row["model"] for row in table] == models
     assert {row["dataset"] for row in table} == {"laboratory", "flat"}
     assert (tmp_path / "demo" / "scene" / "preview.png").is_file()
     assert "plotly" in (tmp_path / "demo" / "view.html").read_text()

@@ -108,4 +108,4 @@ def test_materials_are_found_where_planes_are_not(room):
 
 def test_phases_without_what_makes_them_uncertain_are_refused():
     with pytest.raises(InputError, match="phases needs materials, and planes or frame"):
-        replace(OPTIONS, parts=("materials", "phases"))
+        CorrectionOptions(("materials", "phases"))
