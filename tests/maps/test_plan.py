@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import wrf_mi
 from wrf_mi import InputError, train
 from wrf_mi.cli.main import main
 from wrf_mi.maps.plan import error_priors, greedy, plan
+from wrf_mi.maps.plan_losses import SURFACE_DB
 from wrf_mi.models.error_prior import ErrorPrior, with_columns
 from wrf_mi.models.interpolation.kriging import Kriging, UncertainKriged
 from wrf_mi.models.interpolation.kriging_equations import KrigingSystem, correlation
@@ -100,16 +103,22 @@ def test_plan_goes_where_nothing_was_measured(run: wrf_mi.Run, tmp_path: Path) -
     assert near.expected_error[-1] >= planned.expected_error[-1]
 
 
-def test_surfaces_of_a_scene_are_terms_of_the_process(
-    run: wrf_mi.Run, flat_folder: Path, room: Path, tmp_path: Path
-) -> None:
-    in_scene = train(flat_folder, "hybrid", out=tmp_path / "hybrid", scene=room, n_train=12)
+def test_losses_of_a_corrected_scene_are_terms_of_the_process(flat_folder: Path, room: Path, tmp_path: Path) -> None:
+    scene = Path(shutil.copytree(room, tmp_path / "scene"))
+    in_scene = train(flat_folder, "hybrid", out=tmp_path / "hybrid", scene=scene, n_train=12)
     at = np.array([[1.0, 1.0, 1.3], [3.0, 2.0, 1.3]])
-    with_walls, alone = error_priors(in_scene, [0], at)[0], in_scene.fitted.error_prior(0)
-    assert alone is not None
-    added = with_walls.covariance(at, at) - alone.covariance(at, at)
+    stated = error_priors(in_scene, [0], at)[0].covariance(at, at)
+    by_stated = plan(in_scene, 3, criterion="material")
+    assert by_stated.expected_error[-1] < by_stated.expected_error[0] <= SURFACE_DB
+    assert max(before for before, _ in by_stated.surfaces.values()) == by_stated.expected_error[0]
+    assert all(after <= before for before, after in by_stated.surfaces.values())
+    facts = {"materials": [], "data": {"name": "other", "rows": [], "error_ratio": 1.0}}
+    (scene / "correction.json").write_text(json.dumps(facts))
+    added = error_priors(in_scene, [0], at)[0].covariance(at, at) - stated
     assert (added.diagonal() > 0).all()
     assert np.linalg.eigvalsh(added).min() > -EXACT
+    # The rows of a correction count once, in the deviations that it states.
+    assert plan(in_scene, 1, criterion="material").expected_error[0] == SURFACE_DB
 
 
 def test_command_writes_positions_and_a_picture(
