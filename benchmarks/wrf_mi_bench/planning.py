@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.spatial.distance import cdist
 
 import wrf_mi
 from wrf_mi.core import Record
 from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.files import write_figure
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets import make_splits
 from wrf_mi.maps.plan import greedy
@@ -42,6 +44,7 @@ from .random_room import random_room_record
 from .sources import fit_key, source_files
 
 RUNS = Path("runs/bench/plan")
+PICTURE = Path("docs/images/planned-rows.png")  # written only in a checkout of the project
 SIZES = (10, 20, 30, 40, 50, 60)
 STARTS = range(10)
 MOST_CANDIDATES, MOST_TESTS = 400, 400  # training rows among which rules choose, and test rows, drawn at random
@@ -235,7 +238,12 @@ def row_of(name: str, part: Mapping[str, Any]) -> dict[str, Any]:
     reached = np.flatnonzero(sign * (means[OURS] - means[RANDOM][-1]) >= 0)
     equal = SIZES[reached[0]] if len(reached) else None
     value = f"{means[OURS][2]:.3g} with 30 planned rows, {means[RANDOM][-1]:.3g} with 60 random ones"
-    known = {"mean": {rule: mean.tolist() for rule, mean in means.items()}, "gain": gains, "equal": equal}
+    known: dict[str, Any] = {
+        "mean": {rule: mean.tolist() for rule, mean in means.items()},
+        "gain": gains,
+        "equal": equal,
+    }
+    known["label"] = "SSIM" if part["higher_is_better"] else "error, dB"
     return {**line(name, value, "30 planned rows as good as 60 random ones"), **known}
 
 
@@ -249,6 +257,8 @@ def main() -> dict[str, Any]:
         parts[name] = stored_part("plan", name.replace(" ", "-"), work)
     rows = [row_of(name, part) for name, part in parts.items()]
     result: dict[str, Any] = {"rows": rows, "measured": measured_on(parts.values())}
+    if PICTURE.parent.is_dir():
+        write_figure(PICTURE, picture(rows))
     worse = [row["what"] for row in rows if row["gain"][FILLING][2] < 0]
     return result | ({"failed": f"clearly worse than space-filling: {', '.join(worse)}"} if worse else {})
 
@@ -263,3 +273,18 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         gains = ["{:.3f} ({:.3f} to {:.3f})".format(*row["gain"][rule]) for rule in (RANDOM, FILLING)]
         lines.append([row["what"], *scores, *gains, str(row["equal"] or "more than 60")])
     return markdown_table(head, lines)
+
+
+def picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Scores of each rule by the number of rows, a panel for each place."""
+    figure = Figure(figsize=(11, 5), layout="constrained", facecolor="white")
+    panels = figure.subplots(2, -(-len(rows) // 2), squeeze=False).ravel()
+    for axes, row in zip(panels, rows, strict=False):
+        for rule, colour in zip(RULES, ("0.6", "#2a6f97", "#e09f3e", "#c1121f"), strict=True):
+            axes.plot(SIZES, row["mean"][rule], ".-", color=colour, linewidth=1.2, label=rule)
+        axes.set(xlabel="rows", ylabel=row["label"])
+        axes.set_title(row["what"], fontsize=9)
+    for axes in panels[len(rows) :]:
+        axes.set_axis_off()
+    panels[0].legend(fontsize=7)
+    return figure

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from wrf_mi_bench.planning import farthest_points
+from wrf_mi_bench.planning import OURS, RULES, SIZES, even_weights, farthest_points, row_of, table
 
 import wrf_mi
 from wrf_mi import InputError, train
@@ -80,6 +80,22 @@ def test_error_of_kriging_is_the_deviation_that_it_states() -> None:
 def test_farthest_points_fill_a_line() -> None:
     line = np.linspace(0, 8, 9)[:, None] * [1.0, 0, 0]
     assert farthest_points(line, 3, line[:1]).tolist() == [8, 4, 2]
+
+
+def test_weights_make_sums_over_rows_sums_over_the_area() -> None:
+    place = np.random.default_rng(6).uniform(0, 10, (400, 1)) ** 2 / 10 * [1.0, 0, 0]  # denser towards 0
+    weights = even_weights(place)
+    assert place[:, 0].mean() < 3.6
+    assert 4.3 < np.average(place[:, 0], weights=weights) < 5.7
+
+
+def test_benchmark_states_gains_and_planned_rows_that_equal_random_ones() -> None:
+    falling = np.linspace(4, 3, len(SIZES))
+    errors = {rule: [(falling - 0.4 * (rule == OURS)).tolist()] * 3 for rule in RULES}
+    row = row_of("room", {"errors": errors, "higher_is_better": False})
+    assert row["equal"] == 40
+    assert row["gain"]["random"] == pytest.approx([0.4] * 3)
+    assert table([row]).splitlines()[2].endswith("| 0.400 (0.400 to 0.400) | 0.400 (0.400 to 0.400) | 40 |")
 
 
 @pytest.fixture(scope="module")
