@@ -25,7 +25,7 @@ from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets import make_splits
-from wrf_mi.maps.plan import POWER, greedy
+from wrf_mi.maps.plan import greedy
 from wrf_mi.models import Inputs
 from wrf_mi.models.error_prior import ErrorPrior
 from wrf_mi.models.hybrid.strengths import SMOOTH_M, SPACING_M, TRACE
@@ -202,7 +202,7 @@ def next_rows(rule: str, place: Place, fit: Fit, rows: IntArray, count: int, see
     covariances = [prior.posterior(positions_m[place.able]) for prior in fit.priors]
     noise = [prior.new_noise for prior in fit.priors]
     weights = np.tile(even_weights(positions_m[place.able]), (len(noise), 1))
-    return place.able[greedy(covariances, noise, weights, np.isin(place.able, left), count, power=POWER)[0]]
+    return place.able[greedy(covariances, noise, weights, np.isin(place.able, left), count)[0]]
 
 
 def scores_of(place: Place, rule: str, start: int) -> list[float]:

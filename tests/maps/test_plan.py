@@ -66,17 +66,6 @@ def test_first_choice_is_the_best_of_all() -> None:
     assert chosen == [int(np.argmin(left))]
 
 
-def test_higher_powers_go_where_the_variance_is_greatest() -> None:
-    at = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [9.0, 0, 0]])  # three together, one alone
-
-    def chosen(power: float) -> list[int]:
-        covariance = prior().covariance(at, at) * np.outer(size := np.array([1, 1, 1, 1.3]), size)
-        return greedy([covariance], [4.0], np.ones((1, 4)), np.ones(4, bool), 1, power=power)[0]
-
-    assert chosen(1.0) == [1]
-    assert chosen(8.0) == [3]
-
-
 def test_error_of_kriging_is_the_deviation_that_it_states() -> None:
     rng = np.random.default_rng(5)
     rows, at = rng.uniform(0, 5, (40, 3)), rng.uniform(0, 5, (8, 3))

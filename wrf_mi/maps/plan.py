@@ -6,9 +6,7 @@ all positions after the training rows, a measurement at c with noise of variance
     C(t, c)^2 / (C(c, c) + s),
 
 whatever it will read. So measurements can be planned one after the other before any is made: each is the candidate with
-the greatest reduction over the map and over receivers, after which C loses that rank. What is reduced is the sum of
-the variances to the power p, to first order: with p = 1 the mean variance, and the greater p, the more do positions
-of great variance count, where a process that is not quite right errs most.
+the greatest reduction, summed over the map and over receivers, after which C loses that rank.
 
 Where a scene was corrected by measurements, strengths depend on the loss at each surface, which the correction knows
 within the standard deviations of its materials. These losses are terms of the process whose columns are the derivatives
@@ -18,8 +16,7 @@ The criterion ``"material"`` lowers the least certain of them (`wrf_mi.maps.plan
 
 Source: Seo, Wallat, Graepel and Obermayer, "Gaussian process regression: active data selection and test point
 rejection" (2000) (the reduction over the map, after Cohn); Krause, Singh and Guestrin, "Near-optimal sensor placements
-in Gaussian processes" (2008), JMLR 9 (greedy choice); Kiefer, "General equivalence theory for optimum designs" (1974),
-Annals of Statistics 2 (sums of powers); Picheny, Ginsbourger, Roustant, Haftka and Kim, "Adaptive designs
+in Gaussian processes" (2008), JMLR 9 (greedy choice); Picheny, Ginsbourger, Roustant, Haftka and Kim, "Adaptive designs
 of experiments for accurate approximation of a target region" (2010) (weights about a threshold).
 """
 
@@ -58,7 +55,6 @@ MOST_TARGETS, MOST_CANDIDATES = 600, 1500
 """Positions at which errors count, and candidates: covariances between all of them are kept for each receiver."""
 LEAST_SHARE = 0.02  # largest share of a surface over all positions, below which it is left out
 THRESHOLD_DBM = -90.0
-POWER = 4.0  # of variances, chosen on training rows of flat-ble held out
 
 
 @dataclass(frozen=True)
@@ -163,12 +159,10 @@ def _lower_errors(
     """Choices by the error at targets, or about a threshold."""
     priors = error_priors(run, receivers, positions_m)
     weights = np.ones((len(receivers), len(positions_m))) * is_target
-    power = POWER
-    if threshold_dbm is not None:  # weights say where errors count
-        power = 1.0
+    if threshold_dbm is not None:
         weights *= _about(run, receivers, positions_m, threshold_dbm)
     covariances, noise = [prior.posterior(positions_m) for prior in priors], [prior.new_noise for prior in priors]
-    chosen, before, after = greedy(covariances, noise, weights, ~is_target, count, **search, power=power)
+    chosen, before, after = greedy(covariances, noise, weights, ~is_target, count, **search)
     error = np.sqrt(np.stack([before, *after])[:, :, is_target].mean(axis=(1, 2)))
     return chosen, error, np.stack([before, after[-1]]), {}
 
@@ -214,9 +208,8 @@ def greedy(
     worth: Worth | None = None,
     start: FloatArray | None = None,
     on_progress: OnProgress = quiet,
-    power: float = 1.0,
 ) -> tuple[list[int], FloatArray, list[FloatArray]]:
-    """Positions that lower weighted powers of the variances most, one after the other.
+    """Positions that lower weighted variances most, one after the other.
 
     Args:
         covariances: covariances [p, p] of the errors at p positions for each receiver; changed in place.
@@ -227,7 +220,6 @@ def greedy(
         worth: factor [p] of the reductions, from the position before (None: none).
         start: position before the first choice.
         on_progress: progress callback.
-        power: power of the variances.
 
     Returns:
         Indices of the choices, variances [receivers, p] before, and after each.
@@ -238,8 +230,7 @@ def greedy(
         gain = np.zeros(len(free))
         for covariance, variance, weight in zip(covariances, noise, weights, strict=True):
             used = np.flatnonzero(weight)
-            counts = weight[used] * np.maximum(covariance.diagonal()[used], 0) ** (power - 1)
-            gain += counts @ np.square(covariance[used]) / (covariance.diagonal() + variance)
+            gain += weight[used] @ np.square(covariance[used]) / (covariance.diagonal() + variance)
         if worth is not None:
             gain = gain * worth(chosen[-1] if chosen else None, start)
         best = int(np.argmax(np.where(free, gain, -np.inf)))
