@@ -129,7 +129,7 @@ _OWN: Mapping[str, Check] = {
     "gpu": _here("a GPU beside the CPU", "gpu:main", table="gpu:table", gpu=True),
     "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),
     "damaged-scenes": _here("faults of scenes named", "damaged_scenes:main"),
-    "plan": _here("where to measure next", "planning:main", FLAT, resumes=True),
+    "plan": _here("where to measure next", "planning:main", FLAT, resumes=True, table="planning:table"),
     "waits": _here("what a person waits for", "waits:main", RFID, FLAT, resumes=True, table="page_tables:waits"),
     "sentinels": _here(
         "figures kept", "sentinels:main", RFID, FLAT, CONFERENCE, OFFICE, resumes=True, table="sentinels:table"

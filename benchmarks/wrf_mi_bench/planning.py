@@ -2,74 +2,156 @@
 
 From ten random training rows, rows are added ten at a time by each rule, a model is fitted to them, and its error on
 the official test rows is stored. Rules are random rows, those that fill space (each the farthest from all before),
-those of the greatest variance, and `wrf_mi.plan`. Where a scene is known the model is the hybrid's mean in it with
-interpolation.
+those of the greatest variance, and those of `wrf_mi.plan`: `wrf_mi.maps.plan.greedy` on the model's `error_prior`, for
+the error over the area in which rows could be chosen. Strengths are predicted by kriging about the local mean of the
+power traced in a known scene, as by the hybrid's mean and residual, spectra by kriging of their pixels. A scene is
+traced once for all fits.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.spatial.distance import cdist
 
 import wrf_mi
-from wrf_mi.core import Record, Split
+from wrf_mi.core import Record
 from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.files import write_figure
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets import make_splits
-from wrf_mi.maps.plan import error_priors, plan
-from wrf_mi.runs.api import Run
+from wrf_mi.maps.plan import greedy
+from wrf_mi.models import Inputs
+from wrf_mi.models.error_prior import ErrorPrior
+from wrf_mi.models.hybrid.strengths import SMOOTH_M, SPACING_M, TRACE
+from wrf_mi.models.interpolation.kriging import Kriging
+from wrf_mi.models.interpolation.strengths import fit_strengths
+from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.scene.make import make_scene
 from wrf_mi.synthetic.stored import SCAN
-from wrf_mi.tasks import TASKS
+from wrf_mi.tasks import task_of
 from wrf_mi.tasks.scores import bootstrap
+from wrf_mi.tracing.power_map import trace_map
+from wrf_mi.tracing.sionna.scenes import open_scene
 
 from .bench import FLAT
-from .comparison import data_folder, kept_work, line, say
+from .comparison import data_folder, line, measured_on, say, stored_part
 from .random_room import random_room_record
-from .sources import fit_key, source_files
 
-RUNS = Path("runs/bench/plan")
+PICTURE = Path("docs/images/planned-rows.png")  # written only in a checkout of the project
 SIZES = (10, 20, 30, 40, 50, 60)
-STARTS = range(5)
-MOST_CANDIDATES = 400  # training rows among which rules choose, drawn at random
-IN_SCENE = ("stages=mean,residual",)
+STARTS = range(10)
+MOST_CANDIDATES, MOST_TESTS = 400, 400  # training rows among which rules choose, and test rows, drawn at random
+MOST_RECEIVERS = 6
+NEIGHBOURS = 5  # of a position, whose mean distance is the width of the kernel of its density
+COARSE = slice(None, None, 3)  # every third row and column of a spectrum
 RANDOM, FILLING, VARIANCE, OURS = "random", "space-filling", "greatest variance", "plan"
 RULES = (RANDOM, FILLING, VARIANCE, OURS)
+ASKED = "clearly better than random rows, not clearly worse than space-filling ones"
+Errors = dict[str, list[list[float]]]  # scores by rule, start and number of rows
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model that is fitted to some rows: predictions of test rows [n_rx, m, ...], processes of its errors."""
+
+    test: Any
+    priors: Sequence[ErrorPrior]
 
 
 @dataclass(frozen=True)
 class Place:
-    """Data, and the scene of the hybrid or None for kriging."""
+    """Data, rows that rules choose from, test rows, and the fit of a model to rows."""
 
     record: Record
-    scene: Path | None
+    able: IntArray
+    test: IntArray
+    fit: Callable[[IntArray], Fit]
+
+    def score(self, fit: Fit) -> float:
+        """Mean over test rows and receivers."""
+        truth = self.record.observation[:, self.test]
+        return float(np.nanmean(task_of(self.record).of_rows(fit.test, truth)))
+
+
+def _drawn(record: Record, in_scene: bool) -> tuple[Record, IntArray, IntArray]:
+    """Rows among which rules choose and test rows, and the record that has only these, and few receivers."""
+    official = make_splits(record, "official")[0]
+    drawn = [
+        np.sort(np.random.default_rng(number).permutation(rows)[:most])
+        for number, (rows, most) in enumerate([(official.all_train, MOST_CANDIDATES), (official.test, MOST_TESTS)])
+    ]
+    rows, able = np.concatenate(drawn), np.arange(len(drawn[0]))
+    receivers = np.arange(len(record.receivers))[:: -(-len(record.receivers) // MOST_RECEIVERS)]
+    values = record.observation[receivers][:, rows]
+    thinned = Record(
+        record.name,
+        record.task,
+        record.tx_pos_m[rows],
+        tuple(record.receivers[number] for number in receivers),
+        values if in_scene else values[..., COARSE, COARSE],
+        frequencies_hz=record.frequencies_hz,
+        tx_heading_rad=None if record.tx_heading_rad is None else record.tx_heading_rad[rows],
+    )
+    return thinned, able, np.arange(len(able), len(rows))
+
+
+def _strengths(full: Record, scene: Path) -> Place:
+    record, able, test = _drawn(full, in_scene=True)
+    assert record.frequencies_hz is not None
+    opened = open_scene(scene, float(record.frequencies_hz[0]))
+    mean = trace_map(opened, record, SPACING_M, SMOOTH_M, TRACE)
+    heading, receivers = record.tx_heading_rad, range(len(record.receivers))
+    inputs = Inputs(record.tx_pos_m[test], None if heading is None else heading[test])
+
+    def fit(rows: IntArray) -> Fit:
+        fitted = fit_strengths(record, rows, mean)
+        predicted = np.stack([fitted.predict_mean(inputs, receiver) for receiver in receivers])
+        return Fit(predicted, [fitted.error_prior(receiver) for receiver in receivers])
+
+    return Place(record, able, test, fit)
 
 
 def _flat(folder: Path) -> Place:
     plan_file = data_folder(FLAT) / "layout.csv"
-    return Place(wrf_mi.load(FLAT), make_scene(plan_file, folder / "scene", height_m=2.7).folder)
+    return _strengths(wrf_mi.load(FLAT), make_scene(plan_file, folder / "scene", height_m=2.7).folder)
 
 
-def _scanned(name: str, scene: bool, folder: Path) -> Place:
+def _scanned(name: str, folder: Path) -> Place:
     record = wrf_mi.load(name)
-    scan = Path(record.source) / SCAN
-    return Place(record, make_scene(scan, folder / "scene").folder if scene else None)
+    return _strengths(record, make_scene(Path(record.source) / SCAN, folder / "scene").folder)
 
 
 def _room(seed: int, folder: Path) -> Place:
     record, _, scan = random_room_record(seed, folder)
-    return Place(record, scan)
+    power_mw = np.square(np.abs(record.observation)).mean(axis=-1)  # of 80 MHz, for 0 dBm sent
+    assert record.frequencies_hz is not None
+    carrier_hz = record.frequencies_hz.mean(keepdims=True)
+    strengths = replace(record, task="rssi", truth=None, observation=10 * np.log10(power_mw), frequencies_hz=carrier_hz)
+    return _strengths(strengths, scan)
 
 
-PLACES: Mapping[str, Any] = {
+def _spectra(name: str, folder: Path) -> Place:
+    record, able, test = _drawn(wrf_mi.load(name), in_scene=False)
+    values = record.observation[0].astype(float)
+
+    def fit(rows: IntArray) -> Fit:
+        fitted = Kriging().fit(record.tx_pos_m[rows], values[rows])
+        return Fit(fitted.predict(record.tx_pos_m[test])[None], [fitted.error_prior()])
+
+    return Place(record, able, test, fit)
+
+
+PLACES: Mapping[str, Callable[[Path], Place]] = {
     FLAT: _flat,
-    "traced-floor-receivers": partial(_scanned, "traced-floor-receivers", True),
-    "laboratory": partial(_scanned, "laboratory", False),
-    "traced-room": partial(_scanned, "traced-room", False),
+    "traced-floor-receivers": partial(_scanned, "traced-floor-receivers"),
+    "laboratory": partial(_spectra, "laboratory"),
+    "traced-room": partial(_spectra, "traced-room"),
     **{f"random room {seed}": partial(_room, seed) for seed in (201, 202, 203, 204)},
 }
 
@@ -86,70 +168,123 @@ def farthest_points(positions_m: FloatArray, count: int, known_m: FloatArray) ->
     return np.asarray(chosen)
 
 
-def next_rows(rule: str, run: Run, record: Record, rows: IntArray, able: IntArray, count: int, seed: int) -> IntArray:
-    """Rows that a rule adds to those of a run, of those that it may choose from."""
-    left = np.setdiff1d(able, rows)
+def greatest_variances(priors: Sequence[ErrorPrior], positions_m: FloatArray, count: int) -> IntArray:
+    """Indices of positions [n, 3] each of the greatest variance after those before, summed over receivers."""
+    covariances, chosen = [prior.posterior(positions_m) for prior in priors], list[int]()
+    for _ in range(count):
+        variance = np.sum([covariance.diagonal() for covariance in covariances], axis=0)
+        variance[chosen] = -np.inf
+        chosen.append(int(np.argmax(variance)))
+        for covariance, prior in zip(covariances, priors, strict=True):
+            column = covariance[:, chosen[-1]].copy()
+            covariance -= np.outer(column, column / (column[chosen[-1]] + prior.new_noise))
+    return np.asarray(chosen)
+
+
+def even_weights(positions_m: FloatArray) -> FloatArray:
+    """Weights of positions [n, 3] by which sums over them are over the area: the inverse of their local density."""
+    # A robot stands still at some places; a map has as many positions there as elsewhere.
+    distance = cdist(positions_m, positions_m)
+    width = np.sort(distance, axis=1)[:, NEIGHBOURS].mean()
+    return np.asarray(1 / np.exp(-np.square(distance / width)).sum(axis=1))
+
+
+def next_rows(rule: str, place: Place, fit: Fit, rows: IntArray, count: int, seed: int) -> IntArray:
+    """Rows that a rule adds to those of a fit."""
+    left = np.setdiff1d(place.able, rows)
+    positions_m = place.record.tx_pos_m
     if rule == RANDOM:
         return np.random.default_rng([seed, len(rows)]).choice(left, count, replace=False)
     if rule == FILLING:
-        return left[farthest_points(record.tx_pos_m[left], count, record.tx_pos_m[rows])]
+        return left[farthest_points(positions_m[left], count, positions_m[rows])]
     if rule == VARIANCE:
-        covariances = [p.posterior(record.tx_pos_m[left]) for p in error_priors(run, [0], record.tx_pos_m[left])]
-        chosen = list[int]()
-        for _ in range(count):
-            variance = np.sum([covariance.diagonal() for covariance in covariances], axis=0)
-            variance[chosen] = -np.inf
-            chosen.append(int(np.argmax(variance)))
-            for covariance in covariances:
-                column = covariance[:, chosen[-1]].copy()
-                covariance -= np.outer(column, column / column[chosen[-1]])
-        return left[chosen]
-    candidates_m, first = np.unique(record.tx_pos_m[left], axis=0, return_index=True)
-    low, high = (corner(record.tx_pos_m[able, :2], axis=0) for corner in (np.min, np.max))
-    planned = plan(run, count, candidates_m=candidates_m, area_m=(low - 0.1, high + 0.1)).tx_pos_m
-    return left[first[[int(np.flatnonzero((candidates_m == place).all(axis=1))[0]) for place in planned]]]
+        return left[greatest_variances(fit.priors, positions_m[left], count)]
+    covariances = [prior.posterior(positions_m[place.able]) for prior in fit.priors]
+    noise = [prior.new_noise for prior in fit.priors]
+    weights = np.tile(even_weights(positions_m[place.able]), (len(noise), 1))
+    return place.able[greedy(covariances, noise, weights, np.isin(place.able, left), count)[0]]
 
 
-def measure(name: str, rule: str, start: int, folder: Path) -> list[float]:
-    """Median error on the test rows by the number of rows, from one start."""
-    place = PLACES[name](folder)
-    record, official = place.record, make_splits(place.record, "official")[0]
-    rng = np.random.default_rng([start, 7])
-    able = np.sort(rng.permutation(official.all_train)[:MOST_CANDIDATES])
-    rows, scores = np.sort(rng.permutation(able)[: SIZES[0]]), list[float]()
-    model, settings = ("kriging", ()) if place.scene is None else ("hybrid", IN_SCENE)
-    for size in SIZES:
-        split = Split("chosen", start, rows, rows[:0], official.test)
-        run = wrf_mi.train(record, model, out=folder / f"{size}", scene=place.scene, split=split, settings=settings)
-        scores.append(run.metrics[TASKS[record.task].block]["median"])
-        if size < SIZES[-1]:
-            count = SIZES[SIZES.index(size) + 1] - size
-            rows = np.sort(np.concatenate([rows, next_rows(rule, run, record, rows, able, count, start)]))
+def scores_of(place: Place, rule: str, start: int) -> list[float]:
+    """Scores by the number of rows, from one start."""
+    rows, scores = np.sort(np.random.default_rng([start, 7]).permutation(place.able)[: SIZES[0]]), list[float]()
+    for size, following in zip(SIZES, (*SIZES[1:], SIZES[-1]), strict=True):
+        fit = place.fit(rows)
+        scores.append(place.score(fit))
+        if following > size:
+            rows = np.sort(np.concatenate([rows, next_rows(rule, place, fit, rows, following - size, start)]))
     return scores
 
 
+def measure(name: str) -> dict[str, Any]:
+    """Scores of all rules and starts at a place."""
+    errors: Errors = {}
+    with tempfile.TemporaryDirectory() as folder:
+        place = PLACES[name](Path(folder))
+    for rule in RULES:
+        errors[rule] = [scores_of(place, rule, start) for start in STARTS]
+        say("plan", f"{name}, {rule}: " + ", ".join(f"{score:.3g}" for score in np.mean(errors[rule], axis=0)))
+    return {"errors": errors, "higher_is_better": task_of(place.record).higher_is_better}
+
+
+def row_of(name: str, part: Mapping[str, Any]) -> dict[str, Any]:
+    """Row of the table: mean scores, gains over other rules, and planned rows that equal 60 random ones."""
+    errors = {rule: np.asarray(part["errors"][rule]) for rule in RULES}
+    sign = 1 if part["higher_is_better"] else -1
+    means = {rule: values.mean(axis=0) for rule, values in errors.items()}
+    gains = {}
+    for rule in (RANDOM, FILLING, VARIANCE):
+        gain = bootstrap(sign * (errors[OURS] - errors[rule])[:, 1:].mean(axis=1), statistic=np.mean)
+        gains[rule] = [gain.value, gain.low, gain.high]
+    reached = np.flatnonzero(sign * (means[OURS] - means[RANDOM][-1]) >= 0)
+    equal = SIZES[reached[0]] if len(reached) else None
+    value = f"{means[OURS][2]:.3g} with 30 planned rows, {means[RANDOM][-1]:.3g} with 60 random ones"
+    known: dict[str, Any] = {
+        "mean": {rule: mean.tolist() for rule, mean in means.items()},
+        "gain": gains,
+        "equal": equal,
+    }
+    known["label"] = "SSIM" if part["higher_is_better"] else "error, dB"
+    return {
+        **line(name, value, ASKED),
+        **known,
+    }
+
+
 def main() -> dict[str, Any]:
-    """Measure all places, rules and starts; parts that this code has measured before are not measured again."""
-    data_folder(FLAT)  # missing data are reported first
-    place = RUNS / fit_key(source_files())
-    rows = []
-    for name in PLACES:
-        errors: dict[str, list[list[float]]] = {}
-        for rule in RULES:
-            say("plan", f"{name}, {rule}")
-            parts = {k: f"{name}-{rule}-{k}".replace(" ", "-") for k in STARTS}
-            errors[rule] = [kept_work(place, part, partial(measure, name, rule, k)) for k, part in parts.items()]
-        rows.append({**line(name, summary(errors, name), ""), "errors": errors})
-    return {"rows": rows}
+    """Measure the places that are not stored; ``failed`` where other rows are clearly better than planned ones."""
+    data_folder(FLAT)
+    parts = {name: stored_part("plan", name.replace(" ", "-"), partial(measure, name)) for name in PLACES}
+    rows = [row_of(name, part) for name, part in parts.items()]
+    result: dict[str, Any] = {"rows": rows, "measured": measured_on(parts.values())}
+    if PICTURE.parent.is_dir():
+        write_figure(PICTURE, picture(rows))
+    worse = [f"{row['what']} ({rule})" for row in rows for rule in (RANDOM, FILLING) if row["gain"][rule][2] < 0]
+    return result | ({"failed": f"clearly worse than other rows: {', '.join(worse)}"} if worse else {})
 
 
-def summary(errors: Mapping[str, Sequence[Sequence[float]]], name: str) -> str:
-    """Scores of each rule at 20, 30 and 60 rows, and rows of the plan that equal 60 random ones."""
-    sizes = [SIZES.index(size) for size in (20, 30, 60)]
-    means = {rule: np.mean(values, axis=0) for rule, values in errors.items()}
-    parts = [f"{rule} " + ", ".join(f"{mean[k]:.3g}" for k in sizes) for rule, mean in means.items()]
-    better = 1 if means[RANDOM][-1] > means[RANDOM][0] else -1
-    reached = np.flatnonzero(better * (means[OURS] - means[RANDOM][-1]) >= 0)
-    equal = f"{SIZES[reached[0]]} planned rows equal 60 random ones" if len(reached) else "60 random rows not equalled"
-    gain = better * (np.asarray(errors[OURS]) - np.asarray(errors[RANDOM]))[:, 1:].mean(axis=1)
-    return "; ".join([*parts, equal, f"gain over random {bootstrap(gain, statistic=np.mean)}"])
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown table: scores of each rule with 20, 30 and 60 rows, and gains of planned rows."""
+    head = ["place", *RULES, "gain over random", "gain over space-filling", "planned rows as good as 60 random"]
+    lines = []
+    for row in rows:
+        means = {rule: [row["mean"][rule][SIZES.index(size)] for size in (20, 30, 60)] for rule in RULES}
+        scores = [", ".join(f"{value:.3g}" for value in means[rule]) for rule in RULES]
+        gains = ["{:.3f} ({:.3f} to {:.3f})".format(*row["gain"][rule]) for rule in (RANDOM, FILLING)]
+        lines.append([row["what"], *scores, *gains, str(row["equal"] or "more than 60")])
+    return markdown_table(head, lines)
+
+
+def picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Scores of each rule by the number of rows, a panel for each place."""
+    figure = Figure(figsize=(11, 5), layout="constrained", facecolor="white")
+    panels = figure.subplots(2, -(-len(rows) // 2), squeeze=False).ravel()
+    for axes, row in zip(panels, rows, strict=False):
+        for rule, colour in zip(RULES, ("0.6", "#2a6f97", "#e09f3e", "#c1121f"), strict=True):
+            axes.plot(SIZES, row["mean"][rule], ".-", color=colour, linewidth=1.2, label=rule)
+        axes.set(xlabel="rows", ylabel=row["label"])
+        axes.set_title(row["what"], fontsize=9)
+    for axes in panels[len(rows) :]:
+        axes.set_axis_off()
+    panels[0].legend(fontsize=7)
+    return figure

@@ -29,7 +29,7 @@ ON_PAGE = {
     **dict.fromkeys(("stages", "intervals"), "hybrid.md"),
     **{"rooms": "correction.md", "locate": "locate.md", "moved": "scenes.md"},
     **dict.fromkeys(("fdtd", "far-scans"), "correction.md"),
-    **{"reception": "maps.md", "closed-forms": "numerics.md"},
+    **{"reception": "maps.md", "plan": "maps.md", "closed-forms": "numerics.md"},
 }
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
 NOT_LISTED = (

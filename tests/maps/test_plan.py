@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import csv
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from wrf_mi_bench.planning import farthest_points
+from wrf_mi_bench.planning import OURS, RULES, SIZES, even_weights, farthest_points, row_of, table
 
 import wrf_mi
 from wrf_mi import InputError, train
 from wrf_mi.cli.main import main
 from wrf_mi.maps.plan import error_priors, greedy, plan
+from wrf_mi.maps.plan_losses import SURFACE_DB
 from wrf_mi.models.error_prior import ErrorPrior, with_columns
 from wrf_mi.models.interpolation.kriging import Kriging, UncertainKriged
 from wrf_mi.models.interpolation.kriging_equations import KrigingSystem, correlation
@@ -79,6 +82,22 @@ def test_farthest_points_fill_a_line() -> None:
     assert farthest_points(line, 3, line[:1]).tolist() == [8, 4, 2]
 
 
+def test_weights_make_sums_over_rows_sums_over_the_area() -> None:
+    place = np.random.default_rng(6).uniform(0, 10, (400, 1)) ** 2 / 10 * [1.0, 0, 0]  # denser towards 0
+    weights = even_weights(place)
+    assert place[:, 0].mean() < 3.6
+    assert 4.3 < np.average(place[:, 0], weights=weights) < 5.7
+
+
+def test_benchmark_states_gains_and_planned_rows_that_equal_random_ones() -> None:
+    falling = np.linspace(4, 3, len(SIZES))
+    errors = {rule: [(falling - 0.4 * (rule == OURS)).tolist()] * 3 for rule in RULES}
+    row = row_of("room", {"errors": errors, "higher_is_better": False})
+    assert row["equal"] == 40
+    assert row["gain"]["random"] == pytest.approx([0.4] * 3)
+    assert table([row]).splitlines()[2].endswith("| 0.400 (0.400 to 0.400) | 0.400 (0.400 to 0.400) | 40 |")
+
+
 @pytest.fixture(scope="module")
 def run(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> wrf_mi.Run:
     """Strengths of which one corner of the flat is not measured."""
@@ -100,16 +119,22 @@ def test_plan_goes_where_nothing_was_measured(run: wrf_mi.Run, tmp_path: Path) -
     assert near.expected_error[-1] >= planned.expected_error[-1]
 
 
-def test_surfaces_of_a_scene_are_terms_of_the_process(
-    run: wrf_mi.Run, flat_folder: Path, room: Path, tmp_path: Path
-) -> None:
-    in_scene = train(flat_folder, "hybrid", out=tmp_path / "hybrid", scene=room, n_train=12)
+def test_losses_of_a_corrected_scene_are_terms_of_the_process(flat_folder: Path, room: Path, tmp_path: Path) -> None:
+    scene = Path(shutil.copytree(room, tmp_path / "scene"))
+    in_scene = train(flat_folder, "hybrid", out=tmp_path / "hybrid", scene=scene, n_train=12)
     at = np.array([[1.0, 1.0, 1.3], [3.0, 2.0, 1.3]])
-    with_walls, alone = error_priors(in_scene, [0], at)[0], in_scene.fitted.error_prior(0)
-    assert alone is not None
-    added = with_walls.covariance(at, at) - alone.covariance(at, at)
+    stated = error_priors(in_scene, [0], at)[0].covariance(at, at)
+    by_stated = plan(in_scene, 3, criterion="material")
+    assert by_stated.expected_error[-1] < by_stated.expected_error[0] <= SURFACE_DB
+    assert max(before for before, _ in by_stated.surfaces.values()) == by_stated.expected_error[0]
+    assert all(after <= before for before, after in by_stated.surfaces.values())
+    facts = {"materials": [], "data": {"name": "other", "rows": [], "error_ratio": 1.0}}
+    (scene / "correction.json").write_text(json.dumps(facts))
+    added = error_priors(in_scene, [0], at)[0].covariance(at, at) - stated
     assert (added.diagonal() > 0).all()
     assert np.linalg.eigvalsh(added).min() > -EXACT
+    # The rows of a correction count once, in the deviations that it states.
+    assert plan(in_scene, 1, criterion="material").expected_error[0] == SURFACE_DB
 
 
 def test_command_writes_positions_and_a_picture(

@@ -82,8 +82,11 @@ def _add_plan(commands: Any) -> None:
     add("--candidates", metavar="FILE.csv", help=text)
     text = "corners of the area whose errors count, metres (default: the scene, or all rows of the data)"
     add("--area", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help=text)
-    text = "what is to become small: the error over the map, or that of coverage about a threshold (default: error)"
-    add("--criterion", choices=("error", "coverage"), default="error", help=text)
+    text = (
+        "what is to become small: error over the map, error of coverage about a threshold, or uncertainty of the loss "
+    )
+    text += "at the least certain surface of the scene (default: error)"
+    add("--criterion", choices=("error", "coverage", "material"), default="error", help=text)
     add("--threshold", type=float, metavar="DBM", help="threshold of coverage (default: -90 dBm)")
     text = "distance that is worth half of a reduction, for plans that are short to walk (default: distances are free)"
     add("--walk", type=float, metavar="M", help=text)
@@ -115,8 +118,10 @@ def plan_command(a: Arguments) -> int:
     planned.write(out)
     picture = write_figure(out.with_suffix(".png"), plan_figure(planned, run))
     first, last = planned.expected_error[[0, -1]]
-    text = f"expected error {first:.3g} now, {last:.3g} after {a.count} more measurements\n"
+    what = "least certain loss at a surface, dB:" if planned.surfaces else "expected error"
+    text = f"{what} {first:.3g} now, {last:.3g} after {a.count} more measurements\n"
     figures = {"out": str(out), "picture": str(picture), "expected_error": planned.expected_error.tolist()}
+    figures |= {"surfaces": planned.surfaces} if planned.surfaces else {}
     return show(a.json, figures, f"{text}positions: {out}\npicture: {picture}")
 
 

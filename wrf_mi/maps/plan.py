@@ -8,9 +8,11 @@ all positions after the training rows, a measurement at c with noise of variance
 whatever it will read. So measurements can be planned one after the other before any is made: each is the candidate with
 the greatest reduction, summed over the map and over receivers, after which C loses that rank.
 
-Where the walls of a scene are known, strengths depend on the loss at each surface, which its material states only
-roughly. These losses are terms of the process whose columns are the derivatives of the traced power
-(`wrf_mi.tracing.surface_shares`): a measurement behind a wall tells what all paths through that wall lose.
+Where a scene was corrected by measurements, strengths depend on the loss at each surface, which the correction knows
+within the standard deviations of its materials. These losses are terms of the process whose columns are the derivatives
+of the traced power (`wrf_mi.tracing.surface_shares`): a measurement behind a wall tells what all paths through it lose.
+Scenes as stated have no such terms: a fit that keeps the stated materials would not learn the losses.
+The criterion ``"material"`` lowers the least certain of them (`wrf_mi.maps.plan_losses`).
 
 Source: Seo, Wallat, Graepel and Obermayer, "Gaussian process regression: active data selection and test point
 rejection" (2000) (the reduction over the map, after Cohn); Krause, Singh and Guestrin, "Near-optimal sensor placements
@@ -20,10 +22,11 @@ of experiments for accurate approximation of a target region" (2010) (weights ab
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import compress
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,25 +36,23 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import write_csv
 from ..core.receivers import receiver_index
-from ..models import Inputs
+from ..models import Inputs, Problem
 from ..models.error_prior import ErrorPrior, with_columns
 from ..models.interpolation.kriging import Kriging
 from ..runs.folder import load_rows
 from ..runs.run import Run, open_run
+from ..scene.correction_data import read_correction_data
 from ..tasks import task_of
 from ..training.session import OnProgress, quiet
 from .coverage import coverage_probability
 from .grid import area_of, candidates_of
+from .plan_losses import Losses, Told, Worth, greedy_losses, losses_of
 
-Criterion = Literal["error", "coverage"]
-Worth = Callable[[int | None, FloatArray | None], FloatArray]
-"""Factors [p] of the reductions at p positions from the index of the choice before, or from a start."""
+Criterion = Literal["error", "coverage", "material"]
+Lowered = tuple[list[int], FloatArray, FloatArray, Mapping[str, tuple[float, float]]]
+"""Choices, the criterion before and after each, variances before and after all, and losses by surface (`Plan`)."""
 MOST_TARGETS, MOST_CANDIDATES = 600, 1500
 """Positions at which errors count, and candidates: covariances between all of them are kept for each receiver."""
-SURFACE_DB = 3.0
-"""Standard deviation of the loss at a surface about that of its material, a choice: a factor of two in thickness or
-permittivity changes a slab's transmission by 0.6 dB (3 cm of wood) to 10 dB (20 cm of concrete), and its reflection by
-3 to 11 dB (ITU-R P.2040, root mean square over 0.9, 2.4 and 5.8 GHz at normal incidence)."""
 LEAST_SHARE = 0.02  # largest share of a surface over all positions, below which it is left out
 THRESHOLD_DBM = -90.0
 
@@ -63,10 +64,12 @@ class Plan:
     Attributes:
         tx_pos_m: positions [k, 3], metres.
         expected_error: root of the mean variance over the map before any and after each of them [k + 1], in the unit of
-            an observation (dB for strengths), mean over receivers.
+            an observation (dB for strengths), mean over receivers; of the criterion ``"material"`` the standard
+            deviation of the least certain loss at a surface, dB.
         walked_m: distance of each position from the one before [k], from the start for the first; NaN without one.
         candidates_m, targets_m: positions that could be chosen, and positions of the map [m, 3].
         std: standard deviations of the errors at ``targets_m`` before and after, [2, m], mean over receivers.
+        surfaces: surfaces of the criterion ``"material"`` with the standard deviation of the loss before and after, dB.
     """
 
     tx_pos_m: FloatArray
@@ -75,6 +78,7 @@ class Plan:
     candidates_m: FloatArray
     targets_m: FloatArray
     std: FloatArray
+    surfaces: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def write(self, file: str | Path) -> Path:
         """Write positions to centimetres with their order, expected error after each, and distance walked, as CSV."""
@@ -112,7 +116,8 @@ def plan(
         area_m: lower and upper corner [2] of the area whose errors count, metres; None: the scene, or all rows of the
             data.
         criterion: ``"error"``: the expected error over the map; ``"coverage"``: that about a threshold of received
-            power, of models that state standard deviations.
+            power, of models that state standard deviations; ``"material"``: the loss at the least certain surface of
+            the run's scene, of strengths.
         threshold_dbm: threshold of ``"coverage"``; None: -90 dBm.
         walk_m: distance that is worth half of a reduction: farther positions are chosen for more than twice as much;
             None: distances do not count.
@@ -134,22 +139,58 @@ def plan(
     positions_m = np.concatenate([targets_m, choices_m])
     is_target = np.arange(len(positions_m)) < len(targets_m)
     on_progress("planning: the process of the errors", 0.0)
-    priors = error_priors(opened, numbers, positions_m)
-    covariances = []
-    for done, prior in enumerate(priors, start=1):
-        covariances.append(prior.posterior(positions_m))
-        on_progress("planning: the process of the errors", done / len(priors))
-    weights = np.ones((len(numbers), len(positions_m))) * is_target
-    if criterion == "coverage":
-        weights *= _about(opened, numbers, positions_m, THRESHOLD_DBM if threshold_dbm is None else threshold_dbm)
     start = None if start_m is None else np.asarray(start_m, float)
-    worth, noise = _walking(positions_m, walk_m), [prior.new_noise for prior in priors]
-    chosen, before, after = greedy(covariances, noise, weights, ~is_target, count, worth, start, on_progress)
-    variances = np.stack([before, *after])[:, :, is_target]
+    search: dict[str, Any] = {"worth": _walking(positions_m, walk_m), "start": start, "on_progress": on_progress}
+    if criterion == "material":
+        lowered = _lower_losses(opened, numbers, positions_m, ~is_target, count, search)
+    else:
+        threshold = (THRESHOLD_DBM if threshold_dbm is None else threshold_dbm) if criterion == "coverage" else None
+        lowered = _lower_errors(opened, numbers, positions_m, is_target, count, threshold, search)
+    chosen, error, variances, surfaces = lowered
     way_m = np.concatenate([[[np.nan] * 3 if start is None else start], positions_m[chosen]])
-    walked_m = np.linalg.norm(np.diff(way_m, axis=0), axis=1)
-    error, std = np.sqrt(variances.mean(axis=(1, 2))), np.sqrt(variances[[0, -1]].mean(axis=1))
-    return Plan(positions_m[chosen], error, walked_m, choices_m, targets_m, std)
+    walked_m, std = np.linalg.norm(np.diff(way_m, axis=0), axis=1), np.sqrt(variances[:, :, is_target].mean(axis=1))
+    return Plan(positions_m[chosen], error, walked_m, choices_m, targets_m, std, surfaces)
+
+
+def _lower_errors(
+    run: Run,
+    receivers: Sequence[int],
+    positions_m: FloatArray,
+    is_target: NDArray[np.bool_],
+    count: int,
+    threshold_dbm: float | None,
+    search: Mapping[str, Any],
+) -> Lowered:
+    """Choices by the error at targets, or about a threshold."""
+    priors = error_priors(run, receivers, positions_m)
+    weights = np.ones((len(receivers), len(positions_m))) * is_target
+    if threshold_dbm is not None:
+        weights *= _about(run, receivers, positions_m, threshold_dbm)
+    covariances, noise = [prior.posterior(positions_m) for prior in priors], [prior.new_noise for prior in priors]
+    chosen, before, after = greedy(covariances, noise, weights, ~is_target, count, **search)
+    error = np.sqrt(np.stack([before, *after])[:, :, is_target].mean(axis=(1, 2)))
+    return chosen, error, np.stack([before, after[-1]]), {}
+
+
+def _lower_losses(
+    run: Run,
+    receivers: Sequence[int],
+    positions_m: FloatArray,
+    allowed: NDArray[np.bool_],
+    count: int,
+    search: Mapping[str, Any],
+) -> Lowered:
+    """Choices by the least certain loss."""
+    losses, told = _told(run, receivers, positions_m)
+    # A loss on which no strength at any candidate depends cannot be measured, however uncertain it is.
+    measurable = np.max([np.abs(each.slope[allowed]).max(axis=0) for each in told], axis=0) >= LEAST_SHARE
+    if not measurable.any():
+        raise InputError("criterion material: no path to a candidate meets a surface; give other candidates")
+    chosen, std_db, variances = greedy_losses(told, losses.std_db, measurable, allowed, count, **search)
+    std_db = std_db[:, measurable]
+    of_surface = zip(compress(losses.names, measurable), std_db[0], std_db[-1], strict=True)
+    surfaces = {name: (float(before), float(after)) for name, before, after in of_surface}
+    return chosen, std_db.max(axis=1), variances, surfaces
 
 
 def _check(
@@ -159,8 +200,8 @@ def _check(
         raise InputError(f"count {count}: give a number from 1 to {candidates}, that of the candidates")
     if walk_m is not None and not walk_m > 0:
         raise InputError(f"walk {walk_m:g} m: give a distance above 0")
-    if criterion not in ("error", "coverage") or (criterion == "error" and threshold_dbm is not None):
-        raise InputError(f"criterion {criterion}: choose error, or coverage with or without a threshold")
+    if criterion not in get_args(Criterion) or (criterion != "coverage" and threshold_dbm is not None):
+        raise InputError(f"criterion {criterion}: choose error, material, or coverage with or without a threshold")
 
 
 def greedy(
@@ -208,11 +249,10 @@ def greedy(
     return chosen, before, after
 
 
-def error_priors(run: Run, receivers: Sequence[int], positions_m: FloatArray) -> list[ErrorPrior]:
-    """Processes of the errors of some receivers of a run.
+def model_priors(run: Run, receivers: Sequence[int]) -> list[ErrorPrior]:
+    """Processes of the errors of some receivers.
 
-    That which the model states; of other models the field of the observations themselves about its mean. In a scene,
-    strengths have a term for each surface that matters at the positions [m, 3] or at the training rows.
+    That which the model of a run states; of other models the field of the observations themselves about its mean.
     """
     record, rows = run.problem.record, load_rows(run.folder, run.problem.record).all_train
     priors = []
@@ -222,26 +262,78 @@ def error_priors(run: Run, receivers: Sequence[int], positions_m: FloatArray) ->
             kriging = Kriging(seed=run.config.seed)
             prior = kriging.fit(record.tx_pos_m[rows], record.observation[receiver, rows]).error_prior()
         priors.append(prior)
-    scene = run.problem.opened_scene
-    if scene is None or not task_of(record).in_decibel:
+    return priors
+
+
+def error_priors(run: Run, receivers: Sequence[int], positions_m: FloatArray) -> list[ErrorPrior]:
+    """Processes of the errors of some receivers, with the losses of a corrected scene.
+
+    They have a term for each surface that matters at the positions [m, 3] or at the training rows.
+    """
+    priors, problem = model_priors(run, receivers), _scene_problem(run)
+    if read_correction_data(problem.scene) is None or not task_of(problem.record).in_decibel:
         return priors
+    every, losses, shares = _shares(problem, receivers, priors, positions_m)
+    return with_surface_losses(priors, every, losses, shares)
+
+
+def _scene_problem(run: Run) -> Problem:
+    """The problem with the scene of the fit: the one that it corrected, where there is one."""
+    from ..models.hybrid.fitted import PATHS
+    from ..models.hybrid.scene_side import in_scene
+
+    return in_scene(run.problem, run.folder / "parts" / PATHS)
+
+
+def _shares(
+    problem: Problem, receivers: Sequence[int], priors: Sequence[ErrorPrior], positions_m: FloatArray
+) -> tuple[FloatArray, Losses, FloatArray]:
+    """Positions, also those of training rows, and derivatives at them by the losses at surfaces that matter."""
     from ..models.hybrid.strengths import TRACE
+    from ..tasks.conditions import scene_carrier
     from ..tracing.surface_shares import surface_shares
 
+    record = problem.record
     asked = [record.receivers[receiver] for receiver in receivers]
     every = np.unique(np.concatenate([positions_m, *(prior.measured_m for prior in priors)]), axis=0)
-    shares = surface_shares(scene, every, asked, TRACE, record.tx_antenna)
+    names, shares = surface_shares(problem.opened_scene, every, asked, TRACE, record.tx_antenna)
     matters = shares.max(axis=(0, 1)) >= LEAST_SHARE
+    losses = losses_of(problem.scene, list(compress(names, matters)), scene_carrier(record))
+    return every, losses, shares[:, :, matters]
+
+
+def _told(run: Run, receivers: Sequence[int], positions_m: FloatArray) -> tuple[Losses, list[Told]]:
+    """Losses at surfaces, and errors of receivers by them after the training rows."""
+    priors, problem = model_priors(run, receivers), _scene_problem(run)
+    if problem.opened_scene is None or not task_of(problem.record).in_decibel:
+        raise InputError(f"{run.folder}: criterion material needs signal strengths in a scene; train with --scene")
+    every, losses, shares = _shares(problem, receivers, priors, positions_m)
     index = {row.tobytes(): place for place, row in enumerate(every)}
+
+    def at(positions_m: FloatArray, table: FloatArray) -> FloatArray:
+        return np.asarray(table[[index[row.tobytes()] for row in np.ascontiguousarray(positions_m)]])
+
+    told = []
+    for prior, table in zip(priors, shares, strict=True):
+        each = Told.of(prior, positions_m, at(prior.measured_m, table), at(positions_m, table))
+        # What the rows of a correction tell is in its standard deviations already.
+        told.append(replace(each, information=each.information * (not losses.knows_rows)))
+    return losses, told
+
+
+def with_surface_losses(
+    priors: Sequence[ErrorPrior], positions_m: FloatArray, losses: Losses, shares: FloatArray
+) -> list[ErrorPrior]:
+    """Processes with a term for each loss, by derivatives [receivers, m, s] at all positions [m, 3] that are needed."""
+    index = {row.tobytes(): place for place, row in enumerate(positions_m)}
 
     def of_receiver(prior: ErrorPrior, table: FloatArray) -> ErrorPrior:
         def columns(at_m: FloatArray) -> FloatArray:
             return table[[index[row.tobytes()] for row in np.ascontiguousarray(at_m)]]
 
-        covariance = with_columns(prior.covariance, columns, np.full(table.shape[1], SURFACE_DB))
-        return replace(prior, covariance=covariance)
+        return replace(prior, covariance=with_columns(prior.covariance, columns, losses.std_db))
 
-    return [of_receiver(prior, table[:, matters]) for prior, table in zip(priors, shares, strict=True)]
+    return [of_receiver(prior, table) for prior, table in zip(priors, shares, strict=True)]
 
 
 def _about(run: Run, receivers: Sequence[int], positions_m: FloatArray, threshold_db: float) -> FloatArray:

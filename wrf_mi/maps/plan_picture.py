@@ -46,5 +46,6 @@ def plan_figure(plan: Plan, run: Run) -> Figure:
     figure.colorbar(drawn, ax=list(panels), shrink=0.85).set_label(f"standard deviation ({unit})", fontsize=8)
     first, last = plan.expected_error[[0, -1]]
     text = "dots: measured; numbers: measure next, in this order; triangles: receivers"
-    figure.suptitle(f"{text}\nexpected error {first:.3g} before, {last:.3g} after", fontsize=8)
+    what = "least certain loss at a surface, dB:" if plan.surfaces else "expected error"
+    figure.suptitle(f"{text}\n{what} {first:.3g} before, {last:.3g} after", fontsize=8)
     return figure

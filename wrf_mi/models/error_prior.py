@@ -40,12 +40,13 @@ class ErrorPrior:
 
     def posterior(self, positions_m: FloatArray) -> FloatArray:
         """Covariances of the errors at positions [m, 3] after the training rows, [m, m]."""
-        prior = self.covariance(positions_m, positions_m)
-        if not len(self.measured_m):
+        # One evaluation for rows and positions: terms of a scene are traced anew in each.
+        count = len(self.measured_m)
+        total = self.covariance(*[np.concatenate([self.measured_m, positions_m])] * 2)
+        prior, cross, rows = total[count:, count:], total[:count, count:], total[:count, :count]
+        if not count:
             return prior
-        rows = self.covariance(self.measured_m, self.measured_m)
-        rows[np.diag_indices(len(rows))] += self.noise + JITTER * rows.diagonal().max()
-        cross = self.covariance(self.measured_m, positions_m)
+        rows[np.diag_indices(count)] += self.noise + JITTER * rows.diagonal().max()
         return np.asarray(prior - cross.T @ cho_solve(cho_factor(rows, lower=True), cross))
 
 
@@ -55,6 +56,8 @@ def with_columns(
     """The covariance of a field and of independent terms: columns [n, k] of positions, with deviations [k]."""
 
     def total(a_m: FloatArray, b_m: FloatArray) -> FloatArray:
-        return np.asarray(covariance(a_m, b_m) + (columns(a_m) * deviation**2) @ columns(b_m).T)
+        of_a = columns(a_m)
+        of_b = of_a if b_m is a_m else columns(b_m)
+        return np.asarray(covariance(a_m, b_m) + (of_a * deviation**2) @ of_b.T)
 
     return total

@@ -16,8 +16,8 @@ from .search.devices import solid_around
 
 def surface_shares(
     scene: Any, tx_pos_m: FloatArray, receivers: Sequence[Receiver], options: TraceOptions, tx_antenna: Antenna
-) -> FloatArray:
-    """Derivatives [n_rx, m, surfaces] of received powers in dB by the dB that each interaction with a surface adds.
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Names of surfaces, and derivatives [n_rx, m, surfaces] of received powers by the dB that an interaction adds.
 
     The power of transmitters [m, 3] is a sum over paths, so the derivative is the mean number of interactions of a path
     with the surface, weighted by power. 0 without a path and for transmitters inside solids.
@@ -35,4 +35,4 @@ def surface_shares(
     mean = sums.reshape(pairs, surfaces) / np.maximum(total, np.finfo(float).tiny)[:, None]
     shares = np.zeros((len(receivers), len(tx_pos_m), surfaces))
     shares[:, outside] = mean.reshape(len(receivers), len(outside), surfaces)
-    return shares
+    return tuple(paths.object_names), shares
