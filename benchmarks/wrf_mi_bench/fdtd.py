@@ -259,6 +259,6 @@ def _corrections(
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of what is not explained, and of errors of power, at the receiver that calibrations do not know."""
+    """Markdown table of what is not explained and of errors of power at the receiver that no calibration knows."""
     lines = [[row["what"], f"{row['unexplained_db'][-1]:.1f}", f"{row['power_db'][-1]:+.1f}"] for row in rows]
     return markdown_table(["scene", "unexplained (dB)", "power (dB)"], lines)

@@ -205,6 +205,6 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of the mean SSIM of each prediction, and of what the hybrid in the edited scene gains over it."""
     lines = []
     for row in rows:
-        mean, gain = ("{:.3f} ({:.3f} to {:.3f})".format(*row[name]) for name in ("mean", "gain"))
-        lines.append([row["what"], mean, "" if row["what"] == OURS else gain])
+        gain = "" if row["what"] == OURS else "{:.3f} ({:.3f} to {:.3f})".format(*row["gain"])
+        lines.append([row["what"], f"{row['mean'][0]:.3f}", gain])
     return markdown_table(["prediction", "mean SSIM", "gain of the hybrid in the edited scene"], lines)

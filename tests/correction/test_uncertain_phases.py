@@ -1,7 +1,5 @@
 """Materials by channels of uncertain phases: moments, derivatives, and a scene whose planes cannot be resolved."""
 
-from dataclasses import replace
-
 import correction_rooms
 import numpy as np
 import pytest
