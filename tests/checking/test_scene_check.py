@@ -272,4 +272,4 @@ def test_command_ends_with_two_at_faults(tmp_path, capsys):
     odd.write_text(odd.read_text().replace("mesh-a", "mesh a"))
     assert [call(["check", odd, *more], capsys)[0] for more in ([], ["--strict"])] == [0, 1]
     refused(["check", tmp_path / "none.xml"], "no such scene", capsys)
-    refused(["check", odd, "--material", "wood"], "belong to --repair", capsys)
+    refused(["check", odd, "--material", "wood"], "belongs to --repair", capsys)

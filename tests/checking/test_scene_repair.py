@@ -240,7 +240,7 @@ def test_command_repairs_a_copy(tmp_path, capsys):
     refused(["check", xml, "--repair", out, "--material", "brick"], "exists", capsys)
     assert call(["check", xml, "--repair", out, "--material", "brick", "--replace", "--json"], capsys)[0] == 0
     refused(["check", xml, "--repair", out, "--replace", "--material", "jelly"], "unknown", capsys)
-    refused(["check", xml, "--repair", out, "--strict"], "belong to a check", capsys)
+    refused(["check", xml, "--repair", out, "--strict"], "no effect beside --repair", capsys)
     points = tmp_path / "scan.xyz"
     np.savetxt(points, np.random.default_rng(0).uniform(0, 4, (2000, 3)))
     with pytest.raises(InputError, match="make a scene of it by wrf-mi mesh"):

@@ -211,7 +211,7 @@ def test_sweep_and_comparison_show_baselines_and_the_reference(
     assert (row["model"], row["status"], row["median"]) == ("idw", "done", row["reference_median"])
     compare([run, out / "model=idw"], tmp_path / "page")
     rows = rows_of(tmp_path / "page" / "compare.csv")
-    assert [row["model"] for row in rows] == ["mri", "idw", "idw100"]
+    assert [row["model"] for row in rows] == ["mri", "idw", "idw100", "constant"]
     assert rows[1]["median"] == rows[2]["median"] != rows[0]["median"]
     words = ["sweep", flat_folder, "--vary", "model=idw,vae", "--out", tmp_path / "no"]
     command.refused(words, "vae serves spectrum")

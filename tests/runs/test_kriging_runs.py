@@ -125,7 +125,7 @@ def test_standard_deviations_of_folds_are_pooled(waves: Path, tmp_path: Path) ->
 def test_comparison_shows_kriging_and_reference(run: Path, tmp_path: Path) -> None:
     assert "inside 90 %" in compare([run], tmp_path / "page").read_text()
     rows = rows_of(tmp_path / "page" / "compare.csv")
-    assert [row["model"] for row in rows] == ["kriging", "idw4"]
+    assert [row["model"] for row in rows] == ["kriging", "idw4", "constant"]
     assert float(rows[0]["inside_90"]) == json.loads((run / "metrics.json").read_text())["inside_90"]
     assert rows[1]["inside_90"] == ""
     assert (tmp_path / "page" / "waves-samples.png").is_file()

@@ -150,7 +150,7 @@ def test_command_writes_the_traced_paths(room, flat_folder, tmp_path, capsys):
     ]
     refused([*asked, "--deepmimo", tmp_path / "Flat"], "choose small letters", capsys)
     asked += ["--deepmimo", tmp_path / "flat"]
-    message = "--calibrate trains paths and stores none; omit it, or --deepmimo"
+    message = "--deepmimo has no effect beside --calibrate, which trains in one process and stores no paths"
     refused([*asked, "--calibrate", "gain"], message, capsys)
     assert not (tmp_path / "run").exists()
     status, _, err = call(asked, capsys)

@@ -77,7 +77,7 @@ def test_channels_of_an_array_are_scored_over_antennas_and_subcarriers(csi_folde
     assert read_run(out).reference_name == "copy of the uplink"
     assert (tmp_path / "page" / "index.html") == compare([out], tmp_path / "page")
     with (tmp_path / "page" / "compare.csv").open(newline="") as file:
-        assert [row["model"] for row in csv.DictReader(file)] == ["idw", "uplink", "idw4"]
+        assert [row["model"] for row in csv.DictReader(file)] == ["idw", "uplink", "idw4", "constant"]
 
 
 def test_methods_are_fitted_to_measurements_and_scored_by_the_truth(turned: None, tmp_path: Path) -> None:
