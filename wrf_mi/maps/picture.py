@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 PANEL_IN, BAR_IN, COLUMNS = 3.2, 0.5, 3  # width of a panel and of its colour scale; number of panels in a line
 MOST_PANELS = 12  # largest number of receivers that are drawn, the first ones
-MOST_POINTS = 400  # largest number of training rows of a panel, and of other measured rows
+MOST_POINTS = 250  # largest number of training rows of a panel, and of other measured rows
 TAIL = 1.0  # percentage of values beyond either end of the colour scale
 MEASURED_TAIL = 10.0  # likewise for measured levels, among which are single deep fades
 STRONGEST = "strongest receiver"
