@@ -46,7 +46,7 @@ from ..tasks import task_of
 from ..training.session import OnProgress, quiet
 from .coverage import coverage_probability
 from .grid import area_of, candidates_of
-from .plan_losses import Losses, Told, Worth, greedy_losses, losses_of
+from .plan_losses import Losses, Told, Worth, greedy_losses, losses_of, take_best
 
 Criterion = Literal["error", "coverage", "material"]
 Lowered = tuple[list[int], FloatArray, FloatArray, Mapping[str, tuple[float, float]]]
@@ -236,11 +236,7 @@ def greedy(
         for covariance, variance, weight in zip(covariances, noise, weights, strict=True):
             used = np.flatnonzero(weight)
             gain += weight[used] @ np.square(covariance[used]) / (covariance.diagonal() + variance)
-        if worth is not None:
-            gain = gain * worth(chosen[-1] if chosen else None, start)
-        best = int(np.argmax(np.where(free, gain, -np.inf)))
-        chosen.append(best)
-        free[best] = False
+        best = take_best(gain, free, chosen, worth, start)
         for covariance, variance in zip(covariances, noise, strict=True):
             column = covariance[:, best].copy()
             covariance -= np.outer(column, column / (column[best] + variance))

@@ -155,6 +155,18 @@ def _powers(logarithm: FloatArray, frequency_hz: float) -> FloatArray:
     return np.stack([np.maximum(np.array(dr.squared_norm(each), float), SMALL) for each in both])
 
 
+def take_best(
+    gain: FloatArray, free: NDArray[np.bool_], chosen: list[int], worth: Worth | None, start: FloatArray | None
+) -> int:
+    """Index of the largest gain [p], times its worth, among free positions; it is added to those chosen."""
+    if worth is not None:
+        gain = gain * worth(chosen[-1] if chosen else None, start)
+    best = int(np.argmax(np.where(free, gain, -np.inf)))
+    chosen.append(best)
+    free[best] = False
+    return best
+
+
 def greedy_losses(
     receivers: Sequence[Told],
     std_db: FloatArray,
@@ -193,14 +205,10 @@ def greedy_losses(
         noise = [np.maximum(each.covariance.diagonal(), 0) + each.noise for each in receivers]
         total[:, np.arange(len(receivers)), np.arange(len(receivers))] += np.stack(noise, axis=1)
         gain = np.einsum("pr,pr->p", spread[..., target], np.linalg.solve(total, spread[..., target, None])[..., 0])
-        if worth is not None:
-            gain = gain * worth(chosen[-1] if chosen else None, start)
-        best = int(np.argmax(np.where(free, gain, -np.inf)))
+        best = take_best(gain, free, chosen, worth, start)
         losses -= spread[best].T @ np.linalg.solve(total[best], spread[best])
         for each in receivers:
             each.measure(best)
-        chosen.append(best)
-        free[best] = False
         std.append(np.sqrt(np.maximum(losses.diagonal(), 0)))
         on_progress("planning: positions", (number + 1) / count)
     after = np.stack([each.variance(losses) for each in receivers])
