@@ -1,4 +1,4 @@
-"""Ray tracing, corrections and a published calibration against a solution of Maxwell's equations by gprMax.
+"""Ray tracing, corrections, a published calibration and joint training against Maxwell's equations, solved by gprMax.
 
 A vertical dipole and three receivers lie between two concrete walls, with a metal blocker in the line of sight, at
 6 GHz; a twin of the scene has one wall a quarter of the wavelength off (arXiv 2312.12625, ``fdtd-toy``). The grid is a
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.constants import epsilon_0, mu_0, speed_of_light
 from scipy.optimize import minimize
 
+import wrf_mi
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.types import FloatArray, IntArray
@@ -60,6 +61,12 @@ BRICK = {"relative_permittivity": 3.91, "conductivity": 0.0317, "thickness": 2.0
 START = np.log([BRICK["relative_permittivity"] - 1, BRICK["conductivity"]])
 WALLS = "upper_wall", "lower_wall"
 OPTIONS = TraceOptions(transmission=True, depth=3, rays=1 << 16, seed=1)
+TRAINED: Mapping[str, tuple[str, Mapping[str, float]]] = {
+    "WRF-GS+, joint": ("wrf-gs+", {}),
+    "WRF-GS+, joint, planes": ("wrf-gs+", {"traced.shift": 1e-3, "traced.tilt": 5e-4}),  # rates of `--calibrate planes`
+    "hybrid": ("hybrid", {}),
+}
+"""Model and settings of fits in the twin with walls of brick."""
 DIFFRACTED = TraceOptions(transmission=True, diffraction=True, depth=3, rays=1 << 16, seed=1)
 
 
@@ -148,15 +155,19 @@ def scene_of(model: Path, folder: Path, constants: Mapping[str, float]) -> Path:
     )
 
 
-def figures(scene: Path, record: Record, channels: Complex, options: TraceOptions = OPTIONS) -> dict[str, Any]:
-    """Error of traced channels [3, n] relative to the measured ones, and of the sum of path powers, dB by receiver."""
+def traced(scene: Path, record: Record, options: TraceOptions = OPTIONS) -> tuple[Complex, FloatArray]:
+    """Channels [3, n] that ray tracing gives for the receivers, and sums of path powers [3], dB."""
     tracer = RayTracer(scene, ChannelInstrument(record.receivers, WIDE_HZ), options)
-    traced = tracer.trace(record.tx_pos_m[::READINGS])
-    predicted = np.asarray(tracer.observe(traced), complex).reshape(channels.shape)
+    paths = tracer.trace(record.tx_pos_m[::READINGS])
+    return np.asarray(tracer.observe(paths), complex)[0], rssi_dbm(paths.paths)[0]
+
+
+def figures(channels: Complex, predicted: Complex, power_db: FloatArray) -> dict[str, Any]:
+    """Energy of the error of predicted channels [3, n] relative to the measured ones', and error of powers, dB [3]."""
     power = np.square(np.abs(channels))
     return {
         "unexplained_db": (10 * np.log10(np.square(np.abs(predicted - channels)).sum(1) / power.sum(1))).tolist(),
-        "power_db": (rssi_dbm(traced.paths)[0] - 10 * np.log10(power.mean(axis=1))).tolist(),
+        "power_db": (power_db - 10 * np.log10(power.mean(axis=1))).tolist(),
     }
 
 
@@ -213,11 +224,11 @@ def main() -> dict[str, Any]:
     if not (data / OUTPUT).is_file():
         raise InputError(f"{data / OUTPUT}: not on this machine; put the files of {SOURCE} there")
     wide = measured_channels(data / OUTPUT, WIDE_HZ)
-    known = toy_record(wide, WIDE_HZ)[0]
+    known, split = toy_record(wide, WIDE_HZ)
     rows = list[dict[str, Any]]()
 
-    def add(what: str, scene: Path, options: TraceOptions = OPTIONS, **more: Any) -> None:
-        result = figures(scene, known, wide, options)
+    def add(what: str, predicted: tuple[Complex, FloatArray], **more: Any) -> None:
+        result = figures(wide, *predicted)
         third = f"{result['unexplained_db'][2]:.1f} dB unexplained, power {result['power_db'][2]:+.1f} dB"
         rows.append({**line(what, f"third receiver: {third}", "-"), **result, **more})
         say("fdtd", f"{what}: {third}")
@@ -226,15 +237,20 @@ def main() -> dict[str, Any]:
         place, kinds = Path(folder), ("ground_truth", "dt_model")
         true, model = (data / f"toy_example_maxwell_{kind}" for kind in kinds)
         truth = scene_of(true, place / "truth", CONCRETE)
-        add("true scene", truth)
-        add("true scene, with diffraction", truth, DIFFRACTED)
-        add("twin, true materials", scene_of(model, place / "twin", CONCRETE))
+        add("true scene", traced(truth, known))
+        add("true scene, with diffraction", traced(truth, known, DIFFRACTED))
+        add("twin, true materials", traced(scene_of(model, place / "twin", CONCRETE), known))
         brick = scene_of(model, place / "brick", BRICK)
-        add("twin, brick", brick)
+        add("twin, brick", traced(brick, known))
         for band, hz in BANDS.items():
-            record, split = toy_record(measured_channels(data / OUTPUT, hz), hz)
-            for what, scene, more in _corrections(brick, model, place, record, split):
-                add(f"{what}, {band}", scene, band=band, **more)
+            fitted = toy_record(measured_channels(data / OUTPUT, hz), hz)
+            for what, scene, more in _corrections(brick, model, place, *fitted):
+                add(f"{what}, {band}", traced(scene, known), band=band, **more)
+        for what, (named, settings) in TRAINED.items():
+            run = wrf_mi.train(known, named, brick, split=split, settings=settings)
+            channels = np.asarray(run.predict(known.tx_pos_m[::READINGS]).mean, complex).reshape(wide.shape)
+            power_db = 10 * np.log10(np.square(np.abs(channels)).mean(axis=1))
+            add(f"{what}, 2 GHz", (channels, power_db), band="2 GHz", seconds=run.metrics["train_seconds"])
     return {"rows": rows}
 
 

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from scipy.spatial import KDTree
 
+from ..core.angles import FloatArray
 from ..runs.folder import load_rows
 from ..runs.run import Run
 from ..tasks import task_of
@@ -16,6 +18,7 @@ from .plan import Plan
 
 MARGIN_M = 0.3
 PANEL_IN = 4.2
+PIXELS = 300  # along the longer side
 
 
 def plan_figure(plan: Plan, run: Run) -> Figure:
@@ -28,9 +31,10 @@ def plan_figure(plan: Plan, run: Run) -> Figure:
     figure = Figure(figsize=(2 * PANEL_IN + 1, PANEL_IN * aspect + 1.2), layout="constrained", facecolor="white")
     shade: dict[str, Any] = {"cmap": "viridis", "vmin": float(plan.std.min()), "vmax": float(plan.std.max())}
     panels = figure.subplots(1, 2, squeeze=False).ravel()
+    extent = (low[0], high[0], low[1], high[1])
     titles = "expected error now", f"after {len(plan.tx_pos_m)} more measurements"
     for axes, title, std in zip(panels, titles, plan.std, strict=True):
-        drawn = axes.scatter(*plan.targets_m[:, :2].T, c=std, s=26, marker="s", linewidths=0, **shade)
+        drawn = axes.imshow(_nearest(plan.targets_m[:, :2], std, low, high), extent=extent, origin="lower", **shade)
         for lines in walls:
             axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2))
         axes.plot(*measured_m[:, :2].T, ".", color="white", markersize=5, markeredgecolor="0.3", markeredgewidth=0.5)
@@ -49,3 +53,14 @@ def plan_figure(plan: Plan, run: Run) -> Figure:
     what = "least certain loss at a surface, dB:" if plan.surfaces else "expected error"
     figure.suptitle(f"{text}\n{what} {first:.3g} before, {last:.3g} after", fontsize=8)
     return figure
+
+
+def _nearest(targets_m: FloatArray, values: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Image [h, w] of the value at the nearest of the targets [m, 2], NaN away from all of them."""
+    # Targets are a random draw of cells: twice the 90th percentile of distances to the next bridges the gaps between.
+    tree = KDTree(targets_m)
+    gap_m = 2 * np.percentile(tree.query(targets_m, k=[2])[0], 90) if len(targets_m) > 1 else MARGIN_M
+    pixel_m = (high - low)[:2].max() / PIXELS
+    x, y = (np.arange(start + pixel_m / 2, end, pixel_m) for start, end in zip(low[:2], high[:2], strict=True))
+    distance_m, nearest = tree.query(np.stack(np.meshgrid(x, y), axis=-1))
+    return np.where(distance_m <= max(gap_m, MARGIN_M), values[nearest], np.nan)
