@@ -67,6 +67,8 @@ while kill -0 "$pip" 2>/dev/null; do
 done
 trap - INT TERM
 wait "$pip" || stop "pip could not install the package; see $venv/pip.log"
+# Matplotlib looks through all fonts once.
+"$venv/bin/python" -c 'import matplotlib.font_manager' 2>/dev/null || true
 step "3 of 4, libraries of Open3D: seconds"
 # Open3D, which `wrf-mi mesh` uses, is linked against what depth cameras and windows need.
 open3d_needs="libusb-1.0-0 libgl1 libegl1 libx11-6"

@@ -164,7 +164,7 @@ def test_commands_take_a_folder_without_positions(tmp_path: Path, capsys: pytest
     run, heard = tmp_path / "run", {"hall": "-60", "stairs": "-70", "lab": "-65"}
     status, out, _ = call(["train", office, "--model", "kriging", "--out", run], capsys)
     assert status == 0
-    assert "stairs estimated at x 11.5 +- 0.0 m, y 0.5 +- 0.0 m, z" in out
+    assert "receiver stairs: position estimated at x 11.5 m as stated, y 0.5 m as stated, z" in out
     of_data = [["data", "info", office], ["data", "check", office]]
     for command in of_data + strength_commands(run, tmp_path, heard):
         status, _, err = call(command, capsys)

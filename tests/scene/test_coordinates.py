@@ -160,7 +160,7 @@ def test_a_national_grid_gets_an_origin_that_keeps_millimetres(tmp_path, capsys)
     for name, options in (("scene", []), ("stated", ["--origin", origin])):
         status, out, err = call(["mesh", file, "--out", tmp_path / name, *options], capsys)
         assert (status, err) == (0, "")
-        assert "origin: 701300, 4485500, 1600; subtract it from the positions of the measurements, too" in out
+        assert "origin: 701300, 4485500, 1600 of the source; positions of measurements must be relative to it" in out
         np.testing.assert_allclose(extent(tmp_path / name), [low, low + ROOM], atol=ROUNDING_M)
         facts = yaml.safe_load((tmp_path / name / "scene.yml").read_text())
         assert facts["origin_m"] == list(LOCAL)

@@ -70,6 +70,18 @@ def test_a_map_with_the_wrong_row_0_is_refused(moved, tmp_path, capsys):
     assert not (tmp_path / "scene").exists()
 
 
+def test_a_map_whose_origin_is_elsewhere_is_told_with_a_shift(tmp_path, caplog):
+    """Doors of a metre stop the positions that are half a metre off; the shift that is told makes them pass."""
+    walls, places = np.concatenate([np.stack([OFFICE_M[:-1], OFFICE_M[1:]], axis=1), PARTITIONS_M]), walk(ROUTE_M)
+    plan = write_grid(tmp_path / "plan.npz", "top", walls, places[::8])
+    for shift, told in (((0.0, 0.0), False), ((-0.6, -0.75), True)):
+        caplog.clear()
+        at = write_positions(tmp_path / "places.csv", places + shift)
+        make_scene(plan, tmp_path / "scene", height_m=2.5, positions=at, replace=True)
+        assert ("positions moved by" in caplog.text) == told
+    assert "moved by 0.25 m in x and 0.25 m in y fit: check the origin of the source (--origin)" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("axis", "about", "remedy"),
     [(1, 0.0, "change the sign of its y"), (1, 3.5, "replace its y by 7 - y"), (0, 4.5, "replace its x by 9 - x")],

@@ -58,7 +58,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     _show_receivers(metrics)
     if "inside_90" in metrics:
         share = f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals"
-        print(f"{share}, CRPS {metrics['crps']:.3g}")
+        print(f"{share}, continuous ranked probability score (CRPS) {metrics['crps']:.3g}")
     if "reception" in metrics:
         _show_reception(metrics["reception"])
     costs = {"train_seconds": "trained {:.0f} s", "ms_per_sample": "{:.3g} ms per sample"}
@@ -82,15 +82,14 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
 
 
 def _show_reception(block: dict[str, Any]) -> None:
-    """Print the scores of probabilities of reception beside those of both references."""
-    names = {"log_loss": "log loss", "brier": "Brier score", "calibration_error": "calibration error"}
+    """Print the log loss of probabilities of reception beside those of both references."""
     reference = block["reference"]
-    values = (
-        f"{words} {block[key]:.3f} (rate of each receiver {reference['reception_rate'][key]:.3f}, "
-        f"nearest rows {reference['reception_neighbours'][key]:.3f})"
-        for key, words in names.items()
+    others = ", ".join(
+        f"{words} {reference[key]['log_loss']:.3f}"
+        for key, words in (("reception_rate", "the receivers' rates"), ("reception_neighbours", "nearest rows"))
     )
-    print(f"reception of {block['received']:.0%} of the test values: " + ", ".join(values))
+    share = f"{block['received']:.0%} of the test values were received"
+    print(f"{share}; log loss of the predicted probabilities {block['log_loss']:.3f} ({others})")
 
 
 def _show_receivers(metrics: dict[str, Any]) -> None:
@@ -103,18 +102,21 @@ def _show_receivers(metrics: dict[str, Any]) -> None:
             print(f"receivers with {what} (number): {named}")
     for name, place in metrics.get("receiver_places", {}).items():
         axes = zip("xyz", place["position_m"], place["std_m"], strict=True)
-        print(f"{name} estimated at " + ", ".join(f"{axis} {value:.1f} +- {std:.1f} m" for axis, value, std in axes))
+        # A coordinate that the data state is not estimated.
+        words = (f"{axis} {value:.1f} " + (f"± {std:.1f} m" if std else "m as stated") for axis, value, std in axes)
+        print(f"receiver {name}: position estimated at {', '.join(words)} (± standard deviation)")
 
 
 def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
     """Print what each stage of a fit contributes on held-out training rows and on test rows, and what it costs."""
-    scores = ("held_out", "held-out rows", ".3f"), ("test", "test rows", ".3f")
-    columns = *scores, ("seconds", "seconds", ".0f"), ("ms", "ms", ".3g")
-    print(f"{'stage, mean ' + label:<34}" + "".join(f"{title:>15}" for _, title, _ in columns))
+    known = ("held_out", "held-out rows", ".3f"), ("test", "test rows", ".3f"), ("seconds", "seconds", ".1f")
+    columns = [each for each in (*known, ("ms", "ms", ".3g")) if any(row.get(each[0]) is not None for row in reports)]
+    print(f"{'stages up to, mean ' + label:<34}" + "".join(f"{title:>15}" for _, title, _ in columns))
     for report in reports:
         cells = [f"{report[key]:{form}}" if report.get(key) is not None else "" for key, _, form in columns]
-        mark = "" if report["kept"] else "  not kept"
-        print(f"{report['stage']:<34}" + "".join(f"{cell:>15}" for cell in cells) + mark)
+        print(f"{report['stage']:<34}" + "".join(f"{cell:>15}" for cell in cells) + "  not kept" * (not report["kept"]))
+    if not all(report["kept"] for report in reports):
+        print("not kept: without it, the stages that follow predict held-out rows as well")
 
 
 class Watch:

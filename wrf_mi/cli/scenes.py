@@ -32,7 +32,8 @@ def _add_mesh(commands: Any) -> None:
     add("--units", help="unit of the coordinates: m, cm, mm or ft (default: that of COLLADA and USD, else m)")
     text = "axis that is up in a scan or mesh (default: that of COLLADA and USD, y in GLB, else z)"
     add("--up", choices=("y", "z"), help=text)
-    text = "point of the source, metres, z up, that becomes the origin, such as 701300,4485500,0"
+    text = "point of the source (of a picture, from its lower left corner), metres, z up, that becomes the origin, "
+    text += "such as 701300,4485500,0"
     add("--origin", type=_point, metavar="X,Y,Z", help=text)
     add("--wall-height", type=float, metavar="M", help="height from floor to ceiling; required for a plan")
     add("--floor", type=float, default=0.0, metavar="M", help="z of a plan's floor (default: 0)")
@@ -42,7 +43,8 @@ def _add_mesh(commands: Any) -> None:
     add("--materials", metavar="FILE", help="materials.yml with rules and exceptions")
     add("--register-pairs", metavar="CSV", help="move by pairs of points: x,y[,z],to_x,to_y[,to_z]")
     add("--register-walls", metavar="CSV", help="move so that walls lie on those of a layout: x,y")
-    text = "measured positions x,y[,z] in the scene's frame: refuse a plan that fits them better when mirrored"
+    text = "measured positions x,y[,z] in the scene's frame: refuse a plan that is mirrored or elsewhere, warn if it "
+    text += "fits better when moved"
     add("--positions", metavar="CSV", help=text)
     add("--replace", action="store_true", help="replace an existing scene folder")
 
@@ -67,7 +69,7 @@ def mesh_command(a: Arguments) -> int:
     lines.append(f"floor: {floor_m2:.1f} m2")
     if scene.origin_m is not None:
         point = ", ".join(f"{value:.12g}" for value in scene.origin_m)
-        lines.append(f"origin: {point}; subtract it from the positions of the measurements, too")
+        lines.append(f"origin: {point} of the source; positions of measurements must be relative to it")
     lines.append(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
     return show(a.json, {**facts, "floor_m2": float(floor_m2), "origin_m": scene.origin_m}, "\n".join(lines))
 

@@ -225,5 +225,5 @@ def tell_places(problem: Problem) -> None:
         if receiver.position_std_m is not None:
             x, y, z = receiver.position_m
             deviations = ", ".join(f"{std:.1f}" for std in receiver.position_std_m)
-            text = "receiver %s: estimated at x %.1f, y %.1f, z %.1f m with standard deviations %s m; used in the scene"
+            text = "receiver %s: position estimated at x %.1f, y %.1f, z %.1f m, deviations %s m, used in the scene"
             logger.warning(text, receiver.name, x, y, z, deviations)

@@ -141,7 +141,8 @@ def run_module(
     """
     threads = worker_threads()
     captured = threads is not None if quiet is None else quiet
-    call = [sys.executable, "-m", "wrf_mi.parallel.child", str(threads or 0), module, *arguments]
+    # -P: a folder ``wrf_mi`` here, as a clone of the project is, would hide the installed package.
+    call = [sys.executable, "-P", "-m", "wrf_mi.parallel.child", str(threads or 0), module, *arguments]
     with tempfile.TemporaryFile("w+", errors="replace") as errors:
         streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": errors if captured else None}
         # In a separate process group: Ctrl-C on a terminal reaches this process alone, which passes it on once.

@@ -48,6 +48,7 @@ from ..version import __version__
 
 FORMAT = 4  # version of ``config.yaml`` and ``model.npz``
 CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"
+PLACE = "working_directory"  # key of the folder in which the paths of ``config.yaml`` were stated
 VERSION, SECONDS = "run/format", "run/train_seconds"  # keys of ``model.npz`` beside the model's arrays
 
 
@@ -130,11 +131,20 @@ def read_config(folder: Path) -> RunConfig:
         stated = {name: content[name] for name in needed}
         stated |= {name: content.get(name) or False for name in ("deterministic", "intervals")}
         stated["left_out"] = content.get("left_out") or {}
+        stated |= {name: _from_here(stated[name], content.get(PLACE)) for name in ("dataset", "scene")}
         config = settings_from(RunConfig, {**stated, "settings": None}, str(path))
         if config.task not in TASKS or config.seed < 0:
             raise InputError(f"{path}: task {shown(config.task)} with seed {config.seed}: not known; restore it")
         kind: Any = config.entry.settings
         return replace(config, settings=settings_from(kind, content["settings"], str(path)))
+
+
+def _from_here(stated: Any, place: Any) -> Any:
+    """A path that was stated in a folder, as it is called here: a run is opened from anywhere, also from a copy."""
+    if not isinstance(stated, str) or not isinstance(place, str) or Path(place) == Path.cwd():
+        return stated
+    there = Path(place, stated)
+    return str(there) if there.exists() else stated
 
 
 def known_config(folder: Path) -> RunConfig | None:
@@ -198,7 +208,7 @@ def write_configs(folder: Path, config: RunConfig, splits: Sequence[Split]) -> N
     """Write ``config.yaml`` of a run and of its folds."""
     of_folds = [(part, replace(config, split=rows.name)) for part, rows in _folders(folder, splits) if part != folder]
     for part, stated in [*of_folds, (folder, config)]:  # last: a folder with a configuration has all its splits
-        content = {"format": FORMAT, **asdict(stated), "versions": versions()}
+        content = {"format": FORMAT, **asdict(stated), PLACE: str(Path.cwd()), "versions": versions()}
         plain = json.loads(json.dumps(content))  # YAML has no tuples
         write_atomically(part / CONFIG, yaml.safe_dump(plain, sort_keys=False))
 

@@ -38,6 +38,8 @@ EDGE_SHARE = 0.1  # share of the walls' height, from below and above, within whi
 TOLERATED, TOLERATED_SHARE = 1, 0.005
 """Tolerated conflicts, and share of positions in conflict: a cupboard taken for a wall, a wrong position. Walls found
 from the robot's map of `flat-ble` have 0.4 % on its path, and 10 to 28 % mirrored."""
+SHIFT_M, SHIFT_STEP_M = 1.5, 0.25
+"""Largest shift of the positions along an axis that is tried where some conflict, and its steps: a picture's margin."""
 LARGEST_SHARE = 0.1  # largest share of positions in conflict where no reflection fits better
 
 
@@ -105,11 +107,23 @@ def check_positions(
             rooms = f"rooms that are open to the outside by more than {LARGEST_GAP_M:g} m get no floor"
             raise InputError(f"{text}: {rooms}; close their outer walls in the plan")
         raise InputError(f"{text}: check the registration and the frame of the positions")
-    if sum(best) <= crossings + outside:
+    if crossings + outside > tolerated and (moved_by := _better_shift(positions_m, surfaces, tolerated)) is not None:
+        shift = "{:g} m in x and {:g} m in y".format(*moved_by)
+        logger.warning("%s; positions moved by %s fit: check the origin of the source (--origin)", text, shift)
+    elif sum(best) <= crossings + outside:
         # No position lies where the building and its reflection differ.
         logger.warning("%s: positions do not tell the plan from its mirror image; see that it is right", text)
     else:
         logger.info("%s", text)
+
+
+def _better_shift(positions_m: FloatArray, surfaces: Sequence[Surface], tolerated: float) -> FloatArray | None:
+    """The smallest of the shifts [2] in metres by which positions [n, 3] fit a scene best; None if they do not."""
+    steps = np.arange(-SHIFT_M, SHIFT_M + SHIFT_STEP_M / 2, SHIFT_STEP_M)
+    shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    shifts = shifts[np.argsort(np.hypot(*shifts.T), kind="stable")]
+    counts = [sum(conflicts(positions_m + np.append(shift, 0.0), surfaces)) for shift in shifts]
+    return None if min(counts) > tolerated else np.asarray(shifts[np.argmin(counts)])
 
 
 def reflections(

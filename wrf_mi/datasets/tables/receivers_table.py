@@ -58,7 +58,7 @@ def _notes(table: Table, receivers: Mapping[str, Receiver], stated: Mapping[str,
     lacking = [name for name, receiver in receivers.items() if np.isnan(receiver.position_m).any()]
     groups = {
         "columns that are not used": [name for name in table.frame.columns if name not in used],
-        "receivers without position": lacking,
+        "receivers without position, which train estimates": lacking,
         "receivers that are not in the measurements": [name for name in stated if name not in receivers],
     }
     file = table.files[0][0].name

@@ -279,7 +279,7 @@ def without_thin_lines(grid: PlanGrid, name: str = "plan") -> PlanGrid:
         logger.warning("%s: walls are drawn as lines thinner than %g m, so every line is a wall", name, THINNEST_WALL_M)
         return grid
     text = "%s: lines thinner than %g m, %.2g %% of the dark cells, are not walls (door leaves, dimensions, letters)"
-    logger.warning(f"{text}; draw walls thicker", name, THINNEST_WALL_M, 100 * share)
+    logger.warning(f"{text}; draw those thicker that are", name, THINNEST_WALL_M, 100 * share)
     return replace(grid, occupied=grid.occupied & ~lines, free=grid.free | lines)
 
 
