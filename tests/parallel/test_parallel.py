@@ -37,6 +37,15 @@ def test_parts_cover_all_rows_once(count: int, workers: int, least: int, most: i
     assert all(least <= size <= most for size in sizes[:-1])
 
 
+def test_a_folder_with_the_name_of_the_package_does_not_hide_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where the project is cloned."""
+    (tmp_path / "wrf_mi").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert run_module("wrf_mi.cli", ["--version"]) == (0, "")
+
+
 def test_row_parts_respect_maximum_size_and_number_of_workers() -> None:
     assert len(row_parts(100_000, 1, 1, 1000)) == 100
     assert len(row_parts(80, 2)) == 16

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,21 @@ def test_commands_take_such_a_run(run: Path, table: Path, tmp_path: Path, comman
 
 def test_scored_again_as_before(run: Path, capsys: pytest.CaptureFixture[str]):
     scored_again_as_before(run, capsys)
+
+
+def test_a_run_is_opened_from_any_folder(table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Also from one in which another folder has the name of the data set, and from a copy of all."""
+    for name in ("made", "elsewhere/table"):
+        (tmp_path / name).mkdir(parents=True)
+    shutil.copytree(table, tmp_path / "made" / "table")
+    monkeypatch.chdir(tmp_path / "made")
+    train("table", "idw", out="run")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    record = open_run(tmp_path / "made" / "run").problem.record
+    np.testing.assert_array_equal(record.tx_pos_m, load(table).tx_pos_m)
+    (tmp_path / "made").rename(tmp_path / "copy")
+    monkeypatch.chdir(tmp_path / "copy")
+    assert len(open_run("run").problem.record.tx_pos_m) == len(record.tx_pos_m)
 
 
 def test_a_stopped_run_goes_on(strengths: Record, tmp_path: Path):
