@@ -119,6 +119,9 @@ def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
         print("not kept: without it, the stages that follow predict held-out rows as well")
 
 
+LOG_S = 5.0  # least time between lines of progress within a part of the work, where no bar is shown
+
+
 class Watch:
     """Progress on standard error, a bar on a terminal, else plain lines, and a stop on Ctrl-C.
 
@@ -135,6 +138,7 @@ class Watch:
         self._task: Any = None
         self._stage: str | None = None
         self._score, self._stop, self._begun = "", False, 0.0
+        self._part, self._told = "", 0.0
 
     def __enter__(self) -> Watch:
         """Handle Ctrl-C."""
@@ -179,8 +183,16 @@ class Watch:
         elif progress is not None and progress.validation_score is not None:
             steps = round(progress.step / fraction)
             print(f"{stage} {progress.step}/{steps}  {text}", file=sys.stderr, flush=True)
-        elif progress is None and new:
+        elif progress is None and new and self._is_due(stage):
             print(stage, file=sys.stderr, flush=True)
+
+    def _is_due(self, stage: str) -> bool:
+        """Whether a stage has a line of a log: the first of a part, and then the first of each few seconds."""
+        part, now = stage.partition(":")[0], time.perf_counter()
+        if part == self._part and now - self._told < LOG_S:
+            return False
+        self._part, self._told = part, now
+        return True
 
     def _text(self, p: FitProgress) -> str:
         if p.validation_score is not None and not math.isnan(p.validation_score):  # NaN without validation rows
