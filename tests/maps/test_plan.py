@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +16,10 @@ from wrf_mi_bench.planning import OURS, RULES, SIZES, even_weights, farthest_poi
 import wrf_mi
 from wrf_mi import InputError, train
 from wrf_mi.cli.main import main
+from wrf_mi.maps.grid import STANDING_M
 from wrf_mi.maps.plan import error_priors, greedy, plan
 from wrf_mi.maps.plan_losses import SURFACE_DB
+from wrf_mi.maps.plan_picture import summary
 from wrf_mi.models.error_prior import ErrorPrior, with_columns
 from wrf_mi.models.interpolation.kriging import Kriging, UncertainKriged
 from wrf_mi.models.interpolation.kriging_equations import KrigingSystem, correlation
@@ -125,6 +128,12 @@ def test_losses_of_a_corrected_scene_are_terms_of_the_process(flat_folder: Path,
     at = np.array([[1.0, 1.0, 1.3], [3.0, 2.0, 1.3]])
     stated = error_priors(in_scene, [0], at)[0].covariance(at, at)
     by_stated = plan(in_scene, 3, criterion="material")
+    box = in_scene.problem.opened_scene.mi_scene.bbox()
+    low, high = (np.array(corner, float).ravel()[:2] for corner in (box.min, box.max))
+    assert (by_stated.candidates_m[:, :2] > low + STANDING_M).all()
+    assert (by_stated.candidates_m[:, :2] < high - STANDING_M).all()
+    least = max(by_stated.surfaces, key=lambda name: by_stated.surfaces[name][0])
+    assert f"least certain loss at a surface, {least}: " in summary(by_stated, in_scene)
     assert by_stated.expected_error[-1] < by_stated.expected_error[0] <= SURFACE_DB
     assert max(before for before, _ in by_stated.surfaces.values()) == by_stated.expected_error[0]
     assert all(after <= before for before, after in by_stated.surfaces.values())
@@ -149,7 +158,10 @@ def test_command_writes_positions_and_a_picture(
     assert [row["order"] for row in rows] == ["1", "2"]
     assert float(rows[0]["x"]) == 4
     assert out.with_suffix(".png").stat().st_size > 5000
-    assert "expected error" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert re.search(r"root mean square over the map and receivers: [\d.]+ dB now, [\d.]+ dB after 2 more", text)
+    assert "    1   4.00" in text
+    assert len(rows[0]["expected_error"]) <= 5
     refusals = {
         "count 9": [*call, "--count", "9"],
         "walk -1": [*call, "--count", "1", "--walk", "-1"],

@@ -10,6 +10,8 @@ from ..core import InputError
 from .options import Arguments, add_command, add_scheduler, refuse
 from .output import Watch, show, summary_table
 
+LITTLE = 0.05  # relative reduction of the error below which a plan is said to change little
+
 
 def add_parser(commands: Any) -> None:
     """Add ``map``, ``plan``, ``locate`` and ``view`` to the commands."""
@@ -101,7 +103,7 @@ def plan_command(a: Arguments) -> int:
     """Write planned positions to a file, and a picture beside it."""
     from ..core.files import write_figure
     from ..maps.plan import plan
-    from ..maps.plan_picture import plan_figure
+    from ..maps.plan_picture import plan_figure, summary
     from ..runs.prediction_file import read_inputs
     from ..runs.run import open_run
 
@@ -117,9 +119,12 @@ def plan_command(a: Arguments) -> int:
         planned = plan(run, a.count, candidates_m=candidates_m, **options, on_progress=watch.on_progress)
     planned.write(out)
     picture = write_figure(out.with_suffix(".png"), plan_figure(planned, run))
-    first, last = planned.expected_error[[0, -1]]
-    what = "least certain loss at a surface, dB:" if planned.surfaces else "expected error"
-    text = f"{what} {first:.3g} now, {last:.3g} after {a.count} more measurements\n"
+    gain, text = 1 - planned.expected_error[-1] / planned.expected_error[0], summary(planned, run)
+    if gain < LITTLE:
+        text += f"\nthat is {gain:.1%} lower: the planned measurements change little"
+    text += "\norder      x      y      z  (m)\n"
+    for order, place in enumerate(planned.tx_pos_m, start=1):
+        text += f"{order:5d}" + "".join(f"{value:7.2f}" for value in place) + "\n"
     figures = {"out": str(out), "picture": str(picture), "expected_error": planned.expected_error.tolist()}
     figures |= {"surfaces": planned.surfaces} if planned.surfaces else {}
     return show(a.json, figures, f"{text}positions: {out}\npicture: {picture}")

@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 
 from ..backend.device import to_vectors
 from ..core import InputError
-from ..core.angles import FloatArray
+from ..core.angles import FloatArray, unit_vectors
 from ..runs.folder import load_rows
 from ..runs.run import Run
 from ..scene.coordinates import require_near
@@ -26,6 +26,7 @@ logger = logging.getLogger(__name__)
 LARGEST = 10_000_000  # largest number of positions of a grid: 240 MB of coordinates
 MARGIN_M = 0.5  # margin around transmitter positions where no scene states the area
 ROUNDS = 20  # largest number of times that an edge is halved: a kilometre into millimetres
+STANDING_M, DIRECTIONS = 0.5, 16  # least distance to a wall at which a person stands, and rays that look for walls
 MOUNTED_M = 0.02  # distance from a surface up to which a receiver is taken to lie before it
 
 HEADINGS = 8
@@ -253,3 +254,20 @@ def inside_scene(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
     origin = to_vectors(positions_m, mi.Point3f)
     below = np.array(scene.mi_scene.ray_test(mi.Ray3f(origin, mi.Vector3f(0, 0, -1))), bool)
     return below & outside_solids(scene, positions_m)
+
+
+def with_standing_room(scene: Any, positions_m: FloatArray) -> FloatArray:
+    """Positions [n, 3], metres, with `STANDING_M` to all sides at their height (``sionna.rt.Scene``, None: all).
+
+    All of them where there is none.
+    """
+    if scene is None:
+        return positions_m
+    import mitsuba as mi
+
+    sides = unit_vectors(np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS, 0)
+    origin = to_vectors(np.repeat(positions_m, DIRECTIONS, axis=0), mi.Point3f)
+    ray = mi.Ray3f(origin, to_vectors(np.tile(sides, (len(positions_m), 1)), mi.Vector3f))
+    ray.maxt = STANDING_M
+    free = ~np.array(scene.mi_scene.ray_test(ray), bool).reshape(-1, DIRECTIONS).any(axis=1)
+    return positions_m[free] if free.any() else positions_m

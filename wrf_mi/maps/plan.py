@@ -45,7 +45,7 @@ from ..scene.correction_data import read_correction_data
 from ..tasks import task_of
 from ..training.session import OnProgress, quiet
 from .coverage import coverage_probability
-from .grid import area_of, candidates_of
+from .grid import area_of, candidates_of, with_standing_room
 from .plan_losses import Losses, Told, Worth, greedy_losses, losses_of, take_best
 
 Criterion = Literal["error", "coverage", "material"]
@@ -82,12 +82,9 @@ class Plan:
 
     def write(self, file: str | Path) -> Path:
         """Write positions to centimetres with their order, expected error after each, and distance walked, as CSV."""
-        columns = (
-            np.arange(1, len(self.tx_pos_m) + 1),
-            *self.tx_pos_m.round(2).T,
-            self.expected_error[1:],
-            self.walked_m,
-        )
+        # Four significant digits: errors of spectra are hundredths.
+        error = [float(f"{value:.4g}") for value in self.expected_error[1:]]
+        columns = np.arange(1, len(self.tx_pos_m) + 1), *self.tx_pos_m.round(2).T, error, self.walked_m.round(3)
         header = ("order", "x", "y", "z", "expected_error", "walked_m")
         return write_csv(Path(file), header, zip(*columns, strict=True))
 
@@ -112,7 +109,7 @@ def plan(
     Args:
         run: run of any model, or its folder, with one fitted model.
         count: number of positions.
-        candidates_m: positions that can be measured [n, 3], metres; None: the map's.
+        candidates_m: positions that can be measured [n, 3], metres; None: the map's, half a metre from walls.
         area_m: lower and upper corner [2] of the area whose errors count, metres; None: the scene, or all rows of the
             data.
         criterion: ``"error"``: the expected error over the map; ``"coverage"``: that about a threshold of received
@@ -134,7 +131,8 @@ def plan(
     known = opened.receivers
     numbers = range(len(known)) if receivers is None else [receiver_index(known, name) for name in receivers]
     map_m = candidates_of(opened, step_m, height_m, _area(opened, area_m)).positions_m
-    targets_m, choices_m = _thinned(map_m, MOST_TARGETS), _candidates(candidates_m, map_m)
+    free_m = with_standing_room(opened.problem.opened_scene, map_m) if candidates_m is None else map_m
+    targets_m, choices_m = _thinned(map_m, MOST_TARGETS), _candidates(candidates_m, free_m)
     _check(count, len(choices_m), criterion, threshold_dbm, walk_m)
     positions_m = np.concatenate([targets_m, choices_m])
     is_target = np.arange(len(positions_m)) < len(targets_m)

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 
 from ..core.angles import FloatArray
+from ..runs.figures import without_formulas
 from ..runs.folder import load_rows
 from ..runs.run import Run
 from ..tasks import task_of
@@ -32,7 +33,7 @@ def plan_figure(plan: Plan, run: Run) -> Figure:
     shade: dict[str, Any] = {"cmap": "viridis", "vmin": float(plan.std.min()), "vmax": float(plan.std.max())}
     panels = figure.subplots(1, 2, squeeze=False).ravel()
     extent = (low[0], high[0], low[1], high[1])
-    titles = "expected error now", f"after {len(plan.tx_pos_m)} more measurements"
+    titles = "standard deviation now", f"after {len(plan.tx_pos_m)} more measurements"
     for axes, title, std in zip(panels, titles, plan.std, strict=True):
         drawn = axes.imshow(_nearest(plan.targets_m[:, :2], std, low, high), extent=extent, origin="lower", **shade)
         for lines in walls:
@@ -46,13 +47,26 @@ def plan_figure(plan: Plan, run: Run) -> Figure:
     for number, position_m in enumerate(plan.tx_pos_m, start=1):
         box = {"boxstyle": "circle,pad=0.15", "facecolor": "#c1121f", "edgecolor": "white", "linewidth": 0.6}
         panels[0].text(*position_m[:2], str(number), color="white", fontsize=7, ha="center", va="center", bbox=box)
-    unit = "dB" if task_of(record).in_decibel else "unit of an observation"
-    figure.colorbar(drawn, ax=list(panels), shrink=0.85).set_label(f"standard deviation ({unit})", fontsize=8)
-    first, last = plan.expected_error[[0, -1]]
+    label = f"standard deviation of the prediction error ({_unit(run)})"
+    figure.colorbar(drawn, ax=list(panels), shrink=0.85).set_label(label, fontsize=8)
     text = "dots: measured; numbers: measure next, in this order; triangles: receivers"
-    what = "least certain loss at a surface, dB:" if plan.surfaces else "expected error"
-    figure.suptitle(f"{text}\n{what} {first:.3g} before, {last:.3g} after", fontsize=8)
-    return figure
+    figure.suptitle(f"{text}\n{summary(plan, run)}", fontsize=8)
+    return without_formulas(figure)
+
+
+def summary(plan: Plan, run: Run) -> str:
+    """The quantity that a plan lowers, before and after, in one line."""
+    (first, last), unit = plan.expected_error[[0, -1]], _unit(run)
+    what, other = "standard deviation of the prediction error, root mean square over the map and receivers", ""
+    if plan.surfaces:
+        before, after = (max(plan.surfaces, key=lambda name: plan.surfaces[name][time]) for time in (0, 1))
+        what = f"standard deviation of the least certain loss at a surface, {before}"
+        other = "" if after == before else f" ({after})"
+    return f"{what}: {first:#.3g} {unit} now, {last:#.3g} {unit}{other} after {len(plan.tx_pos_m)} more measurements"
+
+
+def _unit(run: Run) -> str:
+    return "dB" if task_of(run.problem.record).in_decibel else "units of an observation"
 
 
 def _nearest(targets_m: FloatArray, values: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
