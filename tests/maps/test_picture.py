@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,16 @@ def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
     assert not {"threshold_dbm", "transmit_power_dbm"} & set(dataset.attrs)
     assert "no signal strengths" in heading(figure)
     titles = [axes.get_title().split(": ")[-1] for axes in figure.axes[:3]]
-    assert titles == ["expected power (dB)", "standard deviation (dB)", "probability of more than -10 dB"]
+    assert titles == ["expected power", "standard deviation", "probability of more than -10 dB"]
+    assert [axes.get_ylabel().split()[0] for axes in figure.axes[3:]] == ["dB", "dB", "probability"]
+    assert "open crosses" not in heading(figure)
+    place = {"position_m": [0.0, 0.0, 0.0], "std_m": [0.5, 0.25, 0.0]}
+    (run.folder / "receiver_places.json").write_text(json.dumps({run.receivers[0].name: place}))
+    estimated = map_figure(dataset, run)
+    (ellipse,) = estimated.axes[0].patches
+    assert (ellipse.get_width(), ellipse.get_height()) == (1.0, 0.5)
+    assert "open crosses: receivers at estimated places" in heading(estimated)
+    assert "crosses: receivers," not in heading(estimated)
     split = make_splits(run.problem.record, "official")[0]
     assert len(split.test) <= 12 < len(split.all_train)
     for most, trained in ((picture.MOST_POINTS, len(split.all_train)), (12, -(-len(split.all_train) // 3))):
@@ -99,6 +109,9 @@ def test_picture_of_a_carrier_has_the_rows_of_that_carrier(two_bands: Record, tm
     assert (len(found["trained"]), len(found["other"])) == (15, 5)
     assert np.concatenate(list(found.values())).max() < -50
     command.refused(["map", run.folder, "--out", tmp_path / "none.nc"], "900000000, 2400000000 Hz")
+    assert "squares" in heading(figure)
+    sure = map_figure(radio_map(run, step_m=1.0, frequency_hz=BANDS_HZ[1], threshold_dbm=-200), run)
+    assert " ".join(sure.axes[2].get_title().split()).endswith("more than -200 dBm: 1.00 to 1.00 here")
     between = map_figure(radio_map(run, step_m=1.0, frequency_hz=1.5e9), run)
     assert "no measured row at this carrier" in heading(between)
 

@@ -86,7 +86,7 @@ def test_page_shows_every_picture_that_was_written(tmp_path):
     page = compare([tmp_path / "a<b"], tmp_path / "out").read_text()
     assert "a&lt;b" in page
     assert "a<b" not in page
-    names = [f"room-{what}.png" for what in ("cdf", "samples", "time", "errors", "training")]
+    names = [f"room-{what}.png" for what in ("cdf", "samples", "errors", "training")]
     shown = re.findall(r'src="([^"]+)"', page)
     assert len(shown) == len(names)
     for source, name in zip(shown, names, strict=True):
@@ -131,7 +131,7 @@ def test_pictures_show_rows_that_all_runs_predict(tmp_path, monkeypatch):
     compare([many, few], tmp_path / "out")
     rows, columns = calls[-1]
     assert {name for name, _ in rows} == {"row 2", "row 4", "row 8"}
-    assert columns[:3] == ["truth", "many", "few"]
+    assert columns[:3] == ["measured", "many", "few"]
     for name, (truth, of_many, of_few, _) in rows:
         r = int(name.split()[1])
         assert np.array_equal(truth, np.random.default_rng(r).random(SHAPE).astype(np.float32))

@@ -80,7 +80,7 @@ def _add_plan(commands: Any) -> None:
     text = "file to write: order, x, y, z, expected error after each, distance walked; FILE.png beside it"
     add("--out", required=True, metavar="FILE.csv", help=text)
     add("--count", type=int, default=10, metavar="N", help="number of positions (default: 10)")
-    text = "positions that can be measured, x, y, z in metres, with a header (default: all of the map)"
+    text = "positions that can be measured, x, y, z in metres, with a header (default: the map, 0.5 m from walls)"
     add("--candidates", metavar="FILE.csv", help=text)
     text = "corners of the area whose errors count, metres (default: the scene, or all rows of the data)"
     add("--area", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help=text)

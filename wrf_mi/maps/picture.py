@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
@@ -18,8 +19,10 @@ from numpy.typing import NDArray
 from ..core import Prediction
 from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
+from ..models.receiver_places import stored_places
 from ..runs.figures import without_formulas
 from ..runs.folder import load_rows
+from ..runs.results import RECEPTION
 from ..runs.run import Run
 from ..runs.scene_view import surfaces_of
 from ..scene.mesh.surfaces import cut_lines
@@ -38,7 +41,10 @@ MEASURED_TAIL = 10.0  # likewise for measured levels, among which are single dee
 STRONGEST = "strongest receiver"
 TRAINED = {"marker": "o", "s": 13, "edgecolors": "white", "linewidths": 0.4}
 OTHER = {"marker": "s", "s": 11, "edgecolors": "black", "linewidths": 0.4}
-MARKS = "circles: training rows, squares: other measured rows, crosses: receivers"
+ESTIMATED: dict[str, Any] = {"marker": "X", "s": 26, "facecolors": "none"}  # receiver at an estimated place
+RED = "#c1121f"  # of receivers
+MOST_DEVIATIONS = 3  # number of receivers up to which the standard deviation of each is drawn
+CERTAIN = 0.9  # least coverage of a panel in one colour, whose title states the values
 LETTERS_PER_INCH, LINE_IN = 14, 0.16  # of the text above the panels, and height of its lines in inches
 SAME_CARRIER = 1e-9  # relative difference of frequencies that are the same
 
@@ -52,7 +58,7 @@ class _Measured(NamedTuple):
 
 
 class _Panel(NamedTuple):
-    """Values [y, x] or [point] with their colours, and the sides on which values may lie beyond these.
+    """Values [y, x] or [point] with their colours and unit, and the sides on which values may lie beyond these.
 
     ``number`` is the receiver's, None: all; ``measured`` are its rows.
     """
@@ -60,49 +66,56 @@ class _Panel(NamedTuple):
     title: str
     values: FloatArray
     colours: ScalarMappable
-    beyond: Literal["neither", "max", "both"]
+    unit: str
+    beyond: Literal["neither", "both"]
     number: int | None
     measured: _Measured | None
 
 
 def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
-    """Expected power, its standard deviation and the coverage, of the strongest receiver; then power at each receiver.
+    """Expected power, its standard deviation and the coverage, of the strongest receiver; then power at each receiver,
+    and of at most `MOST_DEVIATIONS` receivers the standard deviation at each.
 
     Walls are the cut of the run's scene at the map's height; measured rows of the run's data at this receiver and at
     the map's carrier have their measured level as colour, circles those that trained the model, squares all others.
     """
     flat = "point" not in dataset.sizes
     measured = [_measured(dataset, run, k) for k in range(dataset.sizes["receiver"])]
-    panels = _panels(dataset, measured)
+    panels, estimated = _panels(dataset, measured), stored_places(run.folder)
     lines = -(-len(panels) // COLUMNS)
     columns = min(COLUMNS, len(panels))
     width = (PANEL_IN + BAR_IN) * columns
-    heading = _heading(dataset, measured, int(width * LETTERS_PER_INCH))
+    heading = _heading(dataset, measured, estimated, int(width * LETTERS_PER_INCH))
     height = (PANEL_IN * _aspect(dataset) + 0.5) * lines + 0.3 + LINE_IN * heading.count("\n")
     figure = Figure(figsize=(width, height), layout="constrained")
     kind: dict[str, Any] = {} if flat else {"projection": "3d", "computed_zorder": False}
     grid = figure.subplots(lines, columns, squeeze=False, subplot_kw=kind)
     walls = scene_cuts(run, float(dataset["height"])) if flat else []
     for axes, panel in zip(grid.flat, panels, strict=False):
+        if panel is None:
+            axes.set_axis_off()
+            continue
         if flat:
             _draw_plan(axes, dataset, panel.values, panel.colours, walls)
             axes.set_xlabel("x (m)", fontsize=7)
             axes.set_ylabel("y (m)", fontsize=7)
         else:
             _draw_mesh(axes, dataset, panel.values, panel.colours)
-        _draw_points(axes, dataset, panel)
-        axes.set_title(panel.title, fontsize=8)
+        _draw_points(axes, dataset, panel, estimated)
+        axes.set_title(textwrap.fill(panel.title, int(PANEL_IN * LETTERS_PER_INCH)), fontsize=8)
         axes.tick_params(labelsize=6)
         bar = figure.colorbar(panel.colours, ax=axes, shrink=0.8, pad=0.02 if flat else 0.12, extend=panel.beyond)
         bar.ax.tick_params(labelsize=6)
+        top = f" (largest: {np.nanmax(panel.values):.0f})" if panel.beyond == "both" else ""
+        bar.set_label(f"{panel.unit}{top}", fontsize=7)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     figure.suptitle(heading, fontsize=8)
     return without_formulas(figure)
 
 
-def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Panel]:
-    """Panels of the strongest receiver, then the power at each of the first ones."""
+def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Panel | None]:
+    """Panels of the strongest receiver, then of each of the first ones, in lines; None leaves a place free."""
     power = dataset[POWER].values
     low, high = _range(power, np.concatenate([rows.level for rows in measured]))
     colours = ScalarMappable(Normalize(low, max(high, low + 1e-3)), "viridis")
@@ -118,23 +131,38 @@ def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Pan
         return np.take_along_axis(dataset[name].values, best, axis=0)[0]
 
     rows = None if several else measured[0]
-    panels = [_Panel(f"{who}: expected power ({unit})", of_best(POWER), colours, "both", number, rows)]
+    panels: list[_Panel | None] = []
+    panels.append(_Panel(f"{who}: expected power", of_best(POWER), colours, unit, "both", number, rows))
+    each = STD in dataset and 1 < len(names) <= MOST_DEVIATIONS
     if STD in dataset:
-        values = of_best(STD)
-        scale = Normalize(0, max(float(np.nanpercentile(values, 100 - TAIL)), 1e-3))
-        panels.append(
-            _Panel(f"{who}: standard deviation (dB)", values, ScalarMappable(scale, "magma"), "max", number, None)
-        )
+        drawn = dataset[STD].values if each else of_best(STD)
+        shades = ScalarMappable(Normalize(0, max(float(np.nanmax(drawn)), 1e-3)), "magma")
+        panels.append(_Panel(f"{who}: standard deviation", of_best(STD), shades, "dB", "neither", number, None))
     if COVERAGE in dataset:
-        threshold = next(dataset.attrs[key] for key in ("threshold_dbm", "threshold_db") if key in dataset.attrs)
-        title = f"{who}: probability of more than {threshold:g} {unit}"
-        shades = ScalarMappable(Normalize(0, 1), "cividis")
-        panels.append(_Panel(title, of_best(COVERAGE), shades, "neither", number, None))
+        probable = ScalarMappable(Normalize(0, 1), "cividis")
+        values = of_best(COVERAGE)
+        panels.append(_Panel(_covered(dataset, who, values), values, probable, "probability", "neither", number, None))
     numbers = range(len(names) if several else 0)[:MOST_PANELS]
-    return panels + [_Panel(names[k], power[k], colours, "both", k, measured[k]) for k in numbers]
+    powers = [_Panel(f"{names[k]}: expected power", power[k], colours, unit, "both", k, measured[k]) for k in numbers]
+    if not each:
+        return panels + powers
+    title, std = "{}: standard deviation", dataset[STD].values
+    spreads = [_Panel(title.format(names[k]), std[k], shades, "dB", "neither", k, None) for k in numbers]
+    return [panel for line in (panels, powers, spreads) for panel in (*line, *[None] * (COLUMNS - len(line)))]
 
 
-def _heading(dataset: xarray.Dataset, measured: Sequence[_Measured], width: int) -> str:
+def _covered(dataset: xarray.Dataset, who: str, values: FloatArray) -> str:
+    """Title of the coverage: what the probability is of, and its values where all of them have one colour."""
+    threshold = next(dataset.attrs[key] for key in ("threshold_dbm", "threshold_db") if key in dataset.attrs)
+    received = "reception and " if RECEPTION in dataset else ""
+    title = f"{who}: probability of {received}more than {threshold:g} {dataset[POWER].attrs['units']}"
+    low, high = np.nanmin(values), np.nanmax(values)
+    if low < CERTAIN:
+        return title
+    return f"{title}: {low:.2f} to {high:.2f} here" + (", as readings are lost at any power" if received else "")
+
+
+def _heading(dataset: xarray.Dataset, measured: Sequence[_Measured], estimated: Mapping[str, Any], width: int) -> str:
     """Title, heights of the transmitter, carrier and marks, in lines of at most ``width`` letters."""
     heights = np.concatenate([rows.points_m[:, 2] for rows in measured])
     words = [] if "point" in dataset.sizes else [f"transmitter at z = {float(dataset['height']):.2f} m"]
@@ -146,7 +174,15 @@ def _heading(dataset: xarray.Dataset, measured: Sequence[_Measured], width: int)
         words.append(f"measured at z = {heights.min():.2f} m")
     else:
         words.append(f"measured at z = {heights.min():.2f} to {heights.max():.2f} m")
-    parts = [dataset.attrs["title"], ", ".join(words), MARKS]
+    trained = np.concatenate([rows.trained for rows in measured])
+    receivers = {str(name) in estimated for name in dataset["receiver"].values}
+    marks = {
+        "circles: training rows": trained.any(),
+        "squares: other measured rows": not trained.all(),
+        "crosses: receivers": False in receivers,
+        "open crosses: receivers at estimated places, with one standard deviation": True in receivers,
+    }
+    parts = [dataset.attrs["title"], ", ".join(words), ", ".join(mark for mark, drawn in marks.items() if drawn)]
     if not dataset.attrs["level_is_absolute"]:
         parts.append("levels relative to full scale are no signal strengths")
     return "\n".join(textwrap.fill(part, width) for part in parts)
@@ -177,6 +213,7 @@ def _draw_plan(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: 
     for lines in walls:
         axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2, capstyle="round"))
     axes.set_aspect("equal")
+    axes.margins(0)
 
 
 def _draw_mesh(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable) -> None:
@@ -214,12 +251,19 @@ def _measured(dataset: xarray.Dataset, run: Run, number: int) -> _Measured:
     return _Measured(record.tx_pos_m[rows], level[rows], trained[rows])
 
 
-def _draw_points(axes: Any, dataset: xarray.Dataset, panel: _Panel) -> None:
-    """Measured levels of a receiver, and the receivers as crosses."""
+def _draw_points(axes: Any, dataset: xarray.Dataset, panel: _Panel, estimated: Mapping[str, Any]) -> None:
+    """Measured levels of a receiver, and the receivers as crosses, open with an ellipse where estimated."""
     dims = 3 if "point" in dataset.sizes else 2
     at = np.stack([dataset[f"receiver_{axis}"].values for axis in "xyz"], axis=-1)
-    chosen = at if panel.number is None else at[panel.number : panel.number + 1]
-    axes.scatter(*chosen.T[:dims], marker="x", color="#c1121f", s=22, linewidths=1.4, zorder=5)
+    chosen = range(len(at)) if panel.number is None else [panel.number]
+    for k in chosen:
+        place = estimated.get(str(dataset["receiver"].values[k]))
+        mark = {"marker": "x", "color": RED, "s": 22} if place is None else ESTIMATED | {"edgecolors": RED}
+        axes.scatter(*at[k, :dims, None], **mark, linewidths=1.4, zorder=5)
+        if place is not None and dims == 2:
+            spread = 2 * np.array(place["std_m"])[:2]
+            axes.add_patch(Ellipse(at[k, :2], *spread, fill=False, edgecolor=RED, linewidth=1, zorder=5))
+            axes.annotate("estimated", at[k, :2], (6, 4), textcoords="offset points", fontsize=6, color=RED, zorder=5)
     if panel.measured is None:
         return
     shades = {"cmap": panel.colours.cmap, "norm": panel.colours.norm}

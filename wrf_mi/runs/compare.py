@@ -37,9 +37,10 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
     Runs on the same data set are compared on the same test rows, with their references (`wrf_mi.tasks.TASKS`). Writes
     into ``out``, whole or not at all: ``compare.csv``, one row per run and reference; ``differences.csv``, paired
     differences of each run and its reference and of all pairs of runs, on common rows; for each data set pictures
-    ``<data set>-*.png`` of score distributions (``cdf``), ``samples`` with the truth beside each prediction, ``time``
-    against error, where positions are known ``errors`` over them and the ``best`` run at each, ``scene`` if one was
-    traced and ``training`` if one was trained; and ``index.html``, one file with all of it that needs no network.
+    ``<data set>-*.png`` of score distributions (``cdf``), ``samples`` with the measured beside each predicted, ``time``
+    against error of several runs, where positions are known ``errors`` over them and the ``best`` run at each,
+    ``scene`` if one was traced and ``training`` if one was trained; and ``index.html``, one file with all of it that
+    needs no network.
 
     Args:
         run_dirs: run folders, of any data sets and tasks.
@@ -113,7 +114,7 @@ def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
     drawn: list[tuple[str, str, Figure | None]] = [
         ("cdf", f"{task.label} over test rows", cdf),
         ("samples", *(_spectra(runs) if task.image else _maps(runs))),
-        ("time", "Time against error", _times(runs)),
+        ("time", "Time against error", _times(runs) if len(runs) > 1 else None),
         ("stages", "What each stage contributes", _stages(runs)),
         *_error_maps(runs),
         ("scene", "Mesh, traced paths and the strongest Gaussians of the field", _scene(runs)),
@@ -213,7 +214,7 @@ def _spectra(runs: Sequence[Results]) -> tuple[str, Figure]:
 
 
 def _columns(runs: Sequence[Results]) -> list[str]:
-    return ["truth", *(run.name for run in runs), f"{runs[0].reference_name} ({runs[0].metrics['split']})"]
+    return ["measured", *(run.name for run in runs), f"{runs[0].reference_name} ({runs[0].metrics['split']})"]
 
 
 def _maps(runs: Sequence[Results]) -> tuple[str, Figure]:

@@ -23,10 +23,12 @@ if TYPE_CHECKING:
     from ..gaussians.footprint import Footprints
 
 PANEL_IN = 2.3  # side of a polar plot in inches
+TABLE_IN = 5.5  # least width of a table of maps in inches
 OUTLINE_POINTS = 64  # corners of the polygon of a footprint's outline
 COLOURS = 10  # number of colours in Matplotlib's cycle
 POINTS_AREA = 4000.0  # area of all points of a map together, points squared: few positions are drawn larger
 MARKERS = "os^D"  # markers of points, where colours repeat
+NOT_KEPT = "hollow: not kept, without a clear gain on held-out rows by itself or with the stages after it"
 TAIL = 0.01
 """Fraction of each curve that may lie beyond either end of the axis, so that outliers do not compress the rest."""
 
@@ -84,7 +86,8 @@ def position_table(rows: Rows, columns: Sequence[str], tx_pos_m: ArrayLike, labe
     """Table of maps of values [m], NaN left out, at positions [m, 3] in metres; those of a row share their colours."""
     x, y, _ = np.asarray(tx_pos_m, float).T
     aspect = float(np.clip((np.ptp(y) + 0.1) / (np.ptp(x) + 0.1), 0.3, 1.5))
-    figure = Figure(figsize=(PANEL_IN * len(columns) + 0.8, PANEL_IN * aspect * len(rows) + 0.6), layout="constrained")
+    panel_in = max(PANEL_IN, TABLE_IN / len(columns))
+    figure = Figure(figsize=(panel_in * len(columns) + 0.8, panel_in * aspect * len(rows) + 0.6), layout="constrained")
     grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey=True)
     for r, (name, maps) in enumerate(rows):
         row_values = np.concatenate([np.ravel(values) for values in maps if values is not None])
@@ -200,9 +203,12 @@ def stage_steps(stages: Mapping[str, Sequence[Mapping[str, Any]]], label: str = 
     for number, (name, reports) in enumerate(stages.items()):
         color, used = f"C{number}", [report for report in reports if report["kept"]]
         for key, style, what in (("held_out", "-", "held-out rows"), ("test", "--", "test rows")):
-            axes.plot(*_scored(used, key, order), style, marker="o", color=color, label=f"{name}, {what}")
+            if (scored := _scored(used, key, order))[0]:
+                axes.plot(*scored, style, marker="o", color=color, label=f"{name}, {what}")
         rejected = _scored([report for report in reports if not report["kept"]], "held_out", order)
         axes.scatter(*rejected, facecolors="none", edgecolors=color, zorder=3)
+        if rejected[0]:
+            axes.set_title(NOT_KEPT, fontsize=8)
         _annotate_costs(axes, reports, order, color)
     axes.set_xticks(range(len(order)), order)
     axes.set(xlim=(-0.2, len(order) - 0.5), ylabel=f"mean {label}")  # the last label lies beside its point
