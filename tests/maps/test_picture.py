@@ -116,13 +116,19 @@ def test_picture_of_a_carrier_has_the_rows_of_that_carrier(two_bands: Record, tm
     assert "no measured row at this carrier" in heading(between)
 
 
-def test_picture_of_a_surface_shows_the_mesh(flat_folder: Path, tmp_path: Path, command: Command) -> None:
+def test_picture_of_a_surface_shows_the_mesh(
+    flat_folder: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     trimesh.creation.box((2.0, 1.0, 0.5)).export(tmp_path / "table.ply")
     more = ("--surface", tmp_path / "table.ply", "--receiver", "anchor1")
-    dataset, figure, _ = mapped(flat_folder, tmp_path, command, *more)
+    dataset, figure, run = mapped(flat_folder, tmp_path, command, *more)
     faces = figure.axes[0].collections[0]
     colours = np.unique(faces.get_facecolor()[:, :3], axis=0)
     assert len(faces.get_facecolor()) == dataset.sizes["point"]
     assert len(colours) > 1
     assert "transmitter at z" not in heading(figure)
     assert write_map(dataset, tmp_path / "map.csv").read_text().startswith("receiver,x,y,z,")
+    for most, deviations in ((2, 3), (1, 1)):  # the strongest receiver's, and those of few receivers
+        monkeypatch.setattr(picture, "MOST_DEVIATIONS", most)
+        drawn = map_figure(radio_map(run, step_m=1.0), run)
+        assert sum("standard deviation" in axes.get_title() for axes in drawn.axes) == deviations

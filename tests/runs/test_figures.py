@@ -68,3 +68,15 @@ def test_largest_weight_is_drawn_last_and_absent_footprints_are_omitted() -> Non
     assert azimuth == [180, 0, 90]
     (lines,) = figure.axes[1].collections
     assert lines.get_array().tolist() == [0.1, 0.5, 0.9]
+
+
+def test_stages_name_what_is_drawn() -> None:
+    def report(stage: str, kept: bool, score: float) -> dict[str, object]:
+        return {"stage": stage, "kept": kept, "held_out": score}
+
+    reports = [report("mean", True, 3.0), report("residual", True, 2.0)]
+    (axes,) = figures.stage_steps({"run": reports}).axes
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["run, held-out rows"]
+    assert not axes.get_title()
+    (axes,) = figures.stage_steps({"run": [*reports, report("calibration", False, 1.0)]}).axes
+    assert axes.get_title() == figures.NOT_KEPT

@@ -235,6 +235,11 @@ def test_plan_shows_the_walls_where_they_are():
     shown = np.concatenate([segment for c in cuts for segment in c.get_segments()])
     assert [*shown.min(axis=0), *shown.max(axis=0)] == pytest.approx([0, 0, 5, 4.5])
     assert len(cuts) == len(L_ROOM_M) - 1
+    names = {text.get_text(): text.get_position() for text in plan.texts}
+    wall = next(surface for surface in room() if surface.kind == "wall")
+    middle = (wall.vertices_m.min(axis=0) + wall.vertices_m.max(axis=0))[:2] / 2
+    assert names[wall.name] == pytest.approx(middle)
+    assert not {text.get_text() for text in draw_scene(room() * 11).axes[1].texts} & {wall.name}
     high = [Surface(s.name, s.kind, s.vertices_m + np.array([0, 0, 412.0]), s.faces) for s in room()]
     assert 412.0 < float(draw_scene(high).axes[1].get_title().split()[-2]) < 414.5
 

@@ -126,6 +126,7 @@ def plan_command(a: Arguments) -> int:
     for order, place in enumerate(planned.tx_pos_m, start=1):
         text += f"{order:5d}" + "".join(f"{value:7.2f}" for value in place) + "\n"
     figures = {"out": str(out), "picture": str(picture), "expected_error": planned.expected_error.tolist()}
+    figures["positions_m"] = planned.tx_pos_m.round(2).tolist()
     figures |= {"surfaces": planned.surfaces} if planned.surfaces else {}
     return show(a.json, figures, f"{text}positions: {out}\npicture: {picture}")
 

@@ -268,6 +268,6 @@ def with_standing_room(scene: Any, positions_m: FloatArray) -> FloatArray:
     sides = unit_vectors(np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS, 0)
     origin = to_vectors(np.repeat(positions_m, DIRECTIONS, axis=0), mi.Point3f)
     ray = mi.Ray3f(origin, to_vectors(np.tile(sides, (len(positions_m), 1)), mi.Vector3f))
-    ray.maxt = STANDING_M
-    free = ~np.array(scene.mi_scene.ray_test(ray), bool).reshape(-1, DIRECTIONS).any(axis=1)
+    distance_m = np.array(scene.mi_scene.ray_intersect_preliminary(ray).t, float).reshape(-1, DIRECTIONS)
+    free = (distance_m >= STANDING_M).all(axis=1)  # infinite where nothing is hit
     return positions_m[free] if free.any() else positions_m

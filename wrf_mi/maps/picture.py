@@ -262,7 +262,7 @@ def _draw_points(axes: Any, dataset: xarray.Dataset, panel: _Panel, estimated: M
         axes.scatter(*at[k, :dims, None], **mark, linewidths=1.4, zorder=5)
         if place is not None and dims == 2:
             spread = 2 * np.array(place["std_m"])[:2]
-            axes.add_patch(Ellipse(at[k, :2], *spread, fill=False, edgecolor=RED, linewidth=1, zorder=5))
+            axes.add_patch(Ellipse((at[k, 0], at[k, 1]), *spread, fill=False, edgecolor=RED, linewidth=1, zorder=5))
             axes.annotate("estimated", at[k, :2], (6, 4), textcoords="offset points", fontsize=6, color=RED, zorder=5)
     if panel.measured is None:
         return

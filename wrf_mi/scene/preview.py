@@ -40,6 +40,7 @@ LIGHT = np.array([0.35, -0.5, 0.79])
 CUT = 0.45  # share of the height at which the plan is cut
 TOP = 0.8  # level faces above this share of the height are taken off like a ceiling
 WHOLE_FACES = 50
+MOST_NAMED = 40  # number of walls up to which the plan has their names
 MOST_OUTLINED = 500  # number of faces above which a surface is drawn without its free edges
 CREASE_RAD = 0.5  # angle between the normals of two faces from which their common edge is a crease
 
@@ -254,16 +255,18 @@ def _set_view(axes: Any, low: FloatArray, high: FloatArray) -> None:
         axes.set(**{f"{name}lim": (a, a + s)})
         axis.set_label_text(f"{name} (m)", fontsize=8)
         axis.set_pane_color((1, 1, 1, 0))
-    axes.zaxis.labelpad = -4
+    axes.zaxis.labelpad = -8
     axes.set_box_aspect(size, zoom=0.98)
     axes.tick_params(labelsize=7, pad=0)
+    axes.set_title("ceiling not drawn, walls in front transparent", fontsize=9)
     axes.zaxis.set_major_locator(MaxNLocator(3))
     axes.grid(False)
 
 
 def _draw_plan(axes: Axes, surfaces: Sequence[Surface], low: FloatArray, high: FloatArray) -> None:
-    """The floor, and a cut through everything that stands on it."""
+    """The floor, and a cut through everything that stands on it, with the names of few walls."""
     level = float(low[2] + CUT * (high[2] - low[2]))
+    named = sum(surface.kind == "wall" for surface in surfaces) <= MOST_NAMED
     for surface in surfaces:
         colour = np.array(to_rgb(KIND_COLOURS[surface.kind]))
         if surface.kind == "floor":
@@ -273,6 +276,8 @@ def _draw_plan(axes: Axes, surfaces: Sequence[Surface], low: FloatArray, high: F
         elif len(cut := cut_lines(surface, level)):
             lines = LineCollection(list(cut), colors=[0.6 * colour], linewidths=2.2, capstyle="round", zorder=3)
             axes.add_collection(lines)
+            if named and surface.kind == "wall":
+                _draw_name(axes, surface.name, cut)
     size = np.maximum(high - low, 0.1)[:2]
     margin = 0.06 * size.max()
     axes.set_xlim(low[0] - margin, low[0] + size[0] + margin)
@@ -286,3 +291,15 @@ def _draw_plan(axes: Axes, surfaces: Sequence[Surface], low: FloatArray, high: F
     corner = low[0], low[1] - 1.35 * margin
     axes.add_patch(Rectangle(corner, bar, 0.25 * margin, color="black", zorder=9))
     axes.annotate(f"{bar:g} m", (low[0] + bar, corner[1]), (4, 0), textcoords="offset points", fontsize=8)
+
+
+def _draw_name(axes: Axes, name: str, cut: FloatArray) -> None:
+    """Write a wall's name along its cut [n, 2, 2], in the middle."""
+    start, end = max(cut, key=lambda line: float(np.linalg.norm(line[1] - line[0])))
+    angle = (np.degrees(np.arctan2(*(end - start)[::-1])) + 90) % 180 - 90  # never upside down
+    corners = cut.reshape(-1, 2)
+    along = corners @ (end - start)  # a wall of several faces is cut into as many lines
+    middle = (corners[along.argmin()] + corners[along.argmax()]) / 2
+    box = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+    at = {"ha": "center", "va": "center", "rotation": angle, "rotation_mode": "anchor", "zorder": 9}
+    axes.text(middle[0], middle[1], name, fontsize=6, bbox=box, parse_math=False, **at)
