@@ -263,7 +263,9 @@ def _draw_points(axes: Any, dataset: xarray.Dataset, panel: _Panel, estimated: M
         if place is not None and dims == 2:
             spread = 2 * np.array(place["std_m"])[:2]
             axes.add_patch(Ellipse((at[k, 0], at[k, 1]), *spread, fill=False, edgecolor=RED, linewidth=1, zorder=5))
-            axes.annotate("estimated", at[k, :2], (6, 4), textcoords="offset points", fontsize=6, color=RED, zorder=5)
+            paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
+            text = {"textcoords": "offset points", "fontsize": 6, "color": RED, "bbox": paper, "zorder": 5}
+            axes.annotate("estimated", at[k, :2], (7, 4), **text)
     if panel.measured is None:
         return
     shades = {"cmap": panel.colours.cmap, "norm": panel.colours.norm}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from changed_folders import error_line, refusal
+from matplotlib.figure import Figure
 
 from wrf_mi import import_measurements
 from wrf_mi.checking import check_data
@@ -211,6 +212,18 @@ def test_sectors_keep_orientation_antenna_and_carrier(tmp_path: Path) -> None:
     anchors.assign(id="hall").to_csv(tmp_path / "anchors.csv", index=False)
     message = r"anchors\.csv: row 2: receiver hall is in an earlier row, too"
     refusal(imported, tmp_path, wide(), message, anchors=tmp_path / "anchors.csv")
+
+
+def test_picture_names_receivers_at_known_and_at_unknown_places(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = list[Figure]()
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    (tmp_path / "aps.csv").write_text("id,x,y,z\nkitchen,1,1,2.5\n7,1,7,2.5\n")
+    imported(tmp_path, wide(), anchors=tmp_path / "aps.csv")
+    (axes,) = figures[0].axes
+    assert sorted(text.get_text() for text in axes.texts) == ["anchor7", "kitchen"]
+    assert axes.get_title().splitlines()[1] == "receivers at unknown places: hall"
 
 
 def test_receivers_heard_too_rarely_are_left_out_by_name(tmp_path: Path) -> None:
