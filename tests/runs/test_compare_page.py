@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 import subprocess
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -24,7 +25,15 @@ from wrf_mi.runs import figures
 from wrf_mi.runs.api import plan_run, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.compare_page import changed_settings, command
-from wrf_mi.runs.compare_tables import OTHER_ROWS, best_run, common, common_means, differences, first_differences
+from wrf_mi.runs.compare_tables import (
+    OTHER_ROWS,
+    best_run,
+    common,
+    common_means,
+    differences,
+    first_differences,
+    method_rows,
+)
 from wrf_mi.runs.folder import AntennaOptions, RunRequest, read_config, start_run
 from wrf_mi.runs.results import Results
 from wrf_mi.runs.run import open_run
@@ -164,6 +173,24 @@ def test_all_seeds_must_agree(seeds: list[Path]) -> None:
     assert found["worst", reference] == "worse"
     assert found["worst", "seed0"] == "worse"
     assert found["seed2", "seed0"] == "another seed"
+    assert ("seed1", "seed2") not in found  # a method is not compared with itself
+    best, worst = method_rows(runs)
+    assert (best["method"], best["seeds"]) == ("seed0, seed1, seed2", 3)
+    assert (worst["method"], worst["mean_sd"]) == ("worst", None)
+    assert (best["mean"], best["mean_sd"]) == pytest.approx((5.5 / 3, np.std([1, 1, 3.5], ddof=1)))
+    assert (worst["difference"], worst["low"], best["difference"]) == pytest.approx((5.5 / 3 - 5, 5.5 / 3 - 5, 0))
+    elsewhere = method_rows([*runs[:3], strengths("other", 5.0, train=(1, 2))])[1]
+    assert elsewhere["difference"] is None  # trained on other rows
+    assert not method_rows([runs[0], runs[3]])  # no method of several seeds
+
+
+def test_predictions_of_another_program_are_seeds_of_one_method() -> None:
+    def mine(name: str, seed: int) -> Results:
+        run = strengths(name, 1.0, seed=seed)
+        return replace(run, metrics={**run.metrics, "model": "mine", "predictions": f"{name}.npz"})
+
+    assert [row["method"] for row in method_rows([mine("a", 0), mine("b", 1), strengths("c", 2.0)])] == ["a, b", "c"]
+    assert not method_rows([mine("a", 0), mine("b", 0)])  # what differs is not stated
 
 
 def every_run(folder: Path, flat_folder: Path) -> list[tuple[Path, dict[str, Any]]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -180,7 +181,8 @@ def summary(record: Record) -> dict[str, Any]:
     ``receivers`` are received rows by name, ``observation`` the shape of an observation, ``official`` the numbers of
     training and test rows, ``folds`` rows by spatial fold, ``frequencies_hz`` the carrier or the subcarriers,
     ``carriers_hz`` rows by carrier, ``receiver_carriers_hz`` carriers by receiver, ``antennas`` patterns and
-    polarisations of receivers, ``runs`` rows by run, ``n_readings`` and ``std_db`` minimum, median and maximum.
+    polarisations of receivers, ``runs`` rows by run, ``n_readings`` and ``std_db`` minimum, median and maximum,
+    ``extent_m`` that of the positions, ``nearest_m`` distances of test to training rows.
 
     Raises:
         InputError: parts of the record that do not fit together.
@@ -211,7 +213,24 @@ def summary(record: Record) -> dict[str, Any]:
         "velocities": record.tx_velocity_mps is not None,
         "uplink": record.uplink is not None,
         "truth": record.truth is not None,
+        "extent_m": np.ptp(record.tx_pos_m, axis=0).tolist() if record.has_positions else None,
+        "nearest_m": _nearest(record),
     }
+
+
+def _nearest(record: Record) -> dict[str, list[float]]:
+    """Median and largest distance of test rows to the nearest training row, by split, metres; empty where unknown."""
+    from scipy.spatial import KDTree
+
+    from ..datasets import make_splits
+
+    distances = {}
+    for split in ("official", "blocked") if record.has_positions else ():
+        with suppress(InputError):  # not stated, or too few rows
+            parts, at_m = make_splits(record, split), record.tx_pos_m
+            nearest_m = np.concatenate([KDTree(at_m[part.all_train]).query(at_m[part.test])[0] for part in parts])
+            distances[split] = [float(np.median(nearest_m)), float(nearest_m.max())]
+    return distances
 
 
 def render(facts: dict[str, Any]) -> str:
@@ -225,6 +244,8 @@ def render(facts: dict[str, Any]) -> str:
         "rows": f"{facts['rows']}, each {shape}",
         "received": _named(facts["receivers"]),
         "official split": official,
+        "extent": "{:.2f} x {:.2f} x {:.2f} m".format(*facts["extent_m"]) if facts["extent_m"] else "not stated",
+        "nearest": _distances(facts["nearest_m"]),
         "carrier": _carrier(facts["receiver_carriers_hz"], facts["carriers_hz"], facts["frequencies_hz"]),
         "antennas": ", ".join(facts["antennas"]),
         "runs": "not stated" if facts["runs"] is None else _named(facts["runs"]),
@@ -234,6 +255,11 @@ def render(facts: dict[str, Any]) -> str:
         or "observations alone",
     }
     return "\n".join(f"{label + ':':<18}{text}" for label, text in lines.items())
+
+
+def _distances(nearest_m: dict[str, list[float]]) -> str:
+    words = ("{}: median {:.3g}, at most {:.3g} m".format(split, *of_split) for split, of_split in nearest_m.items())
+    return "; ".join(words) + " from test to training rows" if nearest_m else "not stated"
 
 
 def _named(counts: dict[str, int]) -> str:

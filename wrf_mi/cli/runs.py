@@ -32,7 +32,7 @@ def _add_evaluate(commands: Any) -> None:
     other.add_argument("--name", metavar="NAME", help="name of the model, for tables")
     other.add_argument("--out", metavar="DIR", help="run folder to make, for compare")
     add_n_train(other)
-    other.add_argument("--seed", type=int, metavar="N", help="seed of the split (default: 0)")
+    other.add_argument("--seed", type=int, metavar="N", help="seed of the split, and of the other fit (default: 0)")
     text = "draw how reliable probabilities of coverage are on test rows, P(level > threshold) against observed share"
     parser.add_argument("--reliability", metavar="FILE.png", help=text)
     add_operator(parser)

@@ -20,7 +20,16 @@ from ..tasks import TASKS
 from ..training.session import OnProgress, quiet
 from . import figures
 from .compare_page import Section, page
-from .compare_tables import COLUMNS, DIFFERENCES, difference_rows, differences, references, score_rows
+from .compare_tables import (
+    COLUMNS,
+    DIFFERENCES,
+    METHODS,
+    difference_rows,
+    differences,
+    method_rows,
+    references,
+    score_rows,
+)
 from .folder import FITTED
 from .results import Results, read_runs
 from .scene_view import scene_view
@@ -36,7 +45,8 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
 
     Runs on the same data set are compared on the same test rows, with their references (`wrf_mi.tasks.TASKS`). Writes
     into ``out``, whole or not at all: ``compare.csv``, one row per run and reference; ``differences.csv``, paired
-    differences of each run and its reference and of all pairs of runs, on common rows; for each data set pictures
+    differences of each run and its reference and of all pairs of runs, on common rows; ``methods.csv`` where runs are
+    several seeds of a method, their means and standard deviations; for each data set pictures
     ``<data set>-*.png`` of score distributions (``cdf``), ``samples`` with the measured beside each predicted, ``time``
     against error of several runs, where positions are known ``errors`` over them and the ``best`` run at each,
     ``scene`` if one was traced and ``training`` if one was trained; and ``index.html``, one file with all of it that
@@ -69,8 +79,10 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
             shown = pictures(slug, runs)
             drawn += shown
             files = [(folder / name, title) for name, title, _ in shown]
-            sections.append(Section(slug, runs, score_rows(runs), differences(runs), files))
+            sections.append(Section(slug, runs, score_rows(runs), method_rows(runs), differences(runs), files))
         _write_table(folder / "compare.csv", COLUMNS, (section.scores for section in sections))
+        if any(section.methods for section in sections):
+            _write_table(folder / "methods.csv", METHODS, (section.methods for section in sections))
         changes = (difference_rows(section.differences) for section in sections)
         _write_table(folder / "differences.csv", DIFFERENCES, changes)
         for done, (name, _, figure) in enumerate(drawn):

@@ -27,6 +27,7 @@ from .compare_tables import (
     BETTER,
     COLUMNS,
     DIFFERENCES,
+    METHODS,
     OTHER_ROWS,
     WORSE,
     Difference,
@@ -36,10 +37,9 @@ from .compare_tables import (
     first_differences,
 )
 from .folder import CONFIG, RunConfig, known_config, stored_versions
-from .results import Results
+from .results import PREDICTED, Results
 
 NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
-PREDICTIONS = "predictions"  # key in ``metrics.json`` of the file of another program
 CONSTANT = ("dataset", "metric")  # columns that are equal in a section, whose heading states them
 MOST_RUNS = 8  # largest number of runs of which the page lists all pairs
 FIRST = ("run", "median", "mean", "common_mean")  # columns that narrow screens show without scrolling
@@ -52,6 +52,7 @@ class Section:
     slug: str  # name of the section in links, and beginning of its files' names
     runs: Sequence[Results]  # the runs
     scores: Sequence[Mapping[str, Any]]  # rows of the table of scores, by `COLUMNS`
+    methods: list[dict[str, Any]]  # rows of the table of methods; none without several seeds
     differences: Sequence[Difference]  # paired differences
     pictures: Sequence[tuple[Path, str]]  # file and heading of each picture
 
@@ -110,7 +111,7 @@ def _section(section: Section) -> str:
 <p class="note">{_text(TASKS[section.runs[0].task].label)}, {_better(section.runs[0])}. Click a heading to sort.
 The median comes first here, the verdicts below are of differences of means: they may rank runs differently.</p>
 {_table(shown, section.scores, NUMERIC)}
-<h3>Paired differences</h3>
+{_methods(section.methods)}<h3>Paired differences</h3>
 <p class="note">Each run against its reference{_text(others)}, on the test rows that both have: mean difference per row,
 positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of blocks of rows: clusters of their
 positions, since near rows resemble each other, or else stretches of consecutive rows. {BETTER} and {WORSE}: the
@@ -120,6 +121,18 @@ rows.{words}</p>
 {images}
 <h3>Commands</h3>
 <pre>{_text(chr(10).join(lines))}</pre>
+"""
+
+
+def _methods(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Table of methods of several seeds."""
+    if not rows:
+        return ""
+    return f"""<h3>Methods over seeds</h3>
+<p class="note">Runs that differ in their seed alone are one method. The difference from the best method is that of
+scores that are means over seeds, on the rows that all runs score, positive in favour of the method, with the interval
+over blocks of rows; the standard deviations are those over seeds.</p>
+{_table(METHODS, rows, frozenset(METHODS) - {"method"})}
 """
 
 
@@ -163,7 +176,7 @@ def _models(runs: Sequence[Results]) -> str:
     for run in runs:
         config = known_config(run.path)
         if config is None:
-            outside = PREDICTIONS in run.metrics
+            outside = PREDICTED in run.metrics
             settings = "predictions of another program; training rows as stated by their author" if outside else None
             row = {"run": run.name, "model": run.metrics["model"], "settings": settings or "not stored"}
             rows.append(row)
@@ -250,10 +263,10 @@ def _command(run: Results) -> str:
     config, metrics = known_config(run.path), run.metrics
     if config is not None:
         return command(config, run.path)
-    if PREDICTIONS not in metrics:
+    if PREDICTED not in metrics:
         return f"# {run.name}: {CONFIG} is missing, or of a model that this version lacks"
     stated = read_yaml(run.path / CONFIG) if (run.path / CONFIG).exists() else {}
-    options = {"predictions": metrics[PREDICTIONS], "dataset": metrics["dataset"], "name": metrics["model"]}
+    options = {"predictions": metrics[PREDICTED], "dataset": metrics["dataset"], "name": metrics["model"]}
     options |= {"split": metrics["split"], "n-train": stated.get("n_train"), "seed": run.seed or None}
     words = [word for key, value in options.items() if value is not None for word in (f"--{key}", str(value))]
     return shlex.join(["wrf-mi", "evaluate", *words, "--out", str(run.path)])

@@ -17,7 +17,7 @@ from ..tasks import TASKS
 from ..tasks.scores import block_bootstrap
 from ..training.selection import clusters
 from .folder import known_config
-from .results import CONSTANT, Results
+from .results import CONSTANT, PREDICTED, Results
 
 COLUMNS = {"run": "run", "model": "model", "dataset": "data set", "split": "split", "seed": "seed"}
 COLUMNS |= {"n_train": "training rows (mean of folds)", "n_test": "test rows", "metric": "score"}
@@ -28,6 +28,10 @@ COLUMNS |= {"train_seconds": "training (s)", "peak_memory_mb": "peak memory (MB)
 DIFFERENCES = {key: key for key in ("run", "against", "verdict", "difference")}
 DIFFERENCES |= {"low": "95 % from", "high": "to", "rows": "common rows", "blocks": "blocks"}
 """Columns of ``differences.csv`` and their headings on the page; positive differences are in favour of the run."""
+METHODS = {"method": "method", "seeds": "seeds", "median": "median, mean of seeds", "median_sd": "standard deviation"}
+METHODS |= {"mean": "mean, mean of seeds", "mean_sd": "its standard deviation"}
+METHODS |= {"difference": "difference from the best", "low": "95 % from", "high": "to"}
+"""Columns of ``methods.csv`` and their headings on the page."""
 BETTER, TIE, WORSE, SAME, FEW = "better", "tie", "worse", "another seed", "too few rows"
 OTHER_ROWS, UNKNOWN_ROWS = "not comparable: trained on other rows", "not comparable: training rows are not stored"
 FEWEST = 2  # least number of common rows of a difference with an interval
@@ -79,17 +83,17 @@ def differences(runs: Sequence[Results]) -> list[Difference]:
     seeds; all else is a tie. Runs that differ in their seed alone are seeds of one method; methods are compared by runs
     of the same seed. Runs that predict the common rows from other training rows are not comparable.
     """
-    best, methods, by_name = best_run(runs), {run.name: _method(run) for run in runs}, {run.name: run for run in runs}
+    best, of_name, by_name = best_run(runs), methods(runs), {run.name: run for run in runs}
 
-    def seeds_of(run: Results) -> list[Results]:
-        return [other for other in runs if methods[other.name] == methods[run.name]]
+    def seeds_of(run: Results) -> Sequence[Results]:
+        return of_name[run.name]
 
     @cache  # of several seeds each pair is in the verdict of each
     def pair(run: str, other: str, is_method: bool) -> Difference:
         return _of_pair(by_name[run], by_name[other], is_method)
 
     def between(run: Results, other: Results) -> Difference:
-        if methods[run.name] == methods[other.name]:
+        if other in seeds_of(run):
             return replace(pair(run.name, other.name, False), verdict=SAME)
 
         def to_rival(seed: Results) -> Difference:
@@ -104,6 +108,8 @@ def differences(runs: Sequence[Results]) -> list[Difference]:
         of_runs.append(_of_seeds(run, seeds_of(run), _to_reference))
     listed = {frozenset((gain.run, gain.against)) for gain in of_runs}
     for run, other in combinations(runs, 2):
+        if other in seeds_of(run):
+            continue
         gain = between(run, other)
         of_runs += [gain] if (names := frozenset((gain.run, gain.against))) not in listed else []
         listed.add(names)
@@ -181,11 +187,51 @@ def _row_blocks(stored_m: bytes) -> IntArray:
     return np.arange(n) * count // n
 
 
+def methods(runs: Sequence[Results]) -> dict[str, list[Results]]:
+    """Runs that differ from a run in their seed alone, itself among them, by its name."""
+    groups: dict[Any, list[Results]] = {}
+    for run in runs:
+        groups.setdefault(_method(run), []).append(run)
+    alike: dict[str, list[Results]] = {}
+    for members in groups.values():
+        # Two runs of one seed differ in something else, which no configuration states.
+        distinct = len({run.seed for run in members}) == len(members)
+        alike |= {run.name: members if distinct else [run] for run in members}
+    return alike
+
+
+def method_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
+    """Rows of the table of methods, best mean first; none where no method has several seeds.
+
+    The difference is that from the best, of scores that are means over seeds, with its interval over blocks of rows.
+    """
+    task, keys = TASKS[runs[0].task], common(runs)
+    groups = list({id(group): group for group in methods(runs).values()}.values())
+    if not keys or all(len(group) == 1 for group in groups):
+        return []
+    of_group = [np.mean([[run.score[run.scored[key]] for key in keys] for run in group], axis=0) for group in groups]
+    order = sorted(range(len(groups)), key=lambda k: float(of_group[k].mean()), reverse=task.higher_is_better)
+    rows = []
+    for k in order:
+        group = groups[k]
+        gain = _of_rows(group[0], "", [row for _, row in keys], of_group[k] - of_group[order[0]])
+        trained = [[run.training_digests.get(key) for key in keys] for run in (group[0], groups[order[0]][0])]
+        if trained[0] != trained[1] or None in trained[0]:
+            gain = Difference(group[0].name, "", gain.rows, OTHER_ROWS)
+        row: dict[str, Any] = {"method": ", ".join(run.name for run in group), "seeds": len(group)}
+        for name in ("median", "mean"):
+            values = [run.metrics[task.block][name] for run in group]
+            row |= {name: float(np.mean(values)), f"{name}_sd": float(np.std(values, ddof=1)) if group[1:] else None}
+        rows.append(row | {key: getattr(gain, key) for key in ("difference", "low", "high")})
+    return rows
+
+
 def _method(run: Results) -> Any:
-    """What runs of several seeds have in common; runs without a configuration are methods of their own."""
+    """What runs of several seeds have in common; runs of unknown configuration are methods of their own."""
     config = known_config(run.path)
     if config is None:
-        return run.name
+        facts = [run.metrics.get(key) for key in (PREDICTED, "model", "split", "n_train")]
+        return run.name if facts[0] is None else repr(facts[1:])
     settings = config.settings
     if "seed" in config.entry.train_arguments:
         settings = replace(settings, seed=0)

@@ -177,8 +177,9 @@ def check_format(folder: Path) -> None:
 def check_new(folder: Path) -> None:
     """Refuse a file, or a folder that is neither empty nor of a run killed before its configuration was written."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())) and not _is_begun(folder):
-        remedy = f"choose another --out, or go on with train --resume {folder}"
-        raise InputError(f"{folder}: exists and is not empty; {remedy}")
+        stopped = (folder / CONFIG).exists() and not (folder / METRICS).exists()
+        remedy = f", or go on with train --resume {folder}" if stopped else ", or remove it"
+        raise InputError(f"{folder}: exists and is not empty; choose another --out{remedy}")
 
 
 def _is_begun(folder: Path) -> bool:

@@ -28,6 +28,7 @@ Observations = NDArray[np.float32] | NDArray[np.complex64]
 
 REMEDY = "run evaluate to write it anew"
 CONSTANT = "constant"  # key of the block in ``metrics.json``
+PREDICTED = "predictions"  # key in ``metrics.json`` of the file of another program
 RECEPTION = "probability_of_reception"  # key in ``predictions.npz`` and variable of a map
 SCORES = "constant_score"
 """Key of the constant prediction's scores [n_rx, m] among the arrays of an evaluation; they are not stored."""
