@@ -54,7 +54,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     blocks = {metrics["model"]: metrics[task.block], **references}
     print(summary_table(f"{task.label} on {metrics['n_test']} test rows", blocks, 3))
     if metrics.get("stages"):
-        _show_stages(metrics["stages"], task.label)
+        _show_stages(metrics["stages"], task.label, metrics.get("held_out", {}))
     _show_receivers(metrics)
     if "inside_90" in metrics:
         share = f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals"
@@ -107,14 +107,20 @@ def _show_receivers(metrics: dict[str, Any]) -> None:
         print(f"receiver {name}: position estimated at {', '.join(words)} (± standard deviation)")
 
 
-def _show_stages(reports: list[dict[str, Any]], label: str) -> None:
-    """Print what each stage of a fit contributes on held-out training rows and on test rows, and what it costs."""
+def _show_stages(reports: list[dict[str, Any]], label: str, weighed: dict[str, float]) -> None:
+    """Print what each stage of a fit contributes on held-out training rows and on test rows, and what it costs.
+
+    ``weighed`` are the scores by which the hybrid chose weights, after all stages of the scene were chosen.
+    """
     known = ("held_out", "held-out rows", ".3f"), ("test", "test rows", ".3f"), ("seconds", "seconds", ".1f")
     columns = [each for each in (*known, ("ms", "ms", ".3g")) if any(row.get(each[0]) is not None for row in reports)]
     print(f"{'stages up to, mean ' + label:<34}" + "".join(f"{title:>15}" for _, title, _ in columns))
     for report in reports:
         cells = [f"{report[key]:{form}}" if report.get(key) is not None else "" for key, _, form in columns]
         print(f"{report['stage']:<34}" + "".join(f"{cell:>15}" for cell in cells) + "  not kept" * (not report["kept"]))
+    if reports[-1]["stage"] == "residual" and "paths" in weighed and "residual" in weighed:
+        before, after = (f"{weighed[key]:.3f}" for key in ("paths", "residual"))
+        print(f"residual: {before} without it, {after} with it, on held-out rows after the choice of the stages before")
     if not all(report["kept"] for report in reports):
         print("not kept: without it, the stages that follow predict held-out rows as well")
 
