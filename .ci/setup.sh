@@ -67,6 +67,8 @@ while kill -0 "$pip" 2>/dev/null; do
 done
 trap - INT TERM
 wait "$pip" || stop "pip could not install the package; see $venv/pip.log"
+# Python that starts in the folder above a clone `wrf_mi` takes that folder for the package, unless the path has this one.
+pwd >"$("$venv/bin/python" -c 'import site; print(site.getsitepackages()[0])')/clone_of_wrf_mi.pth"
 # Matplotlib looks through all fonts once.
 "$venv/bin/python" -c 'import matplotlib.font_manager' 2>/dev/null || true
 step "3 of 4, libraries of Open3D: seconds"
