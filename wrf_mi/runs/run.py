@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -165,13 +165,8 @@ class Run:
         of_one = receiver is not None or len(known) == 1
         numbers = [receiver_index(known, receiver or 0)] if of_one else range(len(known))
         every = [self.predict_inputs(inputs, number) for number in numbers]
-
-        def joined(name: str) -> Any:
-            values = [getattr(prediction, name) for prediction in every]
-            return None if any(value is None for value in values) else values[0] if of_one else np.stack(values)
-
         how = inputs.tx_pos_m, tuple(known[number].name for number in numbers), self.config.task, of_one
-        return LabelledPrediction(joined("mean"), joined("std"), joined("reception"), *how)
+        return LabelledPrediction(*_joined(every, np.concatenate if of_one else np.stack), *how)
 
     def score(self, split: str | None = None) -> dict[str, Any]:
         """Scores on the test rows, or on those of another split (`wrf_mi.runs.api.evaluate_run`)."""
@@ -219,14 +214,7 @@ class Run:
                 what = f"{self.folder}: predictions at {len(inputs)} positions at once"
                 require_memory(needed, what, "predict fewer at a time, or into a file (predict_to_file)")
             chunks.append(chunk)
-        if len(chunks) == 1:
-            return chunks[0]
-
-        def joined(name: str) -> Any:
-            parts = [getattr(chunk, name) for chunk in chunks]
-            return None if parts[0] is None else np.concatenate(parts)
-
-        return Prediction(joined("mean"), joined("std"), joined("reception"))
+        return Prediction(*_joined(chunks, np.concatenate))
 
     def predicted_parts(self, inputs: Inputs, receiver: int) -> Iterator[tuple[slice, Prediction]]:
         """Predictions of the receiver of an index in chunks, with the rows of each: memory for a chunk at a time.
@@ -330,6 +318,13 @@ class Run:
 
 Collect = Callable[[slice, int, Prediction], None]
 """Takes the predictions of some rows at the receiver of an index."""
+
+
+def _joined(parts: Sequence[Prediction], join: Callable[[Sequence[Any]], Any]) -> Iterator[Any]:
+    """Mean, standard deviation and reception of joined predictions; None where one of them has none."""
+    for name in ("mean", "std", "reception"):
+        values = [getattr(part, name) for part in parts]
+        yield None if any(value is None for value in values) else values[0] if len(values) == 1 else join(values)
 
 
 def _inputs(
