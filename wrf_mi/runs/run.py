@@ -320,11 +320,14 @@ Collect = Callable[[slice, int, Prediction], None]
 """Takes the predictions of some rows at the receiver of an index."""
 
 
-def _joined(parts: Sequence[Prediction], join: Callable[[Sequence[Any]], Any]) -> Iterator[Any]:
+def _joined(parts: Sequence[Prediction], join: Callable[[Sequence[Any]], Any]) -> tuple[Any, Any, Any]:
     """Mean, standard deviation and reception of joined predictions; None where one of them has none."""
-    for name in ("mean", "std", "reception"):
+
+    def of(name: str) -> Any:
         values = [getattr(part, name) for part in parts]
-        yield None if any(value is None for value in values) else values[0] if len(values) == 1 else join(values)
+        return None if any(value is None for value in values) else values[0] if len(values) == 1 else join(values)
+
+    return of("mean"), of("std"), of("reception")
 
 
 def _inputs(
