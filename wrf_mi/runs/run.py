@@ -165,8 +165,9 @@ class Run:
         of_one = receiver is not None or len(known) == 1
         numbers = [receiver_index(known, receiver or 0)] if of_one else range(len(known))
         every = [self.predict_inputs(inputs, number) for number in numbers]
-        how = inputs.tx_pos_m, tuple(known[number].name for number in numbers), self.config.task, of_one
-        return LabelledPrediction(*_joined(every, np.concatenate if of_one else np.stack), *how)
+        mean, std, reception = _joined(every, np.concatenate if of_one else np.stack)
+        names = tuple(known[number].name for number in numbers)
+        return LabelledPrediction(mean, std, reception, inputs.tx_pos_m, names, self.config.task, of_one)
 
     def score(self, split: str | None = None) -> dict[str, Any]:
         """Scores on the test rows, or on those of another split (`wrf_mi.runs.api.evaluate_run`)."""
