@@ -37,7 +37,8 @@ from wrf_mi.tracing import open_scene, trace_paths
 
 from .comparison import STORED, data_folder
 from .sources import fit_key, source_files
-from .stages import CALIBRATED, HYBRID, JOINT, Cell, run_of_cell
+from .stages import CALIBRATED, HYBRID, JOINT, MATERIALS, Cell, run_of_cell
+from .stages import CORRECTED as IN_CORRECTED
 from .table_pages import FORMER, grouped, read_rows
 from .table_plan import PARTS, SHARES
 from .tables import scene_of_data
@@ -49,7 +50,8 @@ SCENE = 3
 HEAD = ("question", "data", *(f"{name}, {'scan' if k < SCENE else 'no scan'}" for k, name in enumerate(COLUMNS)))
 TRACING, ALONE, INTERPOLATION = 1, 3, 5
 """Columns by number: ray tracing, WRF-GS+ without a scene, IDW."""
-OF_STAGES = {HYBRID: 0, "ray-tracing": TRACING, CALIBRATED: TRACING, JOINT: 2, "kriging": 4, "idw": INTERPOLATION}
+OF_STAGES = {HYBRID: 0, "ray-tracing": TRACING, CALIBRATED: TRACING, MATERIALS: TRACING, IN_CORRECTED: TRACING}
+OF_STAGES |= {JOINT: 2, "kriging": 4, "idw": INTERPOLATION}
 OF_TABLES = {HYBRID: 0, "ray-tracing": TRACING, "ray-tracing-corrected": TRACING, "wrf-gs+-joint": 2}
 OF_TABLES |= {"wrf-gs+": ALONE, "kriging": 4, "idw": INTERPOLATION}
 OF_PARTS = {HYBRID: 0, TRACED: TRACING, CORRECTED: TRACING, KRIGING: 4, IDW: INTERPOLATION, LAW: INTERPOLATION}

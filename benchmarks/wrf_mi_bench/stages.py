@@ -20,10 +20,13 @@ import numpy as np
 
 from wrf_mi.core import Record
 from wrf_mi.core.angles import FloatArray
+from wrf_mi.correction import correct_scene, default_options, write_page
+from wrf_mi.datasets import make_splits
 from wrf_mi.runs.api import resume, train
 from wrf_mi.runs.folder import CONFIG, is_finished
 from wrf_mi.runs.results import Results, read_run
 from wrf_mi.runs.sweep import markdown_table
+from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import bootstrap
@@ -47,11 +50,13 @@ ROWS: Mapping[tuple[str, str], Sequence[int | None]] = {
     (CHANNELS, "official"): (15, 100, None),
 }
 """Numbers of training rows by data set and split; None: all."""
+LEAST_CORRECTED = 15  # rows of which a correction holds enough out
 LIMITS = {"ssim": 0.01, "abs_error_db": 0.1, "cea_db": 0.5}
 """Largest loss against a part that is allowed, in the unit of the score."""
 WORSE_SHARE = 0.02  # largest share of comparisons in which the hybrid may be clearly worse
 INSIDE = (0.85, 0.95)  # limits of the share of test values inside the 90 % intervals
 HYBRID, JOINT, CALIBRATED = "hybrid", "wrf-gs+", "ray-tracing, calibrated"
+MATERIALS, CORRECTED = "ray-tracing, calibrated materials", "ray-tracing, corrected scene"
 TRANSMISSION = ("transmission=true",)  # waves pass the slabs of a scene, furniture among them
 
 
@@ -71,8 +76,10 @@ ALONE: Mapping[str, Alone] = {
     "ray-tracing": Alone("ray-tracing", True, TRANSMISSION),
     JOINT: Alone("wrf-gs+", True),
     CALIBRATED: Alone("ray-tracing", True, IN_A_FLAT),
+    MATERIALS: Alone("ray-tracing", True, (*TRANSMISSION, "calibration=gain,materials")),
 }
-"""Parts by name. Strengths have calibrated ray tracing in place of Gaussians, as the hybrid has none of strengths."""
+"""Parts by name. Strengths have ray tracing with calibrated patterns in place of Gaussians, as the hybrid has none of
+strengths, and of calibrated materials."""
 
 
 @dataclass(frozen=True)
@@ -154,10 +161,19 @@ def run_alone(
     return run_of_cell(cell, data, place, part.model, intervals=intervals, **more)
 
 
+def run_in_corrected(cell: Cell, data: str | Record, scene: str, folder: Path) -> Results:
+    """Run of ray tracing in the scene that the training rows of a cell with one split correct, as `run_of_cell`."""
+    record, place = data if isinstance(data, Record) else load_record(data), folder / "corrected"
+    if not place.exists():
+        (split,) = make_splits(record, cell.split, 0, cell.n_train)
+        write_page(correct_scene(scene, record, split, default_options(record)), place, False)
+    return run_of_cell(cell, data, folder / "in-corrected", "ray-tracing", scene=str(place), settings=TRANSMISSION)
+
+
 def parts_of(task: str, scene: str | None) -> list[str]:
     """Parts that serve a task, with or without a scene."""
-    unused = JOINT if TASKS[task].in_decibel else CALIBRATED
-    return [name for name, part in ALONE.items() if name != unused and (scene is not None or not part.scene)]
+    unused = (JOINT, MATERIALS) if TASKS[task].in_decibel else (CALIBRATED,)
+    return [name for name, part in ALONE.items() if name not in unused and (scene is not None or not part.scene)]
 
 
 def measured(cell: Cell, folder: Path) -> dict[str, Any]:
@@ -165,6 +181,9 @@ def measured(cell: Cell, folder: Path) -> dict[str, Any]:
     data, scene = data_of(cell, folder)
     hybrid = run_of_cell(cell, data, folder / HYBRID, HYBRID, scene=scene)
     others = {name: run_alone(cell, data, folder, name, scene) for name in parts_of(hybrid.task, scene)}
+    enough = cell.n_train is None or cell.n_train >= LEAST_CORRECTED
+    if scene is not None and enough and cell.split == "official" and not TASKS[hybrid.task].in_decibel:
+        others[CORRECTED] = run_in_corrected(cell, data, scene, folder)
     return {"models": compared(hybrid, others)}
 
 

@@ -10,7 +10,7 @@ from wrf_mi_bench.locate import CELLS as LOCATE_CELLS
 from wrf_mi_bench.locate import STRETCH, stretches, summary
 from wrf_mi_bench.rows_saved import CURVES, IDW, ROWS, measure, rows_needed, saved
 from wrf_mi_bench.rows_saved import JOINT as JOINT_START
-from wrf_mi_bench.stages import CALIBRATED, CELLS, JOINT, LAB, Cell, parts_of, rows_of
+from wrf_mi_bench.stages import CALIBRATED, CELLS, JOINT, LAB, MATERIALS, Cell, parts_of, rows_of
 from wrf_mi_bench.unmeasured import HYBRID, LAW, gains, only
 
 from wrf_mi.core import Receiver, Record
@@ -92,7 +92,7 @@ def test_table_names_the_kept_stages_and_the_best_part():
     ("task", "scene", "parts"),
     [
         ("spectrum", None, ["kriging", "idw"]),
-        ("spectrum", "room", ["kriging", "idw", "ray-tracing", JOINT]),
+        ("spectrum", "room", ["kriging", "idw", "ray-tracing", JOINT, MATERIALS]),
         ("rssi", "flat", ["kriging", "idw", "ray-tracing", CALIBRATED]),
     ],
 )
