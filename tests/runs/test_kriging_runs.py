@@ -68,7 +68,7 @@ def test_command_trains_as_the_function_does(waves: Path, run: Path, tmp_path: P
     assert status == 0, err
     lines = table.splitlines()
     assert [line.split()[0] for line in lines[:3]] == ["SSIM", "kriging", "IDW"]
-    assert "of the test values lie inside the predicted 90 % intervals, CRPS " in lines[3]
+    assert "of the test values lie inside the predicted 90 % intervals, continuous ranked" in lines[3]
     assert lines[-1] == f"results: {out}"
     assert "one: element signals of spectra" in err.splitlines()
     for name in ("prediction", "std"):
