@@ -122,7 +122,7 @@ def _show_stages(reports: list[dict[str, Any]], label: str, weighed: dict[str, f
         before, after = (f"{weighed[key]:.3f}" for key in ("paths", "residual"))
         print(f"residual: {before} without it, {after} with it, on held-out rows after the choice of the stages before")
     if not all(report["kept"] for report in reports):
-        print("not kept: without it, the stages that follow predict held-out rows as well")
+        print("not kept: no clear gain on held-out rows, by itself or under the stages that follow")
 
 
 LOG_S = 5.0  # least time between lines of progress within a part of the work, where no bar is shown
