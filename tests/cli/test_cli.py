@@ -28,6 +28,7 @@ from wrf_mi.cli import demo
 from wrf_mi.cli.main import build_parser, main
 from wrf_mi.cli.output import Watch
 from wrf_mi.core import InputError
+from wrf_mi.datasets import load, make_splits
 from wrf_mi.runs import api as runs
 from wrf_mi.runs.api import open_run
 from wrf_mi.training.checkpoint import read_checkpoint
@@ -92,6 +93,17 @@ def test_version_and_settings(command: Command) -> None:
         assert line in listed
     assert "shadow_db=" in listed
     assert "generic=False" in listed
+
+
+def test_data_info_states_the_extent_and_how_far_test_rows_are(folder: Path, command: Command) -> None:
+    status, out, err = command(["data", "info", folder, "--json"])
+    assert status == 0, err
+    facts, record = json.loads(out), load(folder)
+    assert facts["extent_m"] == pytest.approx(np.ptp(record.tx_pos_m, axis=0))
+    (split,) = make_splits(record, "official")
+    train_m, test_m = record.tx_pos_m[split.all_train], record.tx_pos_m[split.test]
+    nearest_m = np.linalg.norm(test_m[:, None] - train_m, axis=2).min(axis=1)
+    assert facts["nearest_m"]["official"] == pytest.approx([np.median(nearest_m), nearest_m.max()])
 
 
 def test_train_prints_a_table_and_progress_elsewhere(folder: Path, tmp_path: Path, command: Command) -> None:

@@ -190,6 +190,8 @@ def test_predictions_of_another_program_are_seeds_of_one_method() -> None:
         return replace(run, metrics={**run.metrics, "model": "mine", "predictions": f"{name}.npz"})
 
     assert [row["method"] for row in method_rows([mine("a", 0), mine("b", 1), strengths("c", 2.0)])] == ["a, b", "c"]
+    drawn = [mine("a", 0), replace(mine("b", 1), splits=strengths("b", 1.0, seed=1, train=(3, 4)).splits)]
+    assert [row["difference"] for row in method_rows([*drawn, strengths("c", 2.0)])] == [0, None]  # seeds draw rows
     assert not method_rows([mine("a", 0), mine("b", 0)])  # what differs is not stated
 
 

@@ -93,7 +93,7 @@ def differences(runs: Sequence[Results]) -> list[Difference]:
         return _of_pair(by_name[run], by_name[other], is_method)
 
     def between(run: Results, other: Results) -> Difference:
-        if other in seeds_of(run):
+        if seeds_of(other) is seeds_of(run):
             return replace(pair(run.name, other.name, False), verdict=SAME)
 
         def to_rival(seed: Results) -> Difference:
@@ -108,7 +108,7 @@ def differences(runs: Sequence[Results]) -> list[Difference]:
         of_runs.append(_of_seeds(run, seeds_of(run), _to_reference))
     listed = {frozenset((gain.run, gain.against)) for gain in of_runs}
     for run, other in combinations(runs, 2):
-        if other in seeds_of(run):
+        if seeds_of(other) is seeds_of(run):
             continue
         gain = between(run, other)
         of_runs += [gain] if (names := frozenset((gain.run, gain.against))) not in listed else []
@@ -214,16 +214,22 @@ def method_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
     rows = []
     for k in order:
         group = groups[k]
-        gain = _of_rows(group[0], "", [row for _, row in keys], of_group[k] - of_group[order[0]])
-        trained = [[run.training_digests.get(key) for key in keys] for run in (group[0], groups[order[0]][0])]
-        if trained[0] != trained[1] or None in trained[0]:
-            gain = Difference(group[0].name, "", gain.rows, OTHER_ROWS)
+        # Of splits that a seed draws, methods are compared by the same seeds alone.
+        one, best = (_trained(runs, keys) for runs in (group, groups[order[0]]))
+        gain = Difference(group[0].name, "", len({row for _, row in keys}), OTHER_ROWS)
+        if one == best and not any(None in rows for rows in one):
+            gain = _of_rows(group[0], "", [row for _, row in keys], of_group[k] - of_group[order[0]])
         row: dict[str, Any] = {"method": ", ".join(run.name for run in group), "seeds": len(group)}
         for name in ("median", "mean"):
             values = [run.metrics[task.block][name] for run in group]
             row |= {name: float(np.mean(values)), f"{name}_sd": float(np.std(values, ddof=1)) if group[1:] else None}
         rows.append(row | {key: getattr(gain, key) for key in ("difference", "low", "high")})
     return rows
+
+
+def _trained(runs: Sequence[Results], keys: Sequence[tuple[str, int]]) -> set[tuple[int | None, ...]]:
+    """Digests of the training rows behind the predictions of some observations, of each run."""
+    return {tuple(run.training_digests.get(key) for key in keys) for run in runs}
 
 
 def _method(run: Results) -> Any:
