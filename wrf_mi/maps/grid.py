@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from ..backend.device import to_vectors
@@ -271,3 +274,33 @@ def with_standing_room(scene: Any, positions_m: FloatArray) -> FloatArray:
     distance_m = np.array(scene.mi_scene.ray_intersect_preliminary(ray).t, float).reshape(-1, DIRECTIONS)
     free = (distance_m >= STANDING_M).all(axis=1)  # infinite where nothing is hit
     return positions_m[free] if free.any() else positions_m
+
+
+def reachable(scene: Any, positions_m: FloatArray, starts_m: FloatArray) -> NDArray[np.bool_]:
+    """Mask of positions [n, 3] at one height that are reached from places [k, 3] without passing a surface.
+
+    One walks at that height over the floors of a ``sionna.rt.Scene``, in steps shorter than a door is wide.
+    """
+    starts = starts_m[np.isfinite(starts_m[:, :2]).all(axis=1)]
+    if scene is None or not len(positions_m) or not len(starts):
+        return np.ones(len(positions_m), bool)
+    import mitsuba as mi
+
+    starts = np.column_stack([starts[:, :2], np.full(len(starts), positions_m[0, 2])])
+    ends = np.concatenate([positions_m, starts])
+    low, high = ends.min(axis=0) - MARGIN_M, ends.max(axis=0) + MARGIN_M
+    step_m = max(CANDIDATE_STEP_M, usual_step(low, high))
+    ways = grid_over(low, high, step_m, ends[0, 2]).positions_m
+    nodes = np.concatenate([ends, ways[inside_scene(scene, ways)]])
+    # Half a step more, so that places between the nodes of the grid meet several of them.
+    pairs = cKDTree(nodes).query_pairs(1.5 * step_m, output_type="ndarray")
+    away = nodes[pairs[:, 1]] - nodes[pairs[:, 0]]
+    length_m = np.linalg.norm(away, axis=-1)
+    directions = away / np.maximum(length_m, np.finfo(float).tiny)[:, None]
+    directions[length_m == 0] = (0, 0, 1)
+    ray = mi.Ray3f(to_vectors(nodes[pairs[:, 0]], mi.Point3f), to_vectors(directions, mi.Vector3f))
+    clear = np.array(scene.mi_scene.ray_intersect_preliminary(ray).t, float) >= length_m
+    first, second = pairs[clear].T.astype(np.int32)
+    graph = sparse.csr_array((np.ones(len(first), bool), (first, second)), shape=(len(nodes), len(nodes)))
+    _, part = connected_components(graph, directed=False)
+    return np.isin(part[: len(positions_m)], part[len(positions_m) : len(ends)])

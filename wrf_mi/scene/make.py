@@ -25,9 +25,11 @@ from .mesh.facets import planes_of_mesh
 from .mesh.files import SUFFIXES, read_mesh
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
 from .mesh.surfaces import Surface, bounds, box_of, moved, sampled
+from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES
 from .plan.sources import PlanGrid, Row0, read_layout, read_plan
 from .plan.storey import layout_walls, plan_surfaces
-from .positions import check_positions, read_positions, reflections
+from .plan.walked import warn_of_places, with_walked_floor
+from .positions import check_positions, in_plan, placed, read_positions, reflections
 from .register import register_walls, wall_points
 from .scan.cloud import surfaces_from_points
 from .scan.las_units import require_stated_metres
@@ -35,7 +37,7 @@ from .scan.points import Scan, read_scan
 
 logger = logging.getLogger(__name__)
 
-PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
+PLAN_SUFFIXES = (*PICTURE_SUFFIXES, *SHEET_SUFFIXES, ".csv")
 PREVIEW_POINTS = 20_000
 Storey = tuple[float | None, float, float | None, Row0 | None]
 """Options of a plan: height of the ceiling, z of the floor, side of a cell, and the side where the first row lies."""
@@ -121,13 +123,17 @@ def make_scene(
     if known_walls is not None:
         matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file))
     motion = shift if matrix is None else matrix @ shift
-    placed = moved(surfaces, motion)
+    scene = placed(surfaces, motion, source.grid, measured)
     if measured is not None:
-        mirrored = reflections(surfaces, file, source.grid, motion, known_walls)
-        check_positions(measured, placed, mirrored, f"{file} with the positions of {positions}")
+        mirrored = reflections(surfaces, file, source.grid, motion, known_walls, measured)
+        check_positions(measured, scene, mirrored, f"{file} with the positions of {positions}")
+        if source.grid is not None:  # only of a frame that has been checked
+            places = in_plan(measured, motion)
+            warn_of_places(source.grid, places, str(positions))
+            scene = moved(with_walked_floor(surfaces, source.grid, places, unmapped=True), motion)
     write_scene(
         out,
-        placed,
+        scene,
         frame=_frame(file, origin_m, matrix),
         origin_m=origin_m,
         source=", ".join(map(str, files)),
