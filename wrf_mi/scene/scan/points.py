@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
 
 from ...core import InputError
 from ...core.angles import FloatArray
@@ -24,6 +25,7 @@ from ...parallel import run_module
 from ..coordinates import FORMATS, UNITS_M, Up, extra_package, require_precise, source_file, turned, up_of
 from ..mesh.planes import Mask
 from ..mesh.polygon_files import read_obj, read_ply
+from ..mesh.surfaces import Surface, sampled
 
 logger = logging.getLogger(__name__)
 
@@ -39,6 +41,12 @@ CHILD_BYTES, CHILD_S, CHILD_BYTES_PER_S = 4 << 30, 30.0, 1 << 20
 """Address space of the process that reads a file beside its points, and the time that it has."""
 PCD_HEADER = 1 << 16  # bytes in which the header of a PCD has to end
 COMMENTS = ("#", "//")  # CloudCompare begins the line of the columns' names with slashes
+STRAY_NEIGHBOURS = 20  # a surface has more returns about each of its own
+STRAY_REACH = 0.05  # radius in which they lie, relative to the distance from the middle of the scan
+FAR_OUT = 3.0
+"""Quartile ranges beyond a quartile from which values are far out (Tukey 1977, "Exploratory data analysis")."""
+SAMPLES_PER_M2, MOST_SAMPLES = 1000, 3_000_000
+"""Points drawn on a mesh, one in each of the cells to which a scan is thinned, and the most of them."""
 PTX_LINES = 8  # lines of a PTX after columns and rows: position and axes of the scanner, and its pose
 
 Part = tuple[FloatArray, FloatArray | None]
@@ -87,12 +95,42 @@ def read_scan(paths: Sequence[str | Path], units: str | None = None, up: Up | No
     for path in paths:
         file = source_file(path, units, f"a point cloud ({FORMATS})")
         for part, viewpoint in _parts(file):
+            near = ~_strays(part, file)
+            part = part[near]
             require_precise(part, unit_m, file)
             points.append(turned(part * unit_m, up_of(file, up)))
             numbers.append(np.full(len(part), -1 if viewpoint is None else len(viewpoints)))
             if viewpoint is not None:
                 viewpoints.append(turned(viewpoint * unit_m, up_of(file, up)))
     return Scan(np.concatenate(points), np.array(viewpoints, float).reshape(-1, 3), np.concatenate(numbers))
+
+
+def _strays(points: FloatArray, file: Path) -> Mask:
+    """Returns [n] far out of a scan that no surface explains, such as reflections in windows; logged.
+
+    Few others are near them: at any distance, the directions of a scanner are spread as evenly on a surface.
+    """
+    strays = np.zeros(len(points), bool)
+    low, middle, high = np.quantile(points, (0.25, 0.5, 0.75), axis=0)
+    fence = FAR_OUT * (high - low)
+    far = np.flatnonzero(((points < low - fence) | (points > high + fence)).any(axis=1))
+    if not len(far) or len(points) < 2 * STRAY_NEIGHBOURS:
+        return strays
+    distance = np.linalg.norm(points[far] - middle, axis=-1)
+    tree = cKDTree(points)
+    others = tree.query_ball_point(points[far], STRAY_REACH * distance, return_length=True)
+    strays[far] = others <= STRAY_NEIGHBOURS
+    if strays.any():
+        text = "%s: %d of %d points, up to %.4g from the middle, are strays without a surface, and are left out"
+        logger.warning(text, file, strays.sum(), len(points), distance[strays[far]].max())
+    return strays
+
+
+def sampled_scan(surfaces: Sequence[Surface]) -> Scan:
+    """Points on the faces of a measured mesh."""
+    corners = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
+    count = min(MOST_SAMPLES, int(SAMPLES_PER_M2 * trimesh.triangles.area(corners).sum()) + 1)
+    return Scan(sampled(corners, count), np.empty((0, 3)), np.full(count, -1))
 
 
 def _parts(file: Path) -> list[Part]:
