@@ -12,7 +12,7 @@ from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.mesh.surfaces import level_area
 from wrf_mi.scene.plan.sources import PlanGrid, read_plan
 from wrf_mi.scene.plan.storey import plan_surfaces
-from wrf_mi.scene.plan.walked import FREE, OUTSIDE, UNMAPPED, WALL, cells_at
+from wrf_mi.scene.plan.walked import FREE, OUTSIDE, UNMAPPED, WALL, cells_at, mapped_part
 
 CELL_M = 0.05
 OCCUPIED, UNKNOWN, EMPTY = 0, 205, 254  # as map_saver writes them
@@ -80,6 +80,12 @@ def test_what_furniture_hides_is_floor():
     cells["free"][row : row + 12, column : column + 60] = False  # 0.6 m deep along a wall
     floor, *_ = plan_surfaces(PlanGrid(**cells, resolution_m=CELL_M, origin_m=LOW_M), height_m=2.7)
     assert floor.mesh.area == pytest.approx(12 * 6, abs=2 * AREA_ERROR_M2)
+
+
+def test_map_without_free_cells_within_its_walls_is_refused(tmp_path):
+    grid = read_plan(write_map(tmp_path, robot_map(mapped=(YARD,))))
+    with pytest.raises(InputError, match="no cell within its walls is known to be free"):
+        mapped_part(shapely.box(*CLOSED), grid, "map")
 
 
 def test_floor_contains_places_in_free_cells_that_no_wall_encloses(tmp_path):

@@ -157,8 +157,10 @@ def test_designed_faces_are_not_measured(name):
     assert not is_measured(as_surfaces(DESIGNED[name]))
 
 
-def test_mesh_of_a_phone_becomes_the_planes_of_a_scan(tmp_path, caplog):
-    uneven(closed_box(z=2.6), 0.008).apply_transform(
+@pytest.mark.parametrize("halvings", [5, 6])
+def test_mesh_of_a_phone_becomes_the_planes_of_a_scan(tmp_path, caplog, halvings):
+    """Faces with sides of about 0.15 and 0.07 m."""
+    uneven(closed_box(z=2.6), 0.008, halvings).apply_transform(
         trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0))
     ).export(tmp_path / "scan.obj")
     surfaces = surfaces_of(tmp_path / "scan.obj", tmp_path, up="y")

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from scipy import ndimage
 
+from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..mesh.outline import boxes, large_parts, polygons, triangulated
@@ -48,7 +49,10 @@ def mapped_part(area: Any, grid: PlanGrid, name: str) -> Any:
     blind_area = shapely.simplify(shapely.union_all(blind), grid.resolution_m)
     text = "%s: %.1f m2 within the walls are unmapped, and are no floor"
     logger.warning(text, name, shapely.intersection(area, blind_area).area)
-    return _opened(shapely.difference(area, blind_area), grid.resolution_m)  # slits of a cell remain along walls
+    mapped = _opened(shapely.difference(area, blind_area), grid.resolution_m)  # slits of a cell remain along walls
+    if mapped.is_empty:
+        raise InputError("no cell within its walls is known to be free; give a map with free cells, or its thresholds")
+    return mapped
 
 
 def _opened(area: Any, half_m: float) -> Any:

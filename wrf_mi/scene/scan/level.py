@@ -16,6 +16,9 @@ MOST_POINTS = 200_000  # points of a scan by whose planes its level is judged
 MOST_TILT_DEG = 15.0  # largest tilt that is corrected: more is no scanner held by hand, but another axis or a slope
 SEARCHED_DEG = 45.0  # nearer to another axis, that one is up
 LEAST_TILT_RAD = MERGE_ANGLE_RAD  # walls and registration lean by less
+LEAST_FITTING = (
+    0.5  # least share of the planes' area square to the vertical or level: slopes of roofs fit one by chance
+)
 LEAST_CORNER = np.sin(np.radians(20))  # sine of the least angle of two walls whose line of intersection is told
 
 
@@ -48,11 +51,11 @@ def level_rotation(points_m: FloatArray) -> tuple[FloatArray, float]:
         has_floor = (np.abs(normals @ up) > np.cos(MERGE_ANGLE_RAD)).any()
         if up[2] > np.cos(np.radians(SEARCHED_DEG)) and has_floor and walls(up) > most:
             best, most = up, walls(up)
-    if best is z:
-        return np.eye(4), 0.0
-    # Least squares over all planes that fit: square to walls, along the normals of floors.
     along = np.abs(normals @ best)
     is_wall, is_level = along < np.sin(MERGE_ANGLE_RAD), along > np.cos(MERGE_ANGLE_RAD)
+    if best is z or size[is_wall | is_level].sum() < LEAST_FITTING * size.sum():
+        return np.eye(4), 0.0
+    # Least squares over all planes that fit: square to walls, along the normals of floors.
     weight = size * (is_wall.astype(float) - is_level)
     up = np.linalg.eigh((normals.T * weight) @ normals)[1][:, 0]
     up = up * np.sign(up[2])

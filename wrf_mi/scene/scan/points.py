@@ -45,8 +45,9 @@ STRAY_NEIGHBOURS = 20  # a surface has more returns about each of its own
 STRAY_REACH = 0.05  # radius in which they lie, relative to the distance from the middle of the scan
 FAR_OUT = 3.0
 """Quartile ranges beyond a quartile from which values are far out (Tukey 1977, "Exploratory data analysis")."""
-SAMPLES_PER_M2, MOST_SAMPLES = 1000, 3_000_000
-"""Points drawn on a mesh, one in each of the cells to which a scan is thinned, and the most of them."""
+SAMPLES_PER_FACE, SAMPLES_PER_M2, MOST_SAMPLES = 2, 150, 3_000_000
+"""Points drawn on a mesh: of more on a face, whose noise is the same, medians would look like layers of a wall; of
+fewer on a square metre no plane is found. The most of them are as many as a large scan has."""
 PTX_LINES = 8  # lines of a PTX after columns and rows: position and axes of the scanner, and its pose
 
 Part = tuple[FloatArray, FloatArray | None]
@@ -117,9 +118,8 @@ def _strays(points: FloatArray, file: Path) -> Mask:
     if not len(far) or len(points) < 2 * STRAY_NEIGHBOURS:
         return strays
     distance = np.linalg.norm(points[far] - middle, axis=-1)
-    tree = cKDTree(points)
-    others = tree.query_ball_point(points[far], STRAY_REACH * distance, return_length=True)
-    strays[far] = others <= STRAY_NEIGHBOURS
+    reach, _ = cKDTree(points).query(points[far], k=[STRAY_NEIGHBOURS + 1])  # the first is the point
+    strays[far] = reach[:, 0] > STRAY_REACH * distance
     if strays.any():
         text = "%s: %d of %d points, up to %.4g from the middle, are strays without a surface, and are left out"
         logger.warning(text, file, strays.sum(), len(points), distance[strays[far]].max())
@@ -129,7 +129,8 @@ def _strays(points: FloatArray, file: Path) -> Mask:
 def sampled_scan(surfaces: Sequence[Surface]) -> Scan:
     """Points on the faces of a measured mesh."""
     corners = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
-    count = min(MOST_SAMPLES, int(SAMPLES_PER_M2 * trimesh.triangles.area(corners).sum()) + 1)
+    least = int(SAMPLES_PER_M2 * trimesh.triangles.area(corners).sum())
+    count = min(MOST_SAMPLES, max(SAMPLES_PER_FACE * len(corners), least))
     return Scan(sampled(corners, count), np.empty((0, 3)), np.full(count, -1))
 
 
