@@ -126,5 +126,7 @@ def warn_of_places(grid: PlanGrid, places_m: FloatArray, name: str) -> None:
             texts.append(f"{len(rows)} {text} (rows {', '.join(map(str, rows[:NAMED_ROWS]))}{more})")
     if texts:
         count = np.count_nonzero(cells != FREE)
-        remedy = "check --origin and --resolution; if they are right, those in unmapped cells prove floor and get it"
+        remedy = "check --origin and --resolution"
+        if (cells == UNMAPPED).any():
+            remedy += "; if they are right, those in unmapped cells prove floor and get it"
         logger.warning("%s: %d of %d positions: %s; %s", name, count, len(cells), ", ".join(texts), remedy)
