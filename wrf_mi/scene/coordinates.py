@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 Up = Literal["y", "z"]
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # length of each unit that a scan or mesh may be in
 FORMATS = ".e57, .pcd, .pts, .ptx, .ply, .las, .laz, .xyz, .txt, or .npz with points"  # files with points
-EXTRAS = {"laspy": "lidar", "open3d": "lidar", "pye57": "lidar", "collada": "meshes", "pxr": "meshes"}
+EXTRAS = {"laspy": "lidar", "open3d": "lidar", "pye57": "lidar", "lzf": "lidar", "collada": "meshes", "pxr": "meshes"}
 """Extra of this package that installs a package; `SYSTEM` are libraries that Open3D needs and a small system lacks."""
 SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
 LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
