@@ -120,12 +120,9 @@ def unlike_units(record: Record) -> Found:
     """Receivers and transmitters in different units, by the factor with which strengths follow a distance law."""
     places = np.stack([receiver.position_m for receiver in record.receivers])
     surveyed = np.isfinite(places).all(axis=1)
-    if (
-        record.task not in ("rssi", "csi")
-        or not record.has_positions
-        or len(record) < FEWEST_ROWS
-        or not surveyed.any()
-    ):
+    # With a single receiver a factor moves the rows as another place of it would.
+    enough = surveyed.sum() >= 2 and len(record) >= FEWEST_ROWS
+    if record.task not in ("rssi", "csi") or not record.has_positions or not enough:
         return
     rows = np.linspace(0, len(record) - 1, min(len(record), MOST_ROWS)).astype(int)
     levels, places = levels_db(record)[surveyed][:, rows], places[surveyed]

@@ -200,7 +200,9 @@ def _scale(observed: NDArray[Any]) -> str:
         return "powers on a linear scale; give dBm, 10 log10 of the milliwatts"
     if high <= 100:
         quality = "they are a quality in per cent (dBm = quality / 2 - 100 in Windows)"
-        return f"above 0 dBm everywhere: the minus sign is missing, {quality}, or dB above a microvolt; give dBm"
+        return (
+            f"above 0 dBm everywhere: the minus sign is missing, {quality}, or they are dB above a microvolt; give dBm"
+        )
     return "above 0 dBm everywhere: the minus sign is missing, or they are dB above a microvolt; give dBm"
 
 
