@@ -22,7 +22,7 @@ from ...core.files import one_line
 from ...core.types import IntArray
 from ..coordinates import FORMATS, UNITS_M, Up, check_extent, require_precise, source_file, turned, up_of
 from .polygon_files import Polygons, read_obj, read_ply
-from .scene_files import USD_SUFFIXES, Beside, bare_gltf, read_collada, read_usd
+from .scene_files import USD_SUFFIXES, Beside, bare_gltf, gltf_facts, read_collada, read_usd
 from .surfaces import Surface, number_names
 
 logger = logging.getLogger(__name__)
@@ -97,8 +97,10 @@ def _trimesh_parts(file: Path) -> list[trimesh.Trimesh]:
     options: dict[str, Any] = {"file_type": file.suffix.lower()[1:], "process": False}
     # Without a name no other file is looked for: materials and textures are not used.
     source: Any = BytesIO(file.read_bytes())
-    if file.suffix.lower() == ".gltf":
-        source, options["resolver"] = BytesIO(bare_gltf(source.read())), Beside(file)
+    if file.suffix.lower() in (".gltf", ".glb"):
+        facts = gltf_facts(file)
+        if file.suffix.lower() == ".gltf":
+            source, options["resolver"] = BytesIO(bare_gltf(facts)), Beside(file)
     dump: list[Any] = trimesh.load_scene(source, **options).dump()
     return [part for part in dump if len(getattr(part, "faces", ()))]
 
