@@ -74,7 +74,7 @@ def test_units_scale_the_coordinates_and_las_keeps_millimetres_of_a_national_gri
     np.savez(tmp_path / "cloud.npz", xyz_m=POINTS)
     for units, factor in (("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("ft", 0.3048)):
         np.testing.assert_allclose(read_points(tmp_path / "cloud.npz", units), POINTS * factor, rtol=1e-15)
-    with pytest.raises(InputError, match=r"units 'inch': not known; give one of m, cm, mm, ft"):
+    with pytest.raises(InputError, match=r"units 'inch': not known; give one of m, dm, cm, mm, ft, in"):
         read_points(tmp_path / "cloud.npz", "inch")
     for name in ("cloud.las", "cloud.laz"):
         write_las(tmp_path / name, FAR, 1e-3)
