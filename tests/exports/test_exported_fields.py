@@ -154,6 +154,7 @@ def test_damaged_and_other_files_are_refused(runs: dict[str, Path], tmp_path: Pa
         ({"export/format": np.array(9)}, "format 9, this version reads 1"),
         ({"export/format": None}, "not written by export"),
         ({"export/config": None}, "incomplete"),
+        ({"param/position": np.full_like(arrays["param/position"], np.nan)}, "param/position has numbers that are not"),
     ):
         np.savez(file, **{key: values for key, values in (arrays | change).items() if values is not None})
         error_line(import_field, file, tmp_path / "run", message)

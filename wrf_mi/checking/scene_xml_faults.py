@@ -158,7 +158,7 @@ def _elements(scene: SceneXml) -> Iterator[Finding]:
             what = f"plugin {plugin[:40]!r} of <{tag}>" if known else f"element <{tag[:40]}>"
             yield Finding("element", scene.path, name, f"{what} is unknown in scenes", "remove or replace it")
         if "$" in value:
-            text = f"the value {value[:40]} is left to the caller"
+            text = f"the value {value[:40]} is left to the caller and has no <default>"
             yield Finding("parameter", scene.path, name, text, "write the value in its place")
         elif tag == "string" and element.get("name") in FILES and not is_converted:
             yield from _file(scene, name, value)

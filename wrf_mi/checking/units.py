@@ -198,6 +198,11 @@ def _scale(observed: NDArray[Any]) -> str:
     low, high = np.percentile(values[values > 0], [1, 99])  # zero is nothing on a linear scale
     if high < 1 or high > LINEAR_RANGE * low:
         return "powers on a linear scale; give dBm, 10 log10 of the milliwatts"
+    if high <= 100:
+        quality = "they are a quality in per cent (dBm = quality / 2 - 100 in Windows)"
+        return (
+            f"above 0 dBm everywhere: the minus sign is missing, {quality}, or they are dB above a microvolt; give dBm"
+        )
     return "above 0 dBm everywhere: the minus sign is missing, or they are dB above a microvolt; give dBm"
 
 

@@ -51,6 +51,7 @@ def _add_import(data: Any) -> None:
     add("--replace", action="store_true", help="replace the folder if it exists")
     text = "columns by meaning, such as x=X,y=Y,rssi=level,id=bssid,time=ts (default: guessed); '-': there is none"
     add("--columns", metavar="LIST", help=text)
+    add("--sheet", metavar="NAME", help="sheet of workbooks that have several")
     text = "columns of strengths of a wide table, such as 'AP* RSS(dBm)'; repeatable"
     add("--receivers", action="append", metavar="PATTERN", help=text)
     add("--test", nargs="+", metavar="FILE", help="tables with the test rows")
@@ -68,7 +69,8 @@ def _add_import(data: Any) -> None:
     add("--crs", metavar="CRS", help="coordinate reference system of positions, such as EPSG:3857")
     text = "unit of headings: rad, deg (from x towards y) or compass (degrees from north, clockwise)"
     add("--heading-unit", metavar="UNIT", dest="heading", help=text)
-    add("--height", dest="height_m", **metres, help="height of the moving end without z (default: 1.3)")
+    text = "height of the moving end without z, one for all tables or each (default: 1.3)"
+    add("--height", dest="height_m", nargs="+", **metres, help=text)
     add("--storey", dest="storey_m", **metres, help="height of a storey, for a column floor without z (default: 3)")
     add("--anchor-height", dest="anchor_height_m", **metres, help="height of receivers without z (default: 2.5)")
     text = "carrier of all rows (default: of the table, or 2.44e9)"

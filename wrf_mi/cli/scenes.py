@@ -29,7 +29,7 @@ def _add_mesh(commands: Any) -> None:
     text += "a mesh (OBJ, STL, GLB, PLY, COLLADA, USD)"
     add("points", nargs="+", metavar="POINTS", help=text)
     add("--out", required=True, metavar="DIR", help="scene folder to make")
-    add("--units", help="unit of the coordinates: m, cm, mm or ft (default: that of COLLADA and USD, else m)")
+    add("--units", help="unit of the coordinates: m, dm, cm, mm, ft or in (default: that of COLLADA and USD, else m)")
     text = "axis that is up in a scan or mesh (default: that of COLLADA and USD, y in GLB, else z)"
     add("--up", choices=("y", "z"), help=text)
     text = "point of the source (of a picture, from its lower left corner), metres, z up, that becomes the origin, "

@@ -23,8 +23,13 @@ TABLE = (
 )
 TABLES = (".csv", ".tsv", ".txt")
 SEPARATORS = ",;\t|"
-STRENGTH = frozenset({"rssi", "rss", "rsrp", "dbm", "level", "signal", "strength", "power"})
-"""Words in the names of columns that hold strengths."""
+STRENGTHS = ("rsrp", "rssi", "rss", "dbm", "signal", "strength", "level", "power")
+"""Words in the names of columns that hold strengths, in the order of preference where a reading has several."""
+STRENGTH = frozenset(STRENGTHS)
+SENT = frozenset({"tx", "txpower", "sent", "transmit", "transmitted", "eirp"})
+"""Words in the names of columns that hold the power that is sent."""
+BESIDE = frozenset({"db", "received", "rx", "mean", "average", "avg", "median", "value", "measured"})
+"""Words beside those of strengths in the name of a column that belongs to no particular receiver."""
 RECEIVER = (
     *("bssid", "mac", "address", "uuid", "receiver", "rx", "anchor", "gateway", "ap", "beacon", "cell", "station"),
     *("pci", "node", "device", "ssid", "id", "name"),
@@ -76,9 +81,20 @@ def name_words(name: str) -> set[str]:
 def long_columns(header: Sequence[str]) -> tuple[str, str] | None:
     """Columns of receivers and of strengths in a table with a row for each reading, or None."""
     words = {column: name_words(column) for column in header}
-    strengths = [column for column, parts in words.items() if parts & STRENGTH]
+    strengths = [column for column, parts in words.items() if parts & STRENGTH and not parts & SENT]
     receivers = (name for word in RECEIVER for name in header if word in words[name] and name not in strengths)
+    # RSRP and RSSI of one reading are two quantities; columns with a number or a name are of a receiver each.
+    if len(strengths) > 1 and all(
+        words[name] <= STRENGTH | BESIDE and not re.search(r"\d", name) for name in strengths
+    ):
+        strengths = preferred(strengths)[:1]
     return next(zip(receivers, strengths, strict=False), None) if len(strengths) == 1 else None
+
+
+def preferred(names: Sequence[str]) -> list[str]:
+    """Columns of strengths by the preference of their quantities in `STRENGTHS`."""
+    words = {name: name_words(name) & STRENGTH for name in names}
+    return sorted(names, key=lambda name: min(map(STRENGTHS.index, words[name]), default=len(STRENGTHS)))
 
 
 def _read_header(file: Path) -> Table | None:

@@ -150,6 +150,9 @@ def import_field(file: str | Path, out: str | Path) -> Run:
         model = {key: values for key, values in arrays.items() if not key.startswith(SPLIT_ARRAYS)}
         if CONFIG not in texts or not split:
             raise InputError(f"{path}: incomplete; export it again")
+        for name, values in under(PARAM, model).items():
+            if not np.isfinite(values).all():
+                raise InputError(f"{path}: {PARAM}{name} has numbers that are not finite; export another run's field")
     with atomic_folder(folder, replace=True) as part:  # `check_new` leaves nothing that could be lost
         write_arrays(part / SPLIT, split)
         write_arrays(part / FITTED, model, compressed=True)

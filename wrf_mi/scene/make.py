@@ -72,8 +72,8 @@ def make_scene(
             (`wrf_mi.scene.plan.sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
             are cut into triangles and else used as they are.
         out: path of the folder.
-        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft; None: that which COLLADA and USD state, else m,
-            which is refused for a LAS or LAZ whose header states another one.
+        units: unit of a scan's or mesh's coordinates: m, dm, cm, mm, ft or in; None: that which COLLADA and USD state,
+            else m, which is refused for a LAS or LAZ whose header states another one.
         up: axis of a scan or mesh that is up, y or z; None: that which COLLADA and USD state, y in glTF, else z, and
             coordinates that look otherwise are refused.
         origin_m: point [3] of the source, z up, metres, that becomes the origin before the registration: far from it,
