@@ -24,6 +24,7 @@ from ...core.memory import require_memory
 from ...core.types import IntArray
 from ...parallel import run_module
 from ..coordinates import FORMATS, UNITS_M, Up, extra_package, require_precise, source_file, turned, up_of
+from ..mesh.planes import Mask
 from ..mesh.polygon_files import read_obj, read_ply
 from ..mesh.surfaces import Surface, sampled
 from .read_child import surveyed_points
