@@ -108,3 +108,13 @@ def test_formats_that_are_not_read_are_refused_with_their_conversion(name, tmp_p
     (tmp_path / name).write_bytes(b"\0content")
     with pytest.raises(InputError, match=rf"{name}: \.\w+ is not read; .*(convert|export)"):
         read_mesh(tmp_path / name)
+
+
+def test_furniture_on_a_floor_stays_closed(tmp_path):
+    """The lower side of a cupboard lies on the floor and looks the other way."""
+    room = trimesh.creation.box(bounds=[[0, 0, 0], [4, 3, 2.5]])
+    room.invert()
+    trimesh.util.concatenate([room, panel((1, 0.5, 2), (2, 1, 1))]).export(tmp_path / "room.obj")
+    surfaces = by_kind(planes_of_mesh(read_mesh(tmp_path / "room.obj")))
+    assert [len(surfaces[kind]) for kind in ("floor", "ceiling", "wall", "other")] == [1, 1, 4, 1]
+    assert surfaces["other"][0].mesh.is_watertight

@@ -27,24 +27,28 @@ def as_sheets(surfaces: Sequence[Surface], name: str | Path) -> list[Surface]:
     """Surfaces in which a wall is one sheet: a path would meet both faces of a thin panel, or both copies of a face.
 
     Closed bodies up to `PANEL_M` thick become the sheet in their middle. Of faces of one plane that look in opposite
-    directions and cover the same place, those of the smaller side are left out. Both are logged.
+    directions and cover the same place, those of the smaller side are left out, but for faces of closed bodies, which
+    would be open without the side on which they stand. Both are logged.
 
     Args:
         surfaces: surfaces of a mesh, metres.
         name: the source in messages.
     """
-    flat, panels = [], 0
+    flat, is_open, panels = [], list[Mask](), 0
     for surface in surfaces:
         parts = []
         for body in bodies(surface.vertices_m[surface.faces]):
             sheet = _middle(body.corners_m) if body.closed else None
             panels += sheet is not None
             parts.append(body.corners_m if sheet is None else sheet)
+            is_open.append(np.full(len(parts[-1]), not body.closed))
         flat.append(np.concatenate(parts))
     if panels:
         logger.warning("%s: %d panels up to %g mm thick are single sheets", name, panels, 1e3 * PANEL_M)
     corners = np.concatenate(flat)
-    copies = _copies(corners)
+    of_sheets = np.concatenate(is_open)
+    copies = np.zeros(len(corners), bool)
+    copies[of_sheets] = _copies(corners[of_sheets])
     if copies.any():
         logger.warning("%s: %d faces left out, behind which another face looks the other way", name, copies.sum())
     owner = np.repeat(np.arange(len(surfaces)), list(map(len, flat)))
