@@ -48,7 +48,8 @@ def as_sheets(surfaces: Sequence[Surface], name: str | Path) -> list[Surface]:
     corners = np.concatenate(flat)
     of_sheets = np.concatenate(is_open)
     copies = np.zeros(len(corners), bool)
-    copies[of_sheets] = _copies(corners[of_sheets])
+    if of_sheets.any():
+        copies[of_sheets] = _copies(corners[of_sheets])
     if copies.any():
         logger.warning("%s: %d faces left out, behind which another face looks the other way", name, copies.sum())
     owner = np.repeat(np.arange(len(surfaces)), list(map(len, flat)))
