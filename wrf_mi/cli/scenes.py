@@ -51,6 +51,7 @@ def _add_mesh(commands: Any) -> None:
 
 def mesh_command(a: Arguments) -> int:
     """Make a scene folder."""
+    from ..checking import check_scene
     from ..scene.make import make_scene
     from ..scene.mesh.files import mesh_parts
     from ..scene.register import read_pairs, register_pairs
@@ -71,7 +72,11 @@ def mesh_command(a: Arguments) -> int:
         point = ", ".join(f"{value:.12g}" for value in scene.origin_m)
         lines.append(f"origin: {point} of the source; positions of measurements must be relative to it")
     lines.append(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
-    return show(a.json, {**facts, "floor_m2": float(floor_m2), "origin_m": scene.origin_m}, "\n".join(lines))
+    check = check_scene(scene.folder)
+    if check.of_level("fault") or check.of_level("warning"):
+        lines += check.lines()
+    facts |= {"floor_m2": float(floor_m2), "origin_m": scene.origin_m, "check": check.as_dict()}
+    return show(a.json, facts, "\n".join(lines))
 
 
 def _point(text: str) -> tuple[float, ...]:
