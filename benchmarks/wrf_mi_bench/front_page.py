@@ -196,7 +196,8 @@ def true_power(receiver: wrf_mi.Receiver, positions_m: FloatArray) -> FloatArray
         set_scattering(scene, DEFAULT.scattering)
         for options in DEFAULT.options():
             # Points of a grid may lie in bodies, where no path arrives.
-            paths = trace_paths(scene, positions_m, receiver, options, progress=True, check=False).paths
+            how: dict[str, Any] = {"progress": True, "check": False, "search_from": "receivers"}
+            paths = trace_paths(scene, positions_m, receiver, options, **how).paths
             scattered = (paths.interactions == SCATTERING).any(axis=1)
             total += received_power(paths.select(scattered == options.scattering))[0]
     return np.asarray(strength_db(total))

@@ -40,6 +40,23 @@ FILES = ("filename",)  # names of texts that are files
 DEEPEST = 64  # most levels of elements: Mitsuba's reader calls itself for each
 
 
+OVERRULED = "has constants and an id of ITU-R P.2040, by which Sionna RT leaves them out; rename it, without itu"
+
+
+def overruled(bsdf: Element) -> bool:
+    """Whether a BSDF states constants, in place of which Sionna RT takes those of ITU-R P.2040 for its id."""
+    is_itu = bsdf.get("id", "").removeprefix("mat-").startswith(("itu_", "itu-"))
+    stated = {child.get("name") for child in bsdf}
+    return is_itu and bool(stated & {"relative_permittivity", "conductivity"})
+
+
+def make_files_absolute(root: Element, path: Path) -> None:
+    """Name the files of a scene file, in place, so that it may be written elsewhere."""
+    for text in root.iter("string"):
+        if text.get("name") in FILES:
+            text.set("value", str((path.parent / text.get("value", "")).absolute()))
+
+
 def parsed_xml(path: Path) -> Element:
     """The root of an XML file, the values of its ``<default>`` elements in the places of ``$name``, as in Mitsuba.
 

@@ -105,7 +105,7 @@ class RayTracer:
         """Number of rays per search for positions [n, 3] (metres); with ``"auto"`` that which converges for them."""
         positions, receivers = self._prepared.placed(np.asarray(tx_pos_m, float), tuple(self.instrument.receivers))
         ends = positions, np.stack([receiver.position_m for receiver in receivers])
-        return self._prepared.rays(*(ends if self.options.diffraction else ends[::-1]), self.options)
+        return self._prepared.rays(*(ends if self.options.sampled else ends[::-1]), self.options)
 
     def __call__(self, tx_pos_m: ArrayLike) -> NDArray[Any]:
         """Observations of all receivers [n_rx, n, ...] for transmitter positions [n, 3] (metres)."""

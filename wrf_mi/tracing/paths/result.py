@@ -19,10 +19,11 @@ from ...core.paths import ARRAYS, read_paths_file, save_paths
 from ...core.settings import settings_from
 from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
-from ..search.chains import Legs
+from ..search.chains import SPECULAR, Legs
 from ..search.surfaces import Surfaces, scene_surfaces
 from ..sionna.materials import absorbs, at_frequency
-from ..sionna.path_solver import Devices, Ends, path_gains, scattering_materials
+from ..sionna.path_solver import Devices, Ends, path_gains
+from ..sionna.scattering import scattering_coefficients, scattering_materials
 
 
 @dataclass(frozen=True)
@@ -71,12 +72,15 @@ class TraceResult:
         return replace(self, paths=paths, primitives=primitives, probability=probability, wedge=wedge)
 
     def unabsorbed(self, scene: Any) -> TraceResult:
-        """The paths that meet no absorber of the ``sionna.rt.Scene``; others have no gain."""
-        names = self.paths.object_names
-        absorbing = [number for number, name in enumerate(names) if absorbs(scene.objects[name].radio_material)]
-        if not absorbing:
-            return self
-        return self.select(np.flatnonzero(~np.isin(self.paths.objects, absorbing).any(axis=1)))
+        """The paths without gain zero: no absorber of the ``sionna.rt.Scene``, no mirror where all is scattered."""
+        materials = [scene.objects[name].radio_material for name in self.paths.object_names]
+        all_scattered = {name for name, share in scattering_coefficients(scene).items() if share == 1}
+        absorbing, rough = (
+            np.isin(self.paths.objects, [number for number, material in enumerate(materials) if is_one(material)])
+            for is_one in (absorbs, lambda material: material.name in all_scattered)
+        )
+        lost = (absorbing | (rough & (self.paths.interactions == SPECULAR))).any(axis=1)
+        return self.select(np.flatnonzero(~lost)) if lost.any() else self
 
     def of_transmitters(self, which: IntArray) -> TraceResult:
         """The trace of the transmitters of indices ``which`` [n], in their order; an index may repeat."""

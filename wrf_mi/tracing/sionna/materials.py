@@ -60,6 +60,14 @@ def absorbs(material: Any) -> bool:
     return isinstance(material, AbsorberRadioMaterial)
 
 
+def is_standard(material: Any) -> bool:
+    """Whether a radio material is, but for its thickness, the one that a scene folder knows by its name."""
+    if material.name == PERFECT:
+        stated = float(material.relative_permittivity[0]), float(material.conductivity[0])
+        return stated == (1.0, float(np.float32(PERFECT_CONDUCTIVITY)))
+    return bool(material.name == f"itu_{getattr(material, 'itu_type', '')}")
+
+
 CONSTANTS = ("relative_permittivity", "conductivity", "thickness")  # those in which materials differ
 # Attributes of a radio material: its constants by frequency, and those of ITU-R P.2040 where others replace them.
 CALLBACK, ITU_LAW = "_frequency_update_callback", "itu_law"

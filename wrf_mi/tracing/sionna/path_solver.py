@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -217,34 +218,54 @@ def field_of(
 
 
 _AS_SIONNA = ContextVar("diffracted fields of Sionna RT", default=False)
+_CORRECTED = ContextVar("corrected fields", default=False)
 
 
 @contextmanager
-def sionna_diffraction() -> Iterator[None]:
-    """Diffracted fields of Sionna RT 2.2 while the block lasts: data that were made with them stay as they are."""
-    token = _AS_SIONNA.set(True)
+def _set(variable: ContextVar[bool]) -> Iterator[None]:
+    token = variable.set(True)
     try:
         yield
     finally:
-        _AS_SIONNA.reset(token)
+        variable.reset(token)
 
 
-@contextmanager
-def corrected() -> Iterator[None]:
-    """Correct Sionna RT's fields while the block lasts: diffraction, and square roots of complex permittivities."""
+def sionna_diffraction() -> AbstractContextManager[None]:
+    """Diffracted fields of Sionna RT 2.2 while the block lasts: data that were made with them stay as they are."""
+    return _set(_AS_SIONNA)
+
+
+def corrected() -> AbstractContextManager[None]:
+    """Correct Sionna RT's fields while the block lasts: diffraction, and square roots of complex permittivities.
+
+    In this thread alone: other threads may trace at the same time, and use Sionna RT as it is.
+    """
+    _correctable()
+    return _set(_CORRECTED)
+
+
+@cache
+def _correctable() -> None:
+    """Replace functions of Sionna RT, once, by functions that are corrected within `corrected`."""
     import drjit as dr
     from sionna.rt import RadioMaterial
     from sionna.rt.utils import electromagnetics
 
-    # Sionna RT 2.2 takes the imaginary part, the attenuation in a slab, from the difference of modulus and real part:
-    # of 6.31 - 0.0026j single precision leaves it 35 % off. Dr.Jit's root has no such difference.
-    stated: Any = electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix
-    diffracted = stated[1] if _AS_SIONNA.get() else diffraction_matrix
-    electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix = dr.sqrt, diffracted
-    try:
-        yield
-    finally:
-        electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix = stated
+    # They are never restored: a thread that does so takes the correction from another one that is in its block. Two
+    # threads that come first at the same time replace them twice, to the same effect.
+    stated_sqrt, stated_matrix = electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix
+
+    def complex_sqrt(x: Any) -> Any:
+        # Sionna RT 2.2 takes the imaginary part, the attenuation in a slab, from the difference of modulus and real
+        # part: of 6.31 - 0.0026j single precision leaves it 35 % off. Dr.Jit's root has no such difference.
+        return dr.sqrt(x) if _CORRECTED.get() else stated_sqrt(x)
+
+    def matrix(*arguments: Any) -> Any:
+        ours = _CORRECTED.get() and not _AS_SIONNA.get()
+        return (diffraction_matrix if ours else stated_matrix)(*arguments)
+
+    rt: Any = RadioMaterial
+    electromagnetics.complex_sqrt, rt._diffraction_matrix = complex_sqrt, matrix
 
 
 def _pattern(devices: Devices, index: Any, receives: bool = False) -> Any:
@@ -353,17 +374,3 @@ def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
     vertices = legs.vertices_m.copy()
     vertices[row] += moved[:, 1:-1]
     return replace(legs, vertices_m=vertices)
-
-
-@contextmanager
-def scattering_materials(scene: Any, options: TraceOptions) -> Iterator[None]:
-    """Set the scattering coefficient of all materials while the block lasts, if scattering is on."""
-    able = [m for m in scene.radio_materials.values() if options.scattering and hasattr(m, "scattering_coefficient")]
-    stated = [material.scattering_coefficient for material in able]
-    for material in able:
-        material.scattering_coefficient = options.scattering_coefficient
-    try:
-        yield
-    finally:
-        for material, coefficient in zip(able, stated, strict=True):
-            material.scattering_coefficient = coefficient
