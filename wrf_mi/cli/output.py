@@ -190,7 +190,7 @@ class Watch:
             steps = round(progress.step / fraction)
             print(f"{stage} {progress.step}/{steps}  {text}", file=sys.stderr, flush=True)
         elif progress is None and self._is_due(stage, new):
-            print(f"{stage}  {fraction:.0%}  {text}" if text else stage, file=sys.stderr, flush=True)
+            print(stage if new else f"{stage}  {fraction:.0%}  {text}".rstrip(), file=sys.stderr, flush=True)
 
     def _is_due(self, stage: str, new: bool) -> bool:
         """Whether a stage has a line of a log: the first of a part, and then the first of each few seconds.

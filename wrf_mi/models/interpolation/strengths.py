@@ -20,6 +20,7 @@ from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS
+from ...parallel.threads import one_blas_thread
 from ...tasks import require
 from ...training.session import OnProgress, quiet
 from ..error_prior import ErrorPrior, with_columns
@@ -97,7 +98,8 @@ class Strengths(Fitted):
         position_m = finite_positions(inputs, "kriging")
         mean, std = np.empty((2, len(position_m)))
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
-            means, variances = zip(*self.field.predict(poses, receiver), strict=True)
+            with one_blas_thread():
+                means, variances = zip(*self.field.predict(poses, receiver), strict=True)
             # Of unknown headings: variance within each, and between their means.
             variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
             mean[rows], std[rows] = np.mean(means, axis=0) + self.shift_db, np.sqrt(variance)
@@ -121,9 +123,12 @@ class Strengths(Fitted):
         return replace(self, field=field)
 
     def refit(self, record: Record, rows: IntArray) -> Strengths:
-        """Posterior and calibration by some rows, see `Fitted`; not their mean and hyperparameters."""
+        """The posterior given some rows, see `Fitted`; factors of deviations are those of held-out stretches of all."""
         field = self.tracing_once().field
-        return _fit(field.prior, field.hyperparameters, _measured(record, rows, field.headings), quiet)
+        stops = _stops(_measured(record, rows, field.headings))
+        with one_blas_thread():
+            posterior = StrengthPosterior(field.prior, field.hyperparameters, field.ratio, stops, field.rounds)
+        return replace(self, field=posterior)
 
     def _chunks(self, position_m: FloatArray, heading_rad: FloatArray | None) -> list[tuple[slice, list[Poses]]]:
         """Slices of the rows, and poses that predictions are averaged over.
@@ -251,46 +256,24 @@ def fit_strengths(
     if record.frequencies_hz is None:
         raise InputError(f"{record.name}: carrier frequency unknown; state it in the data")
     measured = _measured(record, rows, settings.heading)
-    if not len(measured.rows) and power_map is None:
+    rows, values = measured.rows, measured.value_dbm
+    if not len(rows) and power_map is None:
         raise InputError(f"{record.name}: neither a training row that was received nor a scene; give one of them")
     prior = _prior(record, measured, power_map, settings)
     hyperparameters = settings.hyperparameters
-    if len(measured.rows) > 1:
+    ratio, widen = np.ones((2, len(values)))
+    # Traces at exact positions have no fades left in what they do not predict.
+    skew_db = 0.0 if power_map is not None and power_map.exact else SKEW_DB
+    shift, facts = skew_db, {"rows": float(len(rows))}
+    if len(rows) > 1:
         if scales(measured.poses.position_m)[1] > AREA_M:
             prior, hyperparameters = by_likelihood(prior, _stops(measured), hyperparameters)
-        elif len(measured.rows) >= settings.search_rows:
+        elif len(rows) >= settings.search_rows:
             search = Fit(prior, measured, partial(_stops, factor=WIDER))
             search.set_ratio(hyperparameters)
             hyperparameters = search.search(
                 hyperparameters, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
             )
-    return _fit(prior, hyperparameters, measured, on_progress)
-
-
-def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:
-    """Those of some rows of a record that a receiver received, with or without headings."""
-    rows = np.unique(np.asarray(rows, np.int64))
-    values = np.asarray(record.observation[:, rows], float)
-    received = np.isfinite(values).any(axis=0)
-    rows, values = rows[received], values[:, received]
-    heading = record.tx_heading_rad if headings else None
-    poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
-    return Measured(poses, values, rows, record.precision(rows))
-
-
-def _stops(measured: Measured, factor: float = 1.0) -> Stops:
-    stops = stops_of(measured, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
-    return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(measured.value_dbm))))
-
-
-def _fit(prior: PriorMean, hyperparameters: Hyperparameters, measured: Measured, on_progress: OnProgress) -> Strengths:
-    """Posterior and calibration of predictions by rows, with a mean and hyperparameters that are chosen already."""
-    values = measured.value_dbm
-    ratio, widen = np.ones((2, len(values)))
-    # Traces at exact positions have no fades left in what they do not predict.
-    skew_db = 0.0 if prior.traced is not None and prior.traced.exact else SKEW_DB
-    shift, facts = skew_db, {"rows": float(len(measured.rows))}
-    if len(measured.rows) > 1:
         fit = Fit(prior, measured, _stops)
         fit.set_ratio(hyperparameters)
         on_progress("strengths: held-out rows", 0.8)
@@ -309,6 +292,22 @@ def _fit(prior: PriorMean, hyperparameters: Hyperparameters, measured: Measured,
     field = StrengthPosterior(prior, hyperparameters, ratio, _stops(measured), ROBUST_ROUNDS)
     on_progress("strengths: all rows", 1.0)
     return Strengths(field, shift, widen, facts)
+
+
+def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:
+    """Those of some rows of a record that a receiver received, with or without headings."""
+    rows = np.unique(np.asarray(rows, np.int64))
+    values = np.asarray(record.observation[:, rows], float)
+    received = np.isfinite(values).any(axis=0)
+    rows, values = rows[received], values[:, received]
+    heading = record.tx_heading_rad if headings else None
+    poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
+    return Measured(poses, values, rows, record.precision(rows))
+
+
+def _stops(measured: Measured, factor: float = 1.0) -> Stops:
+    stops = stops_of(measured, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
+    return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(measured.value_dbm))))
 
 
 def _prior(record: Record, measured: Measured, power_map: Traced | None, settings: StrengthSettings) -> PriorMean:
