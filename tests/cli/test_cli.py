@@ -286,6 +286,21 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.Capt
     ]
 
 
+def test_watch_states_the_time_left_of_a_long_stage_where_there_is_no_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = 100.0
+    monkeypatch.setattr("time.perf_counter", lambda: now)
+    with Watch() as watch:
+        for second in range(513):
+            now = 100.0 + second
+            watch.on_progress("mapping", second / 512)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:3] == ["mapping", "mapping  1%  8:27 left", "mapping  2%  8:22 left"]
+    assert lines[-1] == "mapping  62%  3:12 left"
+    assert len(lines) == 8  # at 0, 5, 10, 20, 40, ... 320 seconds
+
+
 def test_watch_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     for name, value in (("TTY_COMPATIBLE", "1"), ("FORCE_COLOR", "1"), ("COLUMNS", "150")):
         monkeypatch.setenv(name, value)

@@ -207,6 +207,14 @@ def test_rays_are_shot_once_for_a_geometry(shoebox, divided, monkeypatch):
     assert shot(shoebox) > 0
 
 
+@pytest.mark.parametrize(("planes", "reflections"), [(5, 3), (200_000, 8)])  # beyond 64 bits: ranks
+def test_distinct_chains_are_those_of_numpy(planes, reflections):
+    rng = np.random.default_rng(0)
+    rows = rng.integers(-1, planes, (300, reflections))[rng.integers(0, 300, 1000)]
+    np.testing.assert_array_equal(search_module._unique_rows(rows), np.unique(rows, axis=0))
+    assert search_module._unique_rows(rows[:0]).shape == (0, reflections)
+
+
 def test_number_of_rays_converges(shoebox):
     ends = inside(5), receiver([1.0, 1.0, 1.0])
     found = trace_paths(shoebox, *ends, replace(UPRIGHT, rays="auto", depth=2))

@@ -199,7 +199,9 @@ def _summary(figures: dict[str, Any]) -> str:
     text += "\n" + summary_table(f"{figures['n']} positions", known, 2)
     if "inside" in figures:
         text += f"\n{figures['inside']:.0%} of the true positions lie inside the {level} regions"
-    return text
+    text += f"\nat the border of the searched area: {figures['at_border']} of {figures['n']} estimates; outside of it: "
+    text += f"training rows {figures['training_rows_outside']}"
+    return text + (f", true positions {figures['outside']}" if "outside" in figures else "")
 
 
 def _add_view(commands: Any) -> None:

@@ -189,13 +189,16 @@ class Watch:
         elif progress is not None and progress.validation_score is not None:
             steps = round(progress.step / fraction)
             print(f"{stage} {progress.step}/{steps}  {text}", file=sys.stderr, flush=True)
-        elif progress is None and new and self._is_due(stage):
-            print(stage, file=sys.stderr, flush=True)
+        elif progress is None and self._is_due(stage, new):
+            print(stage if new else f"{stage}  {fraction:.0%}  {text}".rstrip(), file=sys.stderr, flush=True)
 
-    def _is_due(self, stage: str) -> bool:
-        """Whether a stage has a line of a log: the first of a part, and then the first of each few seconds."""
+    def _is_due(self, stage: str, new: bool) -> bool:
+        """Whether a stage has a line of a log: the first of a part, and then the first of each few seconds.
+
+        Within a stage lines are as far apart as the stage was long at the line before: hours have a dozen lines.
+        """
         part, now = stage.partition(":")[0], time.perf_counter()
-        if part == self._part and now - self._told < LOG_S:
+        if (part == self._part or not new) and now - self._told < max(LOG_S, 0 if new else self._told - self._begun):
             return False
         self._part, self._told = part, now
         return True

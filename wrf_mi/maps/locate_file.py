@@ -129,12 +129,14 @@ def figures_of(located: LocatedPositions, true_m: FloatArray | None = None) -> d
     chosen = located.calibration
     figures: dict[str, Any] = {"n": len(located), "level": located.level, "likelihood": asdict(chosen.likelihood)}
     figures |= {"area_m2": summary(located.area_m2), "radius_m": summary(located.radius_m)}
+    figures |= {"at_border": int(located.at_border.sum()), "training_rows_outside": located.rows_outside}
     if chosen.neighbours is not None:
         figures["neighbours"] = asdict(chosen.neighbours)
         names = ("rows", "error_m", "inside", "neighbours_error_m")
         figures["held_out"] = {name: getattr(chosen, name) for name in names}
     if true_m is not None:
         figures |= {"error_m": summary(located.error_m(true_m)), "inside": float(located.covers(true_m).mean())}
+        figures["outside"] = int(located.candidates.outside(true_m).sum())
         if (near := located.neighbours_error_m(true_m)) is not None:
             figures["neighbours_error_m"] = summary(near)
     return figures

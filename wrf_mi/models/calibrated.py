@@ -69,14 +69,25 @@ class FittedWithIntervals(Fitted):
         decomposed = self.fitted.decompose(inputs, receiver, std)
         return replace(decomposed, prediction=self._stated(decomposed.prediction, inputs.tx_pos_m, receiver))
 
+    def _about(self, fitted: Fitted, rows: IntArray) -> FittedWithIntervals:
+        return FittedWithIntervals(fitted, self._record, rows, self._intervals, self._reception)
+
+    def tracing_once(self) -> FittedWithIntervals:
+        """The model that traces once, with the intervals."""
+        return self._about(self.fitted.tracing_once(), self._rows)
+
+    def refit(self, record: Record, rows: IntArray) -> FittedWithIntervals | None:
+        """The model given some rows, see `Fitted`, with the intervals at the distances to these."""
+        refit = self.fitted.refit(record, rows)
+        return None if refit is None else self._about(refit, rows)
+
     def error_prior(self, receiver: int) -> ErrorPrior | None:
         """As of the model: intervals change the size of errors, not where they are large."""
         return self.fitted.error_prior(receiver)
 
     def in_scene(self, scene: str) -> FittedWithIntervals:
         """The model in an edited scene, with the intervals of the scene that it was fitted in."""
-        other = self.fitted.in_scene(scene)
-        return FittedWithIntervals(other, self._record, self._rows, self._intervals, self._reception)
+        return self._about(self.fitted.in_scene(scene), self._rows)
 
     @property
     def depends_on_heading(self) -> bool:

@@ -134,7 +134,7 @@ class FittedWithFew(Fitted):
     """A fitted model of the receivers of some numbers, and a law for the others."""
 
     def __init__(self, fitted: Fitted, numbers: IntArray, law: SharedLaw) -> None:
-        self.fitted, self.law = fitted, law
+        self.fitted, self.law, self._numbers = fitted, law, numbers
         self._place = {int(number): place for place, number in enumerate(numbers)}
         self.train_seconds, self.uses_heading = fitted.train_seconds, fitted.uses_heading
         self.carriers_hz = fitted.carriers_hz
@@ -164,6 +164,17 @@ class FittedWithFew(Fitted):
         if receiver in self._place:
             return self.fitted.decompose(inputs, self._place[receiver], std)
         return super().decompose(inputs, receiver, std)
+
+    def tracing_once(self) -> FittedWithFew:
+        """The model that traces once, and the law."""
+        return FittedWithFew(self.fitted.tracing_once(), self._numbers, self.law)
+
+    def refit(self, record: Record, rows: IntArray) -> FittedWithFew | None:
+        """The model given some rows, see `Fitted`, and the law fitted to these."""
+        refit = self.fitted.refit(record.at_receivers(self._numbers), rows)
+        if refit is None:
+            return None
+        return FittedWithFew(refit, self._numbers, SharedLaw.fit(record, rows, self.law.number))
 
     def error_prior(self, receiver: int) -> ErrorPrior | None:
         """That of the model; none of receivers with few rows."""

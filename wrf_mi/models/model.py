@@ -169,6 +169,20 @@ class Fitted(ABC):
         """
         raise InputError("its predictions use no scene, and do not change with one; trace the edited scene")
 
+    def tracing_once(self) -> Fitted:
+        """The model as a copy that traces each position once, for all receivers, and keeps it as long as the copy.
+
+        For predictions of all receivers in turn, and for refits, which share what the copy traces.
+        """
+        return self
+
+    def refit(self, record: Record, rows: IntArray) -> Fitted | None:
+        """The model given some of its training rows, with scene, hyperparameters and weights as fitted to all of them.
+
+        None: its parameters are the fit, which has to be made anew.
+        """
+        return None
+
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions by the stages up to each but the last, for a fit in stages (entry ``stages`` of `facts`)."""
         return {}

@@ -104,6 +104,10 @@ class TracedPower:
             power[~new] = self.traced_dbm(position_m[~new])[receiver]
         return np.where(np.isnan(power), self.local(position_m, receiver), power)
 
+    def keeping(self) -> TracedPower:
+        """The power that keeps what it traces from now on; itself where it does."""
+        return self if self._keeps else TracedPower(self.local, self._trace, self._places, dict(self._known))
+
     def of_predictions(self, position_m: FloatArray) -> TracedPower:
         """The power for predictions, which keeps nothing but what is known at some positions [k, 3]."""
         self.traced_dbm(position_m)

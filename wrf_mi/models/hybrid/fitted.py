@@ -139,6 +139,18 @@ class FittedHybrid(Fitted):
             return super().in_scene(scene)
         return replace(self, parts=self.parts | {PATHS: self.parts[PATHS].in_scene(scene)})
 
+    def tracing_once(self) -> FittedHybrid:
+        """The hybrid of parts that trace once."""
+        return replace(self, parts={name: part.tracing_once() for name, part in self.parts.items()})
+
+    def refit(self, record: Record, rows: IntArray) -> FittedHybrid | None:
+        """The parts given some rows, see `Fitted`, mixed at the distances to these; None if a part has to be fitted."""
+        refits = {name: part.refit(record, rows) for name, part in self.parts.items()}
+        parts = {name: part for name, part in refits.items() if part is not None}
+        if len(parts) < len(self.parts) or self.residuals is not None:
+            return None
+        return replace(self, known=rows, parts=parts)
+
     @property
     def depends_on_heading(self) -> bool:
         """Whether the predictions of a part depend on the heading of the transmitter."""

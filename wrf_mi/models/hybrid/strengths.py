@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from ...core import InputError, Receiver, Split
+from ...core import InputError, Receiver, Record, Split
 from ...core.files import write_atomically
+from ...core.types import IntArray
 from ...correction.options import STRENGTHS
+from ...scene.correction_data import read_correction_data
 from ...tasks import task_of
 from ...tracing.options import TraceOptions
 from ...tracing.paths.solve import Prepared
@@ -59,6 +61,14 @@ class FittedStrengths(SceneSide):
         # The posterior of the training rows is about the scene in which they were measured.
         field.prior = replace(field.prior, traced=power)
         return FittedStrengths(replace(self.fitted, field=field), problem)
+
+    def refit(self, record: Record, rows: IntArray) -> FittedStrengths:
+        """The kriging given some rows, see `Fitted`, about the power traced in the scene that all rows corrected."""
+        strengths, data = self.fitted.refit(record, rows), read_correction_data(self.problem.scene)
+        if data is not None and data.knows(record.name, rows).any():
+            # Errors of the other rows, which the scene knows, are as much too small: deviations stay in proportion.
+            strengths = replace(strengths, widen=strengths.widen / data.error_ratio)
+        return FittedStrengths(strengths, self.problem)
 
     def held_out_at(self, held_out: HeldOut) -> HeldOutPrediction | None:
         """Predictions of the rows that were held out, see `SceneSide`."""

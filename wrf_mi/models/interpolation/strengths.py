@@ -8,6 +8,7 @@ held-out stretches of the training rows (`strength_fit`). Terms that all receive
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -19,6 +20,7 @@ from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS
+from ...parallel.threads import one_blas_thread
 from ...tasks import require
 from ...training.session import OnProgress, quiet
 from ..error_prior import ErrorPrior, with_columns
@@ -96,7 +98,8 @@ class Strengths(Fitted):
         position_m = finite_positions(inputs, "kriging")
         mean, std = np.empty((2, len(position_m)))
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
-            means, variances = zip(*self.field.predict(poses, receiver), strict=True)
+            with one_blas_thread():
+                means, variances = zip(*self.field.predict(poses, receiver), strict=True)
             # Of unknown headings: variance within each, and between their means.
             variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
             mean[rows], std[rows] = np.mean(means, axis=0) + self.shift_db, np.sqrt(variance)
@@ -109,6 +112,23 @@ class Strengths(Fitted):
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
             mean[rows] = np.mean([self.field.mean(each, receiver) for each in poses], axis=0) + self.shift_db
         return mean
+
+    def tracing_once(self) -> Strengths:
+        """The model about a traced mean that keeps powers, see `Fitted`; itself about any other mean."""
+        traced = self.field.prior.traced
+        if traced is None or not traced.exact:
+            return self
+        field = copy(self.field)
+        field.prior = replace(field.prior, traced=traced.keeping())
+        return replace(self, field=field)
+
+    def refit(self, record: Record, rows: IntArray) -> Strengths:
+        """The posterior given some rows, see `Fitted`; factors of deviations are those of held-out stretches of all."""
+        field = self.tracing_once().field
+        stops = _stops(_measured(record, rows, field.headings))
+        with one_blas_thread():
+            posterior = StrengthPosterior(field.prior, field.hyperparameters, field.ratio, stops, field.rounds)
+        return replace(self, field=posterior)
 
     def _chunks(self, position_m: FloatArray, heading_rad: FloatArray | None) -> list[tuple[slice, list[Poses]]]:
         """Slices of the rows, and poses that predictions are averaged over.
@@ -235,36 +255,26 @@ def fit_strengths(
     require(record, "rssi", why="these strengths are in dBm")
     if record.frequencies_hz is None:
         raise InputError(f"{record.name}: carrier frequency unknown; state it in the data")
-    rows = np.unique(np.asarray(rows, np.int64))
-    values = np.asarray(record.observation[:, rows], float)
-    received = np.isfinite(values).any(axis=0)
-    rows, values = rows[received], values[:, received]
+    measured = _measured(record, rows, settings.heading)
+    rows, values = measured.rows, measured.value_dbm
     if not len(rows) and power_map is None:
         raise InputError(f"{record.name}: neither a training row that was received nor a scene; give one of them")
-    heading = record.tx_heading_rad if settings.heading else None
-    poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
-    measured = Measured(poses, values, rows, record.precision(rows))
     prior = _prior(record, measured, power_map, settings)
     hyperparameters = settings.hyperparameters
-
-    def join(rows: Measured, factor: float = 1.0) -> Stops:
-        stops = stops_of(rows, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
-        return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(values))))
-
     ratio, widen = np.ones((2, len(values)))
     # Traces at exact positions have no fades left in what they do not predict.
     skew_db = 0.0 if power_map is not None and power_map.exact else SKEW_DB
     shift, facts = skew_db, {"rows": float(len(rows))}
     if len(rows) > 1:
-        if scales(poses.position_m)[1] > AREA_M:
-            prior, hyperparameters = by_likelihood(prior, join(measured), hyperparameters)
+        if scales(measured.poses.position_m)[1] > AREA_M:
+            prior, hyperparameters = by_likelihood(prior, _stops(measured), hyperparameters)
         elif len(rows) >= settings.search_rows:
-            search = Fit(prior, measured, partial(join, factor=WIDER))
+            search = Fit(prior, measured, partial(_stops, factor=WIDER))
             search.set_ratio(hyperparameters)
             hyperparameters = search.search(
                 hyperparameters, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
             )
-        fit = Fit(prior, measured, join)
+        fit = Fit(prior, measured, _stops)
         fit.set_ratio(hyperparameters)
         on_progress("strengths: held-out rows", 0.8)
         mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
@@ -279,9 +289,25 @@ def fit_strengths(
         if np.isfinite(residual).any():
             facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
     on_progress("strengths: all rows", 0.9)
-    field = StrengthPosterior(prior, hyperparameters, ratio, join(measured), ROBUST_ROUNDS)
+    field = StrengthPosterior(prior, hyperparameters, ratio, _stops(measured), ROBUST_ROUNDS)
     on_progress("strengths: all rows", 1.0)
     return Strengths(field, shift, widen, facts)
+
+
+def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:
+    """Those of some rows of a record that a receiver received, with or without headings."""
+    rows = np.unique(np.asarray(rows, np.int64))
+    values = np.asarray(record.observation[:, rows], float)
+    received = np.isfinite(values).any(axis=0)
+    rows, values = rows[received], values[:, received]
+    heading = record.tx_heading_rad if headings else None
+    poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
+    return Measured(poses, values, rows, record.precision(rows))
+
+
+def _stops(measured: Measured, factor: float = 1.0) -> Stops:
+    stops = stops_of(measured, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
+    return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(measured.value_dbm))))
 
 
 def _prior(record: Record, measured: Measured, power_map: Traced | None, settings: StrengthSettings) -> PriorMean:
