@@ -79,7 +79,7 @@ def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
     buffer: Any = PathsBuffer(count, depth, bool(legs.wedge))
     used = legs.interactions != 0
     # Sionna RT takes the normal from the corners of the triangle: that of the largest one is exact.
-    face = np.where(used, surfaces.flattest[legs.face], 0)
+    face = np.where(used, np.append(surfaces.flattest, 0)[legs.face], 0)
     object_index = surfaces.object_of(face)
     shape, primitive = np.full(face.shape, 0xFFFFFFFF, np.uint32), np.full(face.shape, 0xFFFFFFFF, np.uint32)
     shape[used] = surfaces.shape_ids[object_index[used]]
