@@ -220,8 +220,9 @@ def test_stopped_run_ends_with_status_130(
     assert command.json(["train", "--resume", run])["steps"] == 4
 
 
-def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path) -> None:
-    """A training process receives SIGINT."""
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_signal_to_end_writes_a_checkpoint_to_resume_from(ending: int, folder: Path, tmp_path: Path) -> None:
+    """A training process receives the signal of Ctrl-C, or that of batch systems."""
     out = tmp_path / "run"
     words = training(folder, out, "--set", "steps=200", "--set", "log_every=1", "--set", "validate_every=200")
     process = subprocess.Popen(
@@ -235,7 +236,7 @@ def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path)
         end = time.monotonic() + SECONDS_TO_START
         while not (out / "log.jsonl").exists() and process.poll() is None and time.monotonic() < end:
             time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(ending)
         stdout, stderr = process.communicate(timeout=SECONDS_TO_START)
     assert process.returncode == 130, stderr
     assert stdout == ""

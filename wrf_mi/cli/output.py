@@ -125,14 +125,15 @@ def _show_stages(reports: list[dict[str, Any]], label: str, weighed: dict[str, f
         print("not kept: no clear gain on held-out rows, by itself or under the stages that follow")
 
 
+ENDING = signal.SIGINT, signal.SIGTERM  # signals of Ctrl-C, and of batch systems and ``kill``
 LOG_S = 5.0  # least time between lines of progress within a part of the work, where no bar is shown
 
 
 class Watch:
-    """Progress on standard error, a bar on a terminal, else plain lines, and a stop on Ctrl-C.
+    """Progress on standard error, a bar on a terminal, else plain lines, and a stop on Ctrl-C or SIGTERM.
 
-    The first Ctrl-C lets the current step of ``resumable`` work, which asks `stop` and can go on later, finish and
-    write a checkpoint; a second one ends at once. ``run`` is the folder that the work can go on with.
+    The first of these signals lets the current step of ``resumable`` work, which asks `stop` and can go on later,
+    finish and write a checkpoint; a second one ends at once. ``run`` is the folder that the work can go on with.
     """
 
     def __init__(self, resumable: bool = False, run: str | None = None) -> None:
@@ -147,17 +148,19 @@ class Watch:
         self._part, self._told = "", 0.0
 
     def __enter__(self) -> Watch:
-        """Handle Ctrl-C."""
-        self._before = signal.getsignal(signal.SIGINT)
+        """Handle the signals that end a process."""
+        self._before = {number: signal.getsignal(number) for number in ENDING}
         if self._resumable:
-            signal.signal(signal.SIGINT, self._interrupt)
+            for number in ENDING:
+                signal.signal(number, self._interrupt)
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Restore the handler of Ctrl-C and stop the bar."""
+        """Restore the handlers and stop the bar."""
         if self._console.is_terminal:
             self._bar.stop()
-        signal.signal(signal.SIGINT, self._before)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self._stop:
@@ -167,7 +170,7 @@ class Watch:
         print(f"stopping after this step; Ctrl-C again ends at once{go_on}", file=sys.stderr)
 
     def stop(self) -> bool:
-        """Whether Ctrl-C was pressed."""
+        """Whether Ctrl-C was pressed, or the process was asked to end."""
         return self._stop
 
     def on_progress(self, stage: str, fraction: float, progress: FitProgress | None = None) -> None:

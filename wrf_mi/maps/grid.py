@@ -314,7 +314,7 @@ def reachable(scene: Any, positions_m: FloatArray, starts_m: FloatArray) -> NDAr
     low, high = ends.min(axis=0) - MARGIN_M, ends.max(axis=0) + MARGIN_M
     step_m = max(CANDIDATE_STEP_M, usual_step(low, high))
     ways = grid_over(low, high, step_m, ends[0, 2]).positions_m
-    nodes = np.concatenate([ends, ways[inside_scene(scene, ways)]])
+    nodes = np.concatenate([ends, ways[over_floor(scene, ways) & outside_solids(scene, ways)]])
     # Half a step more, so that places between the nodes of the grid meet several of them.
     pairs = cKDTree(nodes).query_pairs(1.5 * step_m, output_type="ndarray")
     away = nodes[pairs[:, 1]] - nodes[pairs[:, 0]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -119,7 +118,7 @@ class WithIntervals(Model):
         held_out = HeldOut.of(record, fold, problem.seed)
         place = replace(session, folder=session.folder / "held_out")
         predicted = held_out_predictions(self.model, problem, fold, held_out, place, self.name)
-        shutil.rmtree(place.folder)
+        session.discarded.append(place.folder)
         size = expected_size(task_of(record), predicted)
         intervals = fit_intervals(predicted.mean, held_out.observed(record), size, held_out.distance_m, held_out.row)
         reception, every, rows = None, predicted.every, problem.rows(split)

@@ -50,6 +50,7 @@ logger = logging.getLogger(__name__)
 
 NAME = "ray-tracing"
 PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"
+LOST = "paths_without_gain"  # key of the number of paths that are left out
 WITHOUT_PATH = 0.05  # share of measured values without a path from which on walls that nothing passes are suspected
 TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
 """Fewest positions of a scheduler's part: candidates of fewer are not made faster. Where rays start at the receivers
@@ -143,8 +144,9 @@ class FittedTracing(Fitted):
         return self._arrays
 
     def facts(self) -> dict[str, Any]:
-        """Duration of tracing, numbers of paths and rays."""
-        return {name: self._arrays[name].item() for name in ("trace_seconds", "paths", "rays")}
+        """Duration of tracing, numbers of paths, of those left out without a gain if there are any, and of rays."""
+        names = ("trace_seconds", "paths", LOST, "rays")
+        return {name: self._arrays[name].item() for name in names if name in self._arrays}
 
 
 def _instrument(record: Record) -> Instrument:
@@ -307,6 +309,7 @@ class RayTracing(Model):
         traced = _trace_of_fit(tracer, problem, session)
         seconds = time.perf_counter() - start
         facts = {"rays": traced.rays, "paths": len(traced.paths), "trace_seconds": seconds}
+        facts |= {LOST: traced.lost} if traced.lost else {}
         arrays = {name: np.asarray(value) for name, value in facts.items()}
         if task_of(record).in_decibel:
             known = split.all_train

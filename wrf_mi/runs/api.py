@@ -7,7 +7,8 @@ import shutil
 import tempfile
 import time
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,6 +45,7 @@ from .folder import (
     Settings,
     check_new,
     clear_begun,
+    has_progress,
     load_rows,
     run_parts,
     start_run,
@@ -239,7 +241,8 @@ def train(
         The run, with its scores in ``metrics``.
 
     Raises:
-        InputError: data, scene, settings or folder that cannot be used; nothing is left on the disk.
+        InputError: data, scene, settings or folder that cannot be used; what a fit has stored before it stays, and a
+            note says how to go on; without it nothing is left on the disk.
         Interrupted: ``stop`` ended the run; continue with `resume`.
         BackendError: a deterministic fit in a process that computes on a GPU already.
 
@@ -266,16 +269,31 @@ def train(
     with locked_folder(folder):
         clear_begun(folder)
         start_run(folder, config, splits)
+        session = Session(folder, folder, on_progress, stop, scheduler, progress)
         try:
-            _complete(folder, config, problem, Session(folder, folder, on_progress, stop, scheduler, progress))
+            with _noting_resumption(folder):
+                _complete(folder, config, problem, session)
         except InputError:
-            if not any(any(folder.rglob(name)) for name in (FITTED, CHECKPOINT)):
+            if not has_progress(folder):
                 shutil.rmtree(folder)
             raise
     run = Run(folder, problem.record, kept=scene)
     if out is None:
         weakref.finalize(run, shutil.rmtree, folder, ignore_errors=True)
     return run
+
+
+@contextmanager
+def _noting_resumption(folder: Path) -> Iterator[None]:
+    """Note at an error of the block, whatever it is, how to go on from what a fit has stored in its run folder."""
+    try:
+        yield
+    except Interrupted:  # it says so
+        raise
+    except BaseException as error:
+        if has_progress(folder):
+            error.add_note(f"what was fitted is kept; go on with: wrf-mi train --resume {folder}")
+        raise
 
 
 def _warn_of_known_rows(problem: Problem, splits: Sequence[Split]) -> None:
@@ -315,7 +333,7 @@ def resume(
     if run.config.deterministic:
         init("llvm", threads=1)
     session = Session(run.folder, run.folder, on_progress, stop, progress=progress)
-    with locked_folder(run.folder):
+    with locked_folder(run.folder), _noting_resumption(run.folder):
         _complete(run.folder, run.config, run.problem, session)
     return open_run(folder, record)
 
@@ -340,6 +358,9 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             write_places(part, placed.record)
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
+            for done in session.discarded:
+                shutil.rmtree(done, ignore_errors=True)
+            session.discarded.clear()
             del fitted  # what is scored is the stored one, beside which this would be in memory a second time
         (part / CHECKPOINT).unlink(missing_ok=True)  # also of a process that was killed before
         parts.append(FittedPart(part, rows, *load_fitted(config, problem, part)))

@@ -186,8 +186,13 @@ def _is_begun(folder: Path) -> bool:
     """Whether a run was killed here before it could be resumed: a lock and splits, but no configuration."""
     if not (folder / LOCK).is_file() or (folder / CONFIG).exists():
         return False
+    return not has_progress(folder)
+
+
+def has_progress(folder: Path) -> bool:
+    """Whether a run folder has files that a fit has written, beyond those of its beginning."""
     files = (path.name for path in folder.rglob("*") if not path.is_dir())
-    return all(name in (LOCK, SPLIT, CONFIG) or LEFTOVER.fullmatch(name) for name in files)
+    return not all(name in (LOCK, SPLIT, CONFIG) or LEFTOVER.fullmatch(name) for name in files)
 
 
 def clear_begun(folder: Path) -> None:

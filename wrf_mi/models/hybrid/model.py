@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -160,8 +159,8 @@ class _Fit:
         names = [*self.predictions] or [*self.parts]
         mixture, intervals, chosen = self._mixture(len(names))
         used = _used(names, mixture)
-        for name in set(self.parts) - set(used):
-            shutil.rmtree(self.session.folder / FOLDER / name, ignore_errors=True)
+        # A fit that ends before it is stored goes on from all parts.
+        self.session.discarded.extend(self.session.folder / FOLDER / name for name in set(self.parts) - set(used))
         if KRIGING in names and len(names) > 1:
             # Strengths are kriged about the scene's in every case.
             gained = self.task.in_decibel or not {KRIGING, RESIDUAL}.isdisjoint(used)

@@ -41,7 +41,7 @@ SPACING_M, SMOOTH_M = 0.25, 0.3
 TRACE = TraceOptions(transmission=True, depth=STRENGTHS.depth, reflections=STRENGTHS.reflections)  # as a correction's
 DEFAULT = StrengthSettings()
 SEARCH_ROWS = 30  # least number of rows by which hyperparameters about an exact mean are searched
-HELD = "held"  # folder of the predictions of held-out rows
+HELD, TRIED = "held", "tried"  # folders of the predictions of held-out rows, and of those that choose the mean
 NEVER = 2**31  # `StrengthSettings.search_rows` above any number of rows
 ExactMean = Callable[[Sequence[Receiver]], TracedPower]
 """Power at positions themselves for some receivers of a problem; fits share what was traced."""
@@ -82,18 +82,17 @@ def _chosen(
     record, received = stated.record, replace(held_out, every=held_out.every[:0])
     unit = held_out.receiver if split.held_receivers else held_out.row
 
-    def score(problem: Problem, mean: ExactMean | None = None) -> float:
+    def score(problem: Problem, name: str, mean: ExactMean | None = None) -> float:
         # Which mean is better does not depend on a search for hyperparameters.
-        model, place = StrengthsInScene(StrengthSettings(search_rows=NEVER), mean), inside(session, "tried")
+        model, place = StrengthsInScene(StrengthSettings(search_rows=NEVER), mean), inside(session, TRIED, name)
         means = held_out_predictions(model, problem, fold, received, place, "mean").mean
-        shutil.rmtree(place.folder)
         of_row = task_of(record).mixtures(means[None], held_out.observed(record))
         return float(unit_means(of_row(np.ones((len(held_out), 1)), np.arange(len(held_out))), unit).mean())
 
-    problem, best = inner, score(inner)
+    problem, best = inner, score(inner, "corrected")
     if inner is not stated:
         # The correction has gained as a trace, but may add nothing to kriging, which knows the level around each row.
-        before = score(stated)
+        before = score(stated, "stated")
         if before >= best:
             problem, best = stated, before
     mean = None
@@ -101,7 +100,7 @@ def _chosen(
         # Whoever turns carries the antenna beside the stated position; elsewhere, positions may be exact, unless
         # receivers' are estimates, which each hold-out makes anew.
         exact = _traced(problem)
-        mean = exact if score(problem, exact) > best else None
+        mean = exact if score(problem, "exact", exact) > best else None
     judged = _Remembering(_searched(mean), mean)
     shutil.rmtree(session.folder / HELD, ignore_errors=True)  # of a stopped fit
     held_out_predictions(judged, problem, fold, held_out, inside(session, HELD), "paths")
@@ -202,6 +201,7 @@ class TracedStrengths(StrengthsInScene):
             held_out, path = HeldOut.of(problem.record, fold, problem.seed), session.folder / "mean.json"
             if not path.exists():
                 write_atomically(path, json.dumps(_chosen(problem, inner, split, fold, held_out, session)) + "\n")
+            session.discarded.append(session.folder / TRIED)
             choice = json.loads(path.read_text())
             if inner is not problem and not choice["corrected"]:
                 inner, reports = problem, [replace(report, kept=report.stage == MEAN) for report in reports]

@@ -223,6 +223,8 @@ def trace_paths(
         hz, arrays = float(scene.frequency[0]), (primitives.astype(np.int32), legs.probability, legs.wedge)
         traced = TraceResult(paths, positions, devices, *arrays, options, int(rays), swap, hz, tx_antenna)
         traced = traced.unabsorbed(scene)
+        if gains:
+            traced = traced.with_gains(traced.paths.gain)
     if check:
         _warn_of_silence(traced.paths, positions, devices, first_row)
     return traced
