@@ -79,7 +79,7 @@ class InitialConfig:
     nearest_m: Positive = 1.0  #: smallest distance of a random Gaussian from its receiver, metres
     farthest_m: Positive = 8.0  #: largest distance, metres
     opacity: Inside = 0.4  #: alpha at a footprint's centre
-    signal: float = 0.3  #: standard deviation of the starting signals
+    signal: Positive = 0.3  #: standard deviation of the starting signals; at 0 no signal would have a gradient
 
 
 @dataclass(frozen=True)
