@@ -144,7 +144,8 @@ class WrfGsPlus:
     only the first head is present: the map from the Gaussians' signals to the receiver is then common to all
     transmitters. Where the paper is silent: the scale's offset, bounded to -1..1 by x / sqrt(1 + x^2), is added to its
     logarithm (a scale stays within a factor of e of the static scale), the rotation's to the quaternion before it is
-    normalised; the heads start small, so that the static field dominates at first. With several ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
+    normalised; the heads start small, so that the static field dominates at first. With several
+    ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
     """
 
     encoding: Encoding = Encoding()
@@ -199,8 +200,8 @@ class WrfGsPlus:
             return [a + d for a, d in zip(static, offset[head], strict=True)]
 
         if "scale" in offset:
-            # x / sqrt(1 + x^2): the network is common to all Gaussians. Where most pixels are to be darker, an unbounded
-            # offset shrinks all Gaussians in tens of steps until they lie between the pixels, without a gradient.
+            # x / sqrt(1 + x^2): the network is common to all Gaussians. Where most pixels are to be darker, an offset
+            # without bounds shrinks all Gaussians in tens of steps until they lie between the pixels, without a gradient.
             offset["scale"] = [d * dr.rsqrt(1 + dr.square(d)) for d in offset["scale"]]
         opacity = logistic(params["opacity"].array)
         return Gaussians(

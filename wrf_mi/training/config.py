@@ -149,7 +149,7 @@ class DensityConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Loss of spectra: (1 - eta) L1 + eta (1 - SSIM), as in the WRF-GS papers."""
+    """Loss of spectra: (1 - eta) D + eta (1 - SSIM), after the WRF-GS papers (`wrf_mi.tasks.losses.spectrum_loss`)."""
 
     ssim_weight: Share = 0.2  #: eta
 
