@@ -201,7 +201,7 @@ class WrfGsPlus:
 
         if "scale" in offset:
             # x / sqrt(1 + x^2): the network is common to all Gaussians. Where most pixels are to be darker, an offset
-            # without bounds shrinks all Gaussians in tens of steps until they lie between the pixels, without a gradient.
+            # without bounds shrinks all Gaussians in tens of steps: they lie between the pixels, without a gradient.
             offset["scale"] = [d * dr.rsqrt(1 + dr.square(d)) for d in offset["scale"]]
         opacity = logistic(params["opacity"].array)
         return Gaussians(
