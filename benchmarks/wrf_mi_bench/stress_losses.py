@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 
 from wrf_mi.backend.device import on_device, to_float
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.tasks.losses import SSIM_WEIGHT, absolute_error, spectrum_loss
+from wrf_mi.tasks.losses import LEAST_LIGHT, SSIM_WEIGHT, absolute_error, spectrum_loss
 
 from .stress_fields import SIZE, Rng
 from .stress_rows import DOUBLE, EXACT, GRADIENT, IMAGE, UNFELT, GradientWorst, Row, Worst
@@ -52,7 +52,9 @@ def losses(count: int) -> list[Row]:
         for seed in range(count):
             image, other = (v.astype(np.float32).astype(float) for v in make(np.random.default_rng(seed)))
             structure = structural_similarity(other, image, data_range=1)
-            truth = (1 - SSIM_WEIGHT) * np.abs(image - other).mean() + SSIM_WEIGHT * (1 - structure)
+            error, light = np.abs(image - other), other - other.min()
+            by_light = (light * error).sum() / max(light.sum(), LEAST_LIGHT)
+            truth = (1 - SSIM_WEIGHT) * (error.mean() + by_light) / 2 + SSIM_WEIGHT * (1 - structure)
             values = {"prediction": np.ones(image.size)}
             results = {kind: _both(kind, image, other, SSIM_WEIGHT) for kind in (mi.Float, DOUBLE)}
             likeness.add(abs(results[mi.Float][1] - structure), name)

@@ -57,6 +57,16 @@ def test_rows_that_train_are_refused(train: Any, value: float, part: str, two_ga
     assert not (tmp_path / "run").exists()
 
 
+@BOTH
+def test_observations_whose_squares_overflow_are_refused(train: Any, two_gateways: Record, tmp_path: Path) -> None:
+    row, name = int(official(two_gateways).train[0]), two_gateways.receivers[1].name
+    message = (
+        f"made-here, receiver {name}, row {row}: 1 of 800 values are larger than 1e+15, as no amplitude or power is"
+    )
+    broken = changed(two_gateways, ((1, row, 4, 5), 1e30))
+    assert error_line(train, broken, re.escape(message), out=tmp_path / "run").startswith(message)
+
+
 def test_fields_need_every_receiver_in_every_row(two_gateways: Record, tmp_path: Path) -> None:
     """Other models are fitted to the rows that a receiver received. A row of a later fold is refused at once."""
     row = int(official(two_gateways).train[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +15,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_building import TESTED, TRAINED, building
 from made_channels import channels
+from made_spectra import spectra
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.datasets import make_splits, write_ble_folder, write_nerf2_csi
 from wrf_mi.runs.evaluate import evaluate, pool, write_results
-from wrf_mi.runs.results import CONSTANT, Results, against_constant, constant_scores, read_run, unbeaten
+from wrf_mi.runs.results import (
+    CONSTANT,
+    SCORES,
+    VARIATION,
+    WORDS,
+    Results,
+    against_constant,
+    constant_scores,
+    read_run,
+    variation,
+    warnings_of,
+)
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim
 
@@ -212,36 +225,81 @@ def noise(record: Record) -> Record:
     return replace(record, observation=drawn.astype(np.float32))
 
 
-def test_strengths_are_predicted_by_the_mean_of_the_receiver() -> None:
+def test_constant_of_strengths_is_the_median_of_each_receiver_where_errors_are_smallest() -> None:
     record = building(attic=(1, 2, 3, 45))
     (split,) = make_splits(record, "official")
     truth = record.observation[:, split.test]
-    found = constant_scores(record, split, truth)
+    arrays = constant_scores(record, split, truth)
     for receiver in range(4):
-        mean_dbm = np.nanmean(record.observation[receiver, :TRAINED])
-        np.testing.assert_allclose(found[receiver], np.abs(truth[receiver] - mean_dbm), atol=FLOAT32)
-    assert np.isfinite(found[3]).sum() == 1
+        median_dbm = np.nanmedian(record.observation[receiver, :TRAINED])
+        np.testing.assert_allclose(arrays[SCORES][receiver], np.abs(truth[receiver] - median_dbm), atol=FLOAT32)
+    assert np.isfinite(arrays[SCORES][3]).sum() == 1
+    assert set(arrays[WORDS].flat) == {"the median of each receiver's training rows"}
 
 
 def test_receivers_that_are_held_out_take_the_mean_of_the_others() -> None:
     record, tested = building(), np.arange(TRAINED, TRAINED + TESTED)
     split = Split("mine", 0, np.arange(TRAINED), np.zeros(0, np.int64), tested, held_receivers=(0,))
     truth = record.observation[:, split.test]
-    expected = np.abs(truth[0] - record.observation[1:, :TRAINED].mean())
-    np.testing.assert_allclose(constant_scores(record, split, truth)[0], expected, atol=FLOAT32)
+    expected = np.abs(truth[0] - np.median(record.observation[1:, :TRAINED]))
+    np.testing.assert_allclose(constant_scores(record, split, truth)[SCORES][0], expected, atol=FLOAT32)
 
 
-def test_spectra_are_predicted_by_the_mean_spectrum(one_gateway: Record) -> None:
-    split = Split("mine", 0, np.arange(16), np.zeros(0, np.int64), np.arange(16, 24))
-    truth = one_gateway.observation[:, split.test]
-    mean = one_gateway.observation[0, :16].mean(axis=0)
-    np.testing.assert_allclose(constant_scores(one_gateway, split, truth)[0], ssim([mean] * 8, truth[0]), atol=FLOAT32)
+SPECTRA = Split("mine", 0, np.arange(16), np.zeros(0, np.int64), np.arange(16, 24))
+
+
+@pytest.mark.parametrize("words", ["the mean of each receiver's training rows", "black"])
+def test_constant_of_spectra_is_the_one_that_scores_best_on_training_rows(one_gateway: Record, words: str) -> None:
+    record = one_gateway
+    if words == "black":  # a bright block in each spectrum, elsewhere than in the others
+        blocks = np.zeros_like(record.observation)
+        for row in range(blocks.shape[1]):
+            top, left = row // 6 * 5, row % 6 * 6
+            blocks[0, row, top : top + 3, left : left + 3] = 1
+        record = replace(record, observation=blocks)
+    truth = record.observation[:, SPECTRA.test]
+    constant = record.observation[0, :16].mean(axis=0) * (words != "black")
+    arrays = constant_scores(record, SPECTRA, truth)
+    assert set(arrays[WORDS].flat) == {words}
+    np.testing.assert_allclose(arrays[SCORES][0], ssim([constant] * 8, truth[0]), atol=FLOAT32)
 
 
 def test_channels_are_predicted_by_zero() -> None:
     record = channels()
     (split,) = make_splits(record, "official")
-    np.testing.assert_array_equal(constant_scores(record, split, record.scored[:, split.test]), 0)
+    np.testing.assert_array_equal(constant_scores(record, split, record.scored[:, split.test])[SCORES], 0)
+
+
+TASK_RECORDS = {"rssi": building, "csi": channels, "spectrum": lambda: spectra(rows=24)[0]}
+
+
+@pytest.mark.parametrize("task", TASK_RECORDS)
+def test_predictions_of_the_truth_vary_as_much_as_it(task: str) -> None:
+    record = TASK_RECORDS[task]()
+    (split,) = make_splits(record, "official")
+    metrics, _ = evaluate(record, split, lambda rows, receiver: record.observation[receiver, rows])
+    assert metrics[VARIATION]["ratio"] == pytest.approx(1)
+    assert warnings_of(metrics | {"model": "mine"}) == []
+
+
+@pytest.mark.parametrize("task", TASK_RECORDS)
+def test_a_model_that_predicts_a_constant_says_so_whatever_it_is(task: str) -> None:
+    record = TASK_RECORDS[task]()
+    (split,) = make_splits(record, "official")
+    # The best constant of the test rows themselves, which no training row tells.
+    constant = np.nanmedian(record.observation[:, split.test].real, axis=1).astype(record.observation.dtype)
+    metrics, _ = evaluate(record, split, lambda rows, receiver: np.stack([constant[receiver]] * len(rows)))
+    assert metrics[VARIATION]["ratio"] == 0
+    assert any(line.startswith("mine predicts nearly the same") for line in warnings_of(metrics | {"model": "mine"}))
+
+
+def test_variation_leaves_out_rows_that_are_not_scored() -> None:
+    truth = np.array([[1.0, 3.0, np.nan]])
+    assert variation(np.array([[5.0, 6.0, 100.0]]), truth) == {"prediction": 0.5, "truth": 1.0, "ratio": 0.5}
+
+
+def test_variation_of_one_row_is_unknown() -> None:
+    assert variation(np.ones((2, 1)), np.zeros((2, 1))) is None
 
 
 @pytest.mark.parametrize("task", ["rssi", "csi"])
@@ -278,10 +336,10 @@ def test_folds_are_scored_together() -> None:
 def test_a_model_of_strengths_without_place_says_so(beaten: bool, model: str, tmp_path: Path, command: Command) -> None:
     record, run = building(), tmp_path / "run"
     folder = write_ble_folder(tmp_path / "data", record if beaten else noise(record))
-    *_, line, last = command.done(["train", folder, "--model", model, "--out", run]).splitlines()
+    out = command.done(["train", folder, "--model", model, "--out", run])
     assert json.loads((run / "metrics.json").read_text())[CONSTANT]["beaten"] == beaten
-    assert last == f"results: {run}"
-    assert (f"{model} {LINE}the mean of each receiver's training rows" in line) != beaten
+    assert out.splitlines()[-1] == f"results: {run}"
+    assert bool(re.search(f"{re.escape(model)} {LINE}the me(an|dian) of each receiver's training rows", out)) != beaten
     assert (LINE in command.done(["evaluate", run])) != beaten
 
 
@@ -294,8 +352,8 @@ def test_a_model_of_channels_that_predicts_no_more_than_zero_says_so(
     record = replace(record, observation=record.observation * turned[:, None, None].astype(np.complex64))
     folder, few = write_nerf2_csi(tmp_path / "data", record), SET if model != "idw" else []
     out = command.done(["train", folder, "--model", model, "--out", tmp_path / "run", *few])
-    assert f"{model} {LINE}zero: CEA (dB), median " in out.splitlines()[-2]
+    assert f"{model} {LINE}zero: CEA (dB), median " in out
 
 
 def test_a_run_of_an_earlier_version_has_no_such_line() -> None:
-    assert unbeaten({"task": "rssi"}) is None
+    assert warnings_of({"task": "rssi"}) == []

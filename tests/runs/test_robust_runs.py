@@ -136,14 +136,15 @@ def test_a_run_whose_arrays_were_changed_is_not_opened(
     command.refused(["evaluate", file.parent], f"model.npz: {message}")
 
 
-@pytest.mark.parametrize("change", ["shape", "nan"])
+@pytest.mark.parametrize("change", ["shape", "nan", "huge"])
 def test_a_checkpoint_of_other_arrays_is_refused(change: str, stopped: Path, tmp_path: Path) -> None:
     """They are refused before the backend, which ends the process on other shapes."""
     file = copied(stopped, tmp_path / "run") / "checkpoint.npz"
     arrays = stored_arrays(file)
     for group in ("param", "mean", "first", "second"):
         values = arrays[f"{group}/deform.0.bias"]
-        arrays[f"{group}/deform.0.bias"] = values[:-1] if change == "shape" else values * np.float32(np.nan)
+        filled = np.full_like(values, np.nan if change == "nan" else 1e30)
+        arrays[f"{group}/deform.0.bias"] = values[:-1] if change == "shape" else filled
     write_arrays(file, arrays, checksum=True)
     with pytest.raises(InputError, match="train the run anew"):
         resume(tmp_path / "run")

@@ -152,10 +152,19 @@ def test_float32_gradient_stays_close_on_flat_images():
 def test_loss_equals_its_formula():
     shape, rng = (2, 10, 11), np.random.default_rng(4)
     prediction, truth = rng.random(shape), rng.random(shape)
-    expected = 0.8 * np.abs(prediction - truth).mean() + 0.2 * (1 - reference(prediction, truth).mean())
+    error, light = np.abs(prediction - truth), truth - truth.min(axis=(1, 2), keepdims=True)
+    by_light = (light * error).sum(axis=(1, 2)) / light.sum(axis=(1, 2))
+    difference = (error.mean() + by_light.mean()) / 2
+    expected = 0.8 * difference + 0.2 * (1 - reference(prediction, truth).mean())
     assert loss_of(prediction, truth) == pytest.approx(expected, abs=DOUBLE)
     _, similarity = spectrum_loss(Float64(prediction.ravel()), Float64(truth.ravel()), *shape)
     assert np.array(similarity) == pytest.approx(reference(prediction, truth), abs=DOUBLE)
+
+
+def test_loss_of_spectra_without_light_is_that_of_their_pixels():
+    prediction, truth = np.full((1, 8, 9), 0.3), np.full((1, 8, 9), 0.1)
+    expected = 0.8 * 0.5 * 0.2 + 0.2 * (1 - reference(prediction, truth).mean())
+    assert loss_of(prediction, truth) == pytest.approx(expected, abs=DOUBLE)
 
 
 def test_frozen_loss_equals_plain_loss():

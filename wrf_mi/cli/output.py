@@ -46,7 +46,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     """Print the content of ``metrics.json`` as a table or as JSON, and the run folder; the exit status."""
     if as_json:
         return show(as_json, metrics, "")
-    from ..runs.results import rows_of_folds, unbeaten
+    from ..runs.results import rows_of_folds, warnings_of
     from ..tasks import TASKS
 
     task = TASKS[metrics["task"]]
@@ -74,7 +74,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
             f"scores are cross-validated: each row is predicted by a fit to the other {folds['folds'] - 1} of "
             f"{of_folds or str(folds['folds']) + ' folds'}; the model is fitted to all rows"
         )
-    if line := unbeaten(metrics):
+    for line in warnings_of(metrics):
         print(line)
     if folder is not None:
         print(f"results: {folder}")

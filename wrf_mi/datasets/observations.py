@@ -14,6 +14,8 @@ from ..core.types import IntArray
 logger = logging.getLogger(__name__)
 
 ROWS_PER_CHUNK = 256  # rows that are checked at a time, so that large records are not copied
+LARGEST = 1e15
+"""Largest value of observations and parameters: squares of sums of ten thousand of them fit into single precision."""
 LEAST_ROWS = 2
 """Training rows of a receiver that a fit needs: a level and its slope need two, as do a row that trains and another
 that chooses settings."""
@@ -100,7 +102,7 @@ def _check_uplink(record: Record, used: IntArray) -> None:
     if record.uplink is None:
         return
     uplink = record.uplink[used].reshape(len(used), -1)
-    for row in np.flatnonzero(~np.isfinite(uplink).all(axis=1)):
+    for row in np.flatnonzero(~computable(uplink).all(axis=1)):
         text = f"{place_of(record)}, row {used[row]}: uplink, {count_not_finite(uplink[row])}"
         raise InputError(f"{text}; correct or remove the row")
     for row in np.flatnonzero(~uplink.any(axis=1)):
@@ -122,14 +124,20 @@ def scorable(observation: NDArray[np.generic]) -> tuple[NDArray[np.generic], int
 
 
 def _states(observed: NDArray[np.generic], rows: IntArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Whether nothing was received in each row, and whether the observation is neither finite nor missing."""
+    """Whether nothing was received in each row, and whether the observation is neither `computable` nor missing."""
     missing, broken = np.empty(len(rows), bool), np.empty(len(rows), bool)
     for start in range(0, len(rows), ROWS_PER_CHUNK):
         part = slice(start, start + ROWS_PER_CHUNK)
         values = observed[rows[part]].reshape(len(rows[part]), -1)
         missing[part] = np.isnan(values).all(axis=1)
-        broken[part] = ~np.isfinite(values).all(axis=1) & ~missing[part]
+        broken[part] = ~computable(values).all(axis=1) & ~missing[part]
     return missing, broken
+
+
+def computable(values: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """Whether each value is finite and at most `LARGEST` in size."""
+    with np.errstate(over="ignore"):  # of a complex number near the largest one
+        return np.asarray(np.abs(values) <= LARGEST)
 
 
 def place_of(record: Record) -> str:
@@ -138,5 +146,8 @@ def place_of(record: Record) -> str:
 
 
 def count_not_finite(values: NDArray[np.generic]) -> str:
-    """Number of values that are not finite, in words."""
-    return f"{np.count_nonzero(~np.isfinite(values))} of {values.size} values are not finite"
+    """Number of values that are not finite or too large, in words."""
+    count, what = np.count_nonzero(~computable(values)), "not finite"
+    if np.isfinite(values).all():
+        what = f"larger than {LARGEST:g}, as no amplitude or power is"
+    return f"{count} of {values.size} values are {what}"

@@ -15,7 +15,7 @@ import numpy as np
 from ..core import InputError
 from .initial import InitialGaussians
 from .network import Params, Weights, dense, dense_of_pairs, encode, encoded_size, init_layer, linear
-from .parameters import Gaussians, common_geometry, logistic, rows
+from .parameters import Gaussians, common_geometry, logistic, rows, scheduled
 
 GEOMETRY = ("position", "log_scale", "rotation")
 """Per-Gaussian parameters that every field has, tensors [3, n], [3, n], [4, n].
@@ -115,6 +115,7 @@ class WrfGs:
 
     def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
         """Gaussians for transmitter positions [3, batch] in metres."""
+        scheduled(params)
         # The first network sees Gaussians alone: once for all transmitters of the batch.
         batch, hidden = tx_pos.shape[1], self.features(params)
         z = linear(params, "attenuation.delta", hidden)
@@ -141,9 +142,10 @@ class WrfGsPlus:
     The network has eight ReLU layers of 256; the input joins the fourth layer's output again at the fifth; three linear
     heads give offsets of signal, rotation and scale for each pair of Gaussian and transmitter. With ``static_geometry``
     only the first head is present: the map from the Gaussians' signals to the receiver is then common to all
-    transmitters. Where the paper is silent: the scale's offset is added to its logarithm (a scale stays positive), the
-    rotation's to the quaternion before it is normalised; the heads start small, so that the static field dominates at
-    first. With several ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
+    transmitters. Where the paper is silent: the scale's offset, bounded to -1..1 by x / sqrt(1 + x^2), is added to its
+    logarithm (a scale stays within a factor of e of the static scale), the rotation's to the quaternion before it is
+    normalised; the heads start small, so that the static field dominates at first. With several
+    ``components`` a Gaussian has as many complex signals: real parts, then imaginary ones.
     """
 
     encoding: Encoding = Encoding()
@@ -177,6 +179,7 @@ class WrfGsPlus:
 
     def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
         """Gaussians for transmitter positions [3, batch] in metres."""
+        scheduled(params)
         batch = tx_pos.shape[1]
         position = {"position": self.encoding.position(params["position"])}
         transmitter = {"transmitter": self.encoding.transmitter(tx_pos)}
@@ -196,6 +199,10 @@ class WrfGsPlus:
             static = [dr.tile(a, batch) for a in rows(params[name])]
             return [a + d for a, d in zip(static, offset[head], strict=True)]
 
+        if "scale" in offset:
+            # x / sqrt(1 + x^2): the network is common to all Gaussians. Where most pixels are to be darker, an offset
+            # without bounds shrinks all Gaussians in tens of steps: they lie between the pixels, without a gradient.
+            offset["scale"] = [d * dr.rsqrt(1 + dr.square(d)) for d in offset["scale"]]
         opacity = logistic(params["opacity"].array)
         return Gaussians(
             position=rows(params["position"]),
@@ -271,6 +278,7 @@ class Factorised:
 
     def gaussians(self, params: Params, tx_pos: dr.ArrayBase) -> Gaussians:
         """Gaussians for transmitter positions [3, batch] in metres."""
+        scheduled(params)
         batch, k, factors = tx_pos.shape[1], self.terms, params["signal"]
         n = factors.shape[1]
         blocks = [factors[i * k : (i + 1) * k, :] for i in range(2 * self.components)]

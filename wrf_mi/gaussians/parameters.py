@@ -84,6 +84,13 @@ def rows(tensor: dr.ArrayBase) -> list[dr.ArrayBase]:
     return [tensor[i, :].array for i in range(tensor.shape[0])]
 
 
+def scheduled(params: Mapping[str, Any]) -> None:
+    """Have the next evaluation store a field's parameters."""
+    # Parameters that a plain loop computes from those before, as p - rate * gradient, and never evaluates would carry
+    # the operations of all steps so far: each step would compile a longer kernel.
+    dr.schedule(dict(params))
+
+
 def common_geometry(params: Mapping[str, Any]) -> dict[str, list[Any]]:
     """Position, scale and rotation of Gaussians from a field's parameters, common to all transmitters."""
     return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -48,6 +48,8 @@ class Problem:
     antennas: AntennaOptions = AS_STATED  #: patterns and polarisations in place of those of the data
     operator: bool = True  #: learned fields predict by operator where they can, see `wrf_mi.training.predictor`
     left_out: tuple[str, ...] = ()  #: names of receivers that are left out of the data, as if they had not been there
+    #: what `Model.check` computed that the fit after it takes
+    checked: list[Any] = field(default_factory=list, repr=False, compare=False)
 
     @cached_property
     def record(self) -> Record:

@@ -17,7 +17,7 @@ from ..tasks import TASKS
 from ..tasks.scores import block_bootstrap
 from ..training.selection import clusters
 from .folder import known_config
-from .results import CONSTANT, PREDICTED, Results
+from .results import CONSTANT, PREDICTED, Results, constant_of
 
 COLUMNS = {"run": "run", "model": "model", "dataset": "data set", "split": "split", "seed": "seed"}
 COLUMNS |= {"n_train": "training rows (mean of folds)", "n_test": "test rows", "metric": "score"}
@@ -261,13 +261,13 @@ def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
 
 
 def _constants(runs: Sequence[Results]) -> list[dict[str, Any]]:
-    """Rows of the constant prediction (`wrf_mi.tasks.Task.constant`), once for runs with the same scores of it."""
+    """Rows of the constant prediction (`wrf_mi.tasks.Task.constants`), once for runs with the same scores of it."""
     by_name: dict[str, dict[str, Any]] = {}
     for run in (run for run in runs if CONSTANT in run.metrics):
         shown = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
         shown |= {key: run.metrics[CONSTANT][key] for key in ("median", "mean", "p10", "p90")} | {"model": CONSTANT}
         if shown not in by_name.values():
-            name = f"{TASKS[run.task].constant_words.removeprefix('the ')}, {run.metrics['split']}"
+            name = f"{constant_of(run.metrics).removeprefix('the ')}, {run.metrics['split']}"
             by_name[f"{name} of {run.name}" if name in by_name else name] = shown
     return [{"run": name} | shown for name, shown in by_name.items()]
 

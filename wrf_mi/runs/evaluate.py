@@ -30,7 +30,15 @@ from ..tasks import CARRIER, LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
 from .folder import METRICS, PREDICTIONS, RunConfig
 from .reception import reception_arrays, reception_block
-from .results import CONSTANT, RECEPTION, SCORES, Observations, against_constant, constant_scores, reference_key
+from .results import (
+    NOT_STORED,
+    RECEPTION,
+    Observations,
+    against_constants,
+    constant_scores,
+    evenly_spaced,
+    reference_key,
+)
 
 Predict = Callable[[IntArray, int], "NDArray[Any] | Prediction"]
 """Predicts what the receiver of an index observes in rows [m] of the record: spectra [m, H, W], powers [m] in dBm or
@@ -83,7 +91,8 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
 
     Returns:
         The blocks of ``metrics.json`` that scoring gives (``task``, ``score`` and the same by the name of the metric,
-        ``reference``, ``constant`` (`wrf_mi.runs.results.against_constant`), for several receivers ``receivers``, with
+        ``reference``, ``constant`` (`wrf_mi.runs.results.against_constant`),
+        ``variation`` (`wrf_mi.runs.results.variation`), for several receivers ``receivers``, with
         standard deviations ``inside_90`` and ``crps``, with probabilities of reception ``reception``, ``n_train``,
         ``n_test``, ``n_not_scored``, ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is
         not finite is not scored: its truth is NaN; so are those of trained receivers where a split holds out others.
@@ -105,7 +114,7 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         "tx_pos": record.tx_pos_m[rows],
         **({} if record.carriers_hz is None else {FREQUENCY: record.carriers_hz[rows]}),
         **{reference_key(key): values for key, values in reference_predictions(record, split).items()},
-        SCORES: constant_scores(record, split, truth),
+        **constant_scores(record, split, truth),
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
     if stated[0].std is not None:
@@ -167,7 +176,7 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
             str(name): {**(blocks(r) if counts[r] else {}), "n_test": int(counts[r])}
             for r, name in enumerate(arrays["receiver_name"])
         }
-    metrics[CONSTANT] = against_constant(scorer, scores, arrays[SCORES])
+    metrics |= against_constants(scorer, scores, arrays)
     if "std" in arrays:
         stated = arrays["prediction"], arrays["std"], arrays["truth"]
         metrics["inside_90"], metrics["crps"] = inside_interval(*stated), crps(*stated)
@@ -262,7 +271,7 @@ def _stage_scores(record: Record, part: FittedPart, metrics: dict[str, Any], arr
         return {}
     predictions = part.fitted.by_stage(part.split)
     task, rows = TASKS[record.task], arrays["row"]
-    spaced = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_OF_STAGES)).round().astype(int))
+    spaced = evenly_spaced(len(rows), MOST_OF_STAGES)
     truth = arrays["truth"][:, spaced]
     for report in used:
         if report["stage"] in predictions:
@@ -294,7 +303,7 @@ def _header(folder: Path, config: RunConfig, parts: Sequence[FittedPart]) -> dic
 
 def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any]) -> None:
     """Write ``predictions.npz`` and then ``metrics.json``, which marks the run as finished."""
-    write_predictions(folder / PREDICTIONS, {key: values for key, values in arrays.items() if key != SCORES})
+    write_predictions(folder / PREDICTIONS, {key: values for key, values in arrays.items() if key not in NOT_STORED})
     write_atomically(folder / METRICS, json.dumps(metrics, indent=1) + "\n")
 
 

@@ -30,8 +30,16 @@ REMEDY = "run evaluate to write it anew"
 CONSTANT = "constant"  # key of the block in ``metrics.json``
 PREDICTED = "predictions"  # key in ``metrics.json`` of the file of another program
 RECEPTION = "probability_of_reception"  # key in ``predictions.npz`` and variable of a map
-SCORES = "constant_score"
-"""Key of the constant prediction's scores [n_rx, m] among the arrays of an evaluation; they are not stored."""
+SCORES, WORDS = "constant_score", "constant_words"
+NOT_STORED = SCORES, WORDS
+"""Keys of the constant prediction's scores and words, [n_rx, m] each, among the arrays of an evaluation."""
+CHOSEN_BY = 100  # largest number of a receiver's training rows by which the constant is chosen: SSIM takes milliseconds
+VARIATION = "variation"  # key of the block in ``metrics.json``
+LEAST_VARIATION = 0.1
+"""Ratio of the standard deviations of predictions and truth over the rows, below which predictions hardly vary.
+
+Predictions of ratio r reduce the squared error of their own mean by 1 - (1 - r)^2 at most, here by a fifth.
+"""
 
 
 def reference_key(name: str) -> str:
@@ -250,20 +258,68 @@ def _read_log(path: Path) -> list[tuple[float, float]]:
     return points
 
 
-def constant_scores(record: Record, split: Split, truth: NDArray[Any]) -> FloatArray:
-    """Scores [n_rx, m] of a constant prediction (`wrf_mi.tasks.Task.constant`) of the test rows' truth [n_rx, m, ...].
+def constant_scores(record: Record, split: Split, truth: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Scores [n_rx, m] of a constant prediction of the test rows' truth [n_rx, m, ...], and its words: `NOT_STORED`.
 
-    The constant is that of the training rows, validation rows included, that a receiver received; a receiver without
-    any, which the split holds out, takes that of all receivers. Truth is NaN where it is not scored.
+    It is the one of `wrf_mi.tasks.Task.constants` with the best mean score on the training rows, validation rows
+    included, that a receiver received; a receiver without any, which the split holds out, takes those of all receivers.
+    Truth is NaN where it is not scored.
     """
     task, rows = TASKS[record.task], split.all_train
     observed = record.seen(split).observation[:, rows]
     received = np.asarray(np.isfinite(observed).reshape(*observed.shape[:2], -1).all(axis=2))
-    scores = []
+    trained: dict[str, list[FloatArray]] = {}
+    tested: dict[str, list[FloatArray]] = {}
     for values, known, expected in zip(observed, received, truth, strict=True):
-        constant = task.constant(values[known] if known.any() else observed[received])
-        scores.append(task.of_rows(np.broadcast_to(constant, expected.shape)[None], expected[None])[0])
-    return np.stack(scores)
+        seen = values[known] if known.any() else observed[received]
+        sample = seen[evenly_spaced(len(seen), CHOSEN_BY)]
+        for words, constant in task.constants(seen).items():
+            for scores, rows_of in ((trained, sample), (tested, expected)):
+                predicted = np.broadcast_to(constant, rows_of.shape)[None]
+                scores.setdefault(words, []).append(task.of_rows(predicted, rows_of[None])[0])
+    # Limited, as in `against_constant`.
+    means = {words: np.nanmean(np.clip(np.concatenate(scores), *task.limits)) for words, scores in trained.items()}
+    best = (max if task.higher_is_better else min)(means, key=lambda words: means[words])
+    return {SCORES: np.stack(tested[best]), WORDS: np.full(truth.shape[:2], best)}
+
+
+def evenly_spaced(count: int, most: int) -> IntArray:
+    """Numbers of at most ``most`` of ``count`` rows, evenly spaced."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def variation(prediction: NDArray[Any], truth: NDArray[Any]) -> dict[str, float] | None:
+    """Block of ``metrics.json``: how much predictions [n_rx, m, ...] vary over the rows, and how much the truth does.
+
+    Returns:
+        Standard deviations over the scored rows, root mean square over receivers and an observation's values, of
+        ``prediction`` and ``truth``, and their ``ratio``; None: the truth has no two rows that differ.
+    """
+    squares = np.zeros(2)
+    for of_receiver in zip(prediction, truth, strict=True):
+        scored = np.isfinite(of_receiver[1]).reshape(len(of_receiver[1]), -1).all(axis=1)
+        for number, values in enumerate(of_receiver):
+            if scored.any():
+                # About the first row: what is the same in all rows is then exactly 0.
+                change = np.asarray(values[scored] - values[scored][0], np.result_type(values, np.float64))
+                squares[number] += np.sum(np.square(np.abs(change - change.mean(axis=0))))
+    if not squares[1]:
+        return None
+    deviations = np.sqrt(squares / np.count_nonzero(np.isfinite(truth)))
+    return {
+        "prediction": float(deviations[0]),
+        "truth": float(deviations[1]),
+        "ratio": float(deviations[0] / deviations[1]),
+    }
+
+
+def against_constants(task: Task, scores: FloatArray, arrays: dict[str, Any]) -> dict[str, Any]:
+    """Blocks ``constant`` and ``variation`` of ``metrics.json`` from scores and the arrays of an evaluation."""
+    # Folds may differ in the constant that scores best on their training rows.
+    words = " or ".join(np.unique(arrays[WORDS]).tolist())
+    changes = variation(arrays["prediction"], arrays["truth"])
+    blocks = {CONSTANT: against_constant(task, scores, arrays[SCORES]) | {"words": words}}
+    return blocks if changes is None else blocks | {VARIATION: changes}
 
 
 def against_constant(task: Task, scores: FloatArray, constant: FloatArray) -> dict[str, Any]:
@@ -286,13 +342,22 @@ def against_constant(task: Task, scores: FloatArray, constant: FloatArray) -> di
     return {**summary(constant + 0.0), "gain": gain, "gain_error": error, "beaten": beaten}
 
 
-def unbeaten(metrics: dict[str, Any]) -> str | None:
-    """Line about a model whose scores are not better than those of the constant prediction; None where they are."""
-    block = metrics.get(CONSTANT)
-    if block is None or block["beaten"]:
-        return None
-    task = TASKS[metrics["task"]]
-    both = [f"{key} {metrics[task.block][key] + 0.0:.3f} against {block[key]:.3f}" for key in ("median", "mean")]
-    gain = f"gain {block['gain']:.2g}, standard error {block['gain_error']:.2g}"
-    what = f"{metrics['model']} is no better than predicting {task.constant_words}"
-    return f"{what}: {task.label}, {', '.join(both)} ({gain}); see docs/data.md, Scores"
+def warnings_of(metrics: dict[str, Any]) -> list[str]:
+    """Lines about a model whose scores are not better than the constant prediction's, or that predicts a constant."""
+    block, changes, lines = metrics.get(CONSTANT), metrics.get(VARIATION), list[str]()
+    if block is not None and not block["beaten"]:
+        task = TASKS[metrics["task"]]
+        both = [f"{key} {metrics[task.block][key] + 0.0:.3f} against {block[key]:.3f}" for key in ("median", "mean")]
+        gain = f"gain {block['gain']:.2g}, standard error {block['gain_error']:.2g}"
+        what = f"{metrics['model']} is no better than predicting {constant_of(metrics)}"
+        lines.append(f"{what}: {task.label}, {', '.join(both)} ({gain}); see docs/data.md, Scores")
+    if changes is not None and changes["ratio"] < LEAST_VARIATION:
+        what = f"{metrics['model']} predicts nearly the same at all positions: standard deviation over the test rows"
+        both = f"{changes['prediction']:.2g}, of the truth {changes['truth']:.2g}"
+        lines.append(f"{what} {both}; do not use it to tell positions apart")
+    return lines
+
+
+def constant_of(metrics: dict[str, Any]) -> str:
+    """Words for the constant prediction that a run is compared with."""
+    return str(metrics[CONSTANT].get("words", "a constant"))  # earlier versions state none

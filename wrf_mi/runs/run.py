@@ -227,6 +227,8 @@ class Run:
         while start < len(inputs) or not start:
             rows = slice(start, min(start + size, len(inputs)))
             chunk = self.fitted.predict(inputs if rows == slice(0, len(inputs)) else inputs.rows(rows), receiver)
+            if np.isinf(chunk.mean).any():
+                raise InputError(f"{self.folder}: predictions are infinite, as parameters are too large; train it anew")
             yield rows, chunk
             if rows.stop >= len(inputs):
                 return

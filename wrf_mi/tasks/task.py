@@ -19,8 +19,10 @@ from .scores import MixtureScores, abs_error_db, cea_db, level_of_amplitudes, ss
 UPLINK = "uplink"  # Key of the reference that copies the uplink
 LAW = "law"  # Key of the reference at receivers that were held out
 CARRIER = "carrier"
-SCORED_TOGETHER = 16  # Images whose similarity is computed at a time
 """Key of the reference at carriers without training rows: that of `Task.reference` at the nearest carrier with some."""
+SCORED_TOGETHER = 16  # Images whose similarity is computed at a time
+MEAN, MEDIAN = "the mean of each receiver's training rows", "the median of each receiver's training rows"
+"""Words for constant predictions (`Task.constants`); of arrays value by value."""
 
 
 class Task(ABC):
@@ -54,7 +56,6 @@ class Task(ABC):
     softening_m: ClassVar[float] = 0.0  #: addend of the distances in the reference, metres
     #: words for the second reference, of data with an uplink; "" where the task has none
     from_uplink: ClassVar[str] = ""
-    constant_words: ClassVar[str] = "the mean of each receiver's training rows"  #: what `constant` predicts, in words
     heading: ClassVar[str]  #: heading of the task
     quantity: ClassVar[str]  #: quantity that is drawn over positions, with its unit
     note: ClassVar[str] = ""  #: sentence for readers of a table
@@ -86,9 +87,12 @@ class Task(ABC):
     def check(self, record: Record) -> None:  # noqa: B027 - most tasks have nothing to check
         """Refuse a record with inconsistent parts; raises InputError."""
 
-    def constant(self, observed: NDArray[Any]) -> NDArray[Any]:
-        """The best constant prediction of a receiver's observations [n, ...], all finite: by default their mean."""
-        return np.asarray(observed.mean(axis=0))
+    def constants(self, observed: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """Constant predictions of a receiver's observations [n, ...], all finite, by what they are in words.
+
+        A model is compared with the constant that scores best on the training rows; by default mean and median.
+        """
+        return {MEAN: np.asarray(observed.mean(axis=0)), MEDIAN: np.asarray(np.median(observed, axis=0))}
 
     @property
     def reference(self) -> str:
@@ -187,6 +191,10 @@ class Spectrum(Task):
 
         return spectrum_loss(prediction, truth, batch, shape[0], shape[1], ssim_weight)[0]
 
+    def constants(self, observed: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """A black spectrum, which is the most similar to spectra of few narrow lobes, and the mean and median."""
+        return {"black": np.zeros(observed.shape[1:], observed.dtype)} | super().constants(observed)
+
     def level(self, prediction: Prediction) -> Prediction:
         """Mean power over the solid angle: greys are magnitudes of a beam former (`level_of_amplitudes`)."""
         height, width = prediction.mean.shape[1:]
@@ -250,7 +258,6 @@ class Csi(Task):
     axes, more_axes, is_complex = 1, 1, True
     receiver = receiver_with_scene = "csi"
     from_uplink = "copy of the uplink"
-    constant_words = "zero"
     heading, quantity = "channel coefficients", "power (dB)"
     level_kind, level_note = "gain", "mean of |h|^2 over antennas and subcarriers, in the unit of the data"
     note = (
@@ -259,10 +266,10 @@ class Csi(Task):
         "uplink takes each antenna's uplink coefficients for the downlink's."
     )
 
-    def constant(self, observed: NDArray[Any]) -> NDArray[Any]:
+    def constants(self, observed: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """Zero, whose accuracy is 0 dB."""
         # Over some wavelengths of positions the phase takes every value: the mean of few training rows is chance.
-        return np.zeros(observed.shape[1:], observed.dtype)
+        return {"zero": np.zeros(observed.shape[1:], observed.dtype)}
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
         """Mean squared difference over received observations."""

@@ -79,7 +79,7 @@ class InitialConfig:
     nearest_m: Positive = 1.0  #: smallest distance of a random Gaussian from its receiver, metres
     farthest_m: Positive = 8.0  #: largest distance, metres
     opacity: Inside = 0.4  #: alpha at a footprint's centre
-    signal: float = 0.3  #: standard deviation of the starting signals
+    signal: Positive = 0.3  #: standard deviation of the starting signals; at 0 no signal would have a gradient
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class DensityConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Loss of spectra: (1 - eta) L1 + eta (1 - SSIM), as in the WRF-GS papers."""
+    """Loss of spectra: (1 - eta) D + eta (1 - SSIM), after the WRF-GS papers (`wrf_mi.tasks.losses.spectrum_loss`)."""
 
     ssim_weight: Share = 0.2  #: eta
 

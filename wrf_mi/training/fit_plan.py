@@ -18,7 +18,7 @@ from ..core import InputError, Receiver, Record, Split
 from ..core.angles import FloatArray
 from ..core.memory import require_memory
 from ..core.types import IntArray
-from ..datasets.observations import check_observations
+from ..datasets.observations import LARGEST, check_observations, computable
 from ..gaussians import FIELDS, Encoding, random_gaussians
 from ..graph.graph import Field, Graph
 from ..graph.receivers import AUTO, Form, receiver_kind
@@ -84,10 +84,11 @@ def _shapes(field: Field) -> dict[str, tuple[int, ...]]:
 
 
 def check_params(field: Field | None, params: Mapping[str, NDArray[Any]], source: str) -> None:
-    """Refuse parameters of a file ``source`` that are missing, not finite, or of other shapes than the field's."""
+    """Refuse parameters of a file ``source`` that are missing, not usable, or of other shapes than the field's."""
     for name, values in params.items():
-        if values.dtype.kind != "f" or not np.isfinite(values).all():
-            raise InputError(f"{source}: parameter {name} does not hold finite numbers; train the run anew")
+        if values.dtype.kind != "f" or not computable(values).all():
+            text = f"parameter {name} does not hold finite numbers of at most {LARGEST:g}"
+            raise InputError(f"{source}: {text}; train the run anew")
     if field is None:
         return
     # The backend ends the process on other shapes.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..backend.device import Recorded, on_device, to_float, to_tensor
 from ..backend.vectors import Complex, Pose
-from ..core import Receiver
+from ..core import InputError, Receiver
 from ..gaussians.tiles import TiledPlane, perception_plane
 from ..graph.graph import LEVEL, Batch, Graph, Report
 from ..graph.settings import TRACED_NAMES
@@ -161,6 +161,11 @@ class Steps:
         o, traced = self._plan.config.optimiser, self._plan.graph.traced
         rates = {name: getattr(o, name) for name in ("position", "rotation", "opacity", "signal")}
         rates |= {"log_scale": o.scale, LEVEL: o.level}
+        # Parameters of networks have a dot in their names (`wrf_mi.gaussians.network.init_layer`).
+        unknown = [name for name in names if "." not in name and name not in rates]
+        if unknown:
+            text = f"no learning rate for parameter {', '.join(unknown[:6])} of the field; known are {', '.join(rates)}"
+            raise InputError(f"{text}, and parameters of networks, named layer.part")
         return {
             name: traced.rate(name) if name.startswith(TRACED_NAMES) else rates.get(name, o.network) for name in names
         }

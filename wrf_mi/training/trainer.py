@@ -195,6 +195,7 @@ class Trainer(TrainingLoop):
             where nothing was received; None: the task's loss.
         scene: scene of `wrf_mi.tracing.open_scene` at the record's carrier, whose paths are trained together with the
             Gaussians. None: Gaussians alone.
+        plan: plan of the fit, of the arguments above; None: it is made of them.
 
     Attributes:
         plan: data, graph, stages and schedule of the fit.
@@ -220,8 +221,9 @@ class Trainer(TrainingLoop):
         state: FitState | None = None,
         loss: Loss | None = None,
         scene: Any | None = None,
+        plan: FitPlan | None = None,
     ) -> None:
-        plan = self.plan = FitPlan(record, split, config, field, scene)
+        plan = self.plan = plan or FitPlan(record, split, config, field, scene)
         self.config, self.schedule = plan.config, plan.schedule
         self.label, self.higher_is_better = plan.task.label, plan.task.higher_is_better
         if config.deterministic:

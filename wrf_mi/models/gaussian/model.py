@@ -222,7 +222,8 @@ class GaussianField(Model):
         stored = read_checkpoint(folder) if (folder / CHECKPOINT).exists() else None
         state = None if stored is None else FitState.from_arrays(stored)
         # Receivers without rows would have parameters that nothing trains: they get those of the others afterwards.
-        trainer = Trainer(*trained_part(record, split), config, state=state, scene=_scene(problem, split))
+        plan = self._plan(problem, split)
+        trainer = Trainer(plan.record, plan.split, config, state=state, plan=plan)
         trainer.seconds = 0.0 if stored is None else float(stored["seconds"])
         cut_log(folder, trainer.state.step)  # a killed run has logged steps after its checkpoint
 
@@ -252,6 +253,18 @@ class GaussianField(Model):
         release_memory()
         return fitted
 
+    def _plan(self, problem: Problem, split: Split) -> FitPlan:
+        """Plan of a fit, taken from `check` where data, rows, settings and scene are the same."""
+        (record, rows), scene = trained_part(problem.record, split), _scene(problem, split)
+        config, known = problem.settings.resolved(record.tx_pos_m[rows.all_train]), list(problem.checked)
+        problem.checked.clear()  # a training changes the graph of its plan
+        for plan in known:
+            same = plan.record is record and plan.config == config and plan.graph.scene is scene
+            parts = (plan.split.train, rows.train), (plan.split.validation, rows.validation)
+            if same and all(np.array_equal(*part) for part in parts):
+                return plan
+        return FitPlan(record, rows, problem.settings, scene=scene)
+
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
         """The field that `FittedField.arrays` described; operators are stored in the folder."""
         return FittedField(arrays, problem.settings, problem, folder)
@@ -263,13 +276,14 @@ class GaussianField(Model):
             names = [field.name for field in fields(traced)]
             changed = [f"traced.{name}" for name in names if getattr(traced, name) != getattr(default, name)]
             logger.warning("%s: no effect without a scene, whose paths are traced; give --scene", ", ".join(changed))
-        for split in splits:
+        # The last plan that is made is that of the part that is fitted first: plans of all would be in memory together.
+        for split in reversed(splits):
             # The first part of a fit, which takes no time: what it refuses is refused before a run folder exists.
-            record, rows = trained_part(problem.record, split)
-            plan = FitPlan(record, rows, problem.settings, scene=_scene(problem, rows))
+            plan = self._plan(problem, split)
             drawn = np.random.default_rng([plan.config.seed, 0])
-            placed = replace(record, receivers=plan.graph.receivers)
-            initial_gaussians(plan.config.initial, placed, rows.train, drawn)
+            placed = replace(plan.record, receivers=plan.graph.receivers)
+            initial_gaussians(plan.config.initial, placed, plan.split.train, drawn)
+            problem.checked.append(plan)
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> TrainConfig:
         """Settings with number of steps and scale of transmitters resolved."""
