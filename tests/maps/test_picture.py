@@ -65,7 +65,8 @@ def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
     place = {"position_m": [0.0, 0.0, 0.0], "std_m": [0.5, 0.25, 0.0]}
     (run.folder / "receiver_places.json").write_text(json.dumps({run.receivers[0].name: place}))
     amid = {f"receiver_{axis}": ("receiver", [float(dataset[axis].mean())]) for axis in "xy"}
-    estimated = map_figure(dataset.assign_coords(amid), run)
+    dataset = dataset.assign_coords(amid)
+    estimated = map_figure(dataset, run)
     (ellipse,) = estimated.axes[0].patches
     assert (ellipse.get_width(), ellipse.get_height()) == (1.0, 0.5)
     assert "open crosses: receivers at estimated places" in heading(estimated)
