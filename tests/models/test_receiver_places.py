@@ -121,6 +121,13 @@ def test_every_model_runs(model: str, tmp_path: Path) -> None:
         assert run.metrics["abs_error_db"]["mean"] - known.metrics["abs_error_db"]["mean"] < 0.5
 
 
+def test_maps_state_the_deviation_of_estimated_places(tmp_path: Path) -> None:
+    run = train(unmapped(building(), "lab"), "mri", out=tmp_path / "run")
+    mapped, place = run.map(step_m=1.0), run.metrics["receiver_places"]["lab"]
+    for axis, std_m in zip("xyz", place["std_m"], strict=True):
+        np.testing.assert_array_equal(mapped[f"receiver_{axis}_std"], [0, 0, std_m])
+
+
 def test_folds_locate_by_their_own_rows(tmp_path: Path) -> None:
     run = train(unmapped(building(), "lab"), "mri", out=tmp_path / "run", split="blocked")
     files = sorted(run.folder.glob("fold*/receiver_places.json"))
