@@ -136,6 +136,10 @@ class WithIntervals(Model):
         reception = Reception.from_arrays(under(INTERVALS, arrays), problem.record)
         return FittedWithIntervals(fitted, problem.record, arrays[ROWS], intervals, reception)
 
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """As the model."""
+        return self.model.uses_places(problem, splits)
+
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse rows that are too few to hold some out, and what the model refuses."""
         for split in splits:

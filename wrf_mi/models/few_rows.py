@@ -235,6 +235,10 @@ class WithFewRows(Model):
         of_model = {key: values for key, values in arrays.items() if not key.startswith(FEW)}
         return FittedWithFew(self.model.load(of_model, self._part(problem, numbers), folder), numbers, law)
 
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Whether the model does, or receivers have few rows, of which the law of distance needs the places of all."""
+        return self.model.uses_places(problem, splits) or bool(len(few_rows(problem.record, splits)))
+
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse what the model refuses of the receivers with enough rows."""
         numbers, _ = self._numbers(problem, splits)

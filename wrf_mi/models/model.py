@@ -284,6 +284,10 @@ class Model(ABC):
         """Whether it predicts signal strengths of receivers with few training rows, or none, from the others."""
         return False
 
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Whether its fits use positions of receivers; else those that nobody surveyed are not estimated."""
+        return True
+
     def serves(self, task: str) -> bool:
         """Whether it serves a task."""
         return self.tasks is None or task in self.tasks

@@ -62,7 +62,7 @@ logger = logging.getLogger(__name__)
 
 
 def plan_run(
-    dataset: str | Path | Record, request: RunRequest, progress: bool = False
+    dataset: str | Path | Record, request: RunRequest, progress: bool = False, on_progress: OnProgress = quiet
 ) -> tuple[Problem, RunConfig, list[Split]]:
     """Problem, configuration and splits of a run; errors as those of `train`. Nothing is written."""
     scene = None if request.scene is None else str(request.scene)
@@ -83,7 +83,7 @@ def plan_run(
     name = split.name if isinstance(split, Split) else split
     options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
     config = RunConfig(request.model, source, record.task, name, request.n_train, *options)
-    placed = placed_problem(problem.seen(splits[-1]), splits[-1].all_train)
+    placed = placed_problem(problem.seen(splits[-1]), splits[-1], config.entry, on_progress)
     config.entry.check(placed, splits)
     tell_places(placed)
     return problem, config, splits
@@ -258,7 +258,7 @@ def train(
     what = RunRequest(model, place, material, antennas, receiver, evaluation, split, n_train, seed, settings)
     request = replace(what, deterministic=deterministic, intervals=intervals, min_rows=min_rows, preset=preset)
     data = data if isinstance(data, str | Path | Record) else load_record(data)
-    problem, config, splits = plan_run(data, request, progress)
+    problem, config, splits = plan_run(data, request, progress, on_progress)
     warn_of_suspicions(problem.record)
     warn_of_left_out(problem.record, config.left_out, _least_rows(problem.record, request))
     _warn_of_known_rows(problem, splits)
@@ -343,7 +343,8 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
     folders = run_parts(folder)
     splits = [load_rows(part, problem.record) for part in folders]
     if not all((part / FITTED).exists() for part in folders):
-        problem.settings = config.entry.prepare(placed_problem(problem, splits[0].all_train), splits, session)
+        placed = placed_problem(problem, splits[0], config.entry, session.report)
+        problem.settings = config.entry.prepare(placed, splits, session)
         if problem.settings != config.settings:
             config = replace(config, settings=problem.settings)
             write_configs(folder, config, splits)
@@ -353,8 +354,9 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             before, start = checkpoint_seconds(part), time.perf_counter()
             # Matrices of a few hundred rows: threads of BLAS would mostly wait for each other.
             with threadpool_limits(1, "blas"):
-                placed = placed_problem(problem.seen(rows), rows.all_train)
-                fitted = config.entry.fit(placed, rows, session.of_part(part, folders))
+                of_part = session.of_part(part, folders)
+                placed = placed_problem(problem.seen(rows), rows, config.entry, of_part.report)
+                fitted = config.entry.fit(placed, rows, of_part)
             write_places(part, placed.record)
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)

@@ -26,6 +26,10 @@ class StrengthKriging(GenericKriging):
         """Whether strengths have a single, known carrier and settings ask for no other covariance."""
         return not problem.settings.is_generic and problem.record.frequencies_hz is not None
 
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Pooled kriging is about the law of distance."""
+        return self.pools_receivers(problem) or super().uses_places(problem, splits)
+
     def fit(self, problem: Problem, split: Split, session: FitSession) -> Fitted:
         """Kriging of all receivers together where they are pooled, else of each by itself."""
         if not self.pools_receivers(problem):

@@ -7,7 +7,7 @@ Cov(z(x), z(x')) = s^2 c(x, x') and Var(e) = s^2 noise. The covariance is shared
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, Any, Literal
@@ -18,12 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.optimize import minimize
 
-from ...core import InputError, Prediction, Receiver, Record
+from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings
 from ...tasks import task_of
 from ..error_prior import ErrorPrior, with_columns
-from ..model import Arrays
+from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
 
@@ -335,6 +335,10 @@ class GenericKriging(ByReceiverModel):
         """Whether the settings let headings count, which matter to strengths alone."""
         return settings.heading and task_of(record).in_decibel
 
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Whether its trend is a law of distance."""
+        return _trend_name(problem) == LOG_DISTANCE
+
     def fit_single(self, rows: ReceiverRows) -> Single:
         """Kriging of the observations themselves, see `kriged`."""
         return kriged(rows)
@@ -344,6 +348,10 @@ class GenericKriging(ByReceiverModel):
         if SCALE not in arrays:
             return Kriged.from_arrays(arrays, receiver)
         return UncertainKriged.from_arrays(arrays, receiver, noise=float(arrays["noise"]), scale=arrays[SCALE])
+
+
+def _trend_name(problem: Problem) -> str:
+    return problem.settings.trend or (LOG_DISTANCE if task_of(problem.record).in_decibel else CONSTANT)
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:
@@ -359,7 +367,7 @@ def kriged(rows: ReceiverRows) -> Kriged:
     s, record = rows.problem.settings, rows.problem.record
     if s.heading_length is not None and record.tx_heading_rad is None:
         raise InputError(f"{record.name}: has no headings for kriging's heading_length; omit the setting")
-    name = s.trend or (LOG_DISTANCE if task_of(record).in_decibel else CONSTANT)
+    name = _trend_name(rows.problem)
     if name not in (CONSTANT, LOG_DISTANCE):
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
     # The law of distance is that of the whole room: each row weighs the same in it, however dense the rows around it.
