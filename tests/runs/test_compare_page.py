@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -27,6 +28,7 @@ from wrf_mi.runs.api import plan_run, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.compare_page import changed_settings, command
 from wrf_mi.runs.compare_tables import (
+    NO_GAIN,
     OTHER_ROWS,
     best_run,
     common,
@@ -36,7 +38,7 @@ from wrf_mi.runs.compare_tables import (
     method_rows,
 )
 from wrf_mi.runs.folder import AntennaOptions, RunRequest, read_config, start_run
-from wrf_mi.runs.results import Results
+from wrf_mi.runs.results import Results, unbeaten
 from wrf_mi.runs.run import open_run
 
 
@@ -224,6 +226,23 @@ def test_commands_parse_and_give_the_same_configuration(folder: Path, flat_folde
         assert parsed.out == str(tmp_path / "it's a run")
         again = plan_run(parsed.dataset, training_request(parsed))[1]
         assert again == config, line
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_run_that_the_command_calls_no_better_than_a_constant_is_not_praised(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / name, noise=noise) for name, noise in (("constant", 0.1), ("fine", 0.1))]
+    block = {"median": 0.9, "mean": 0.9, "p10": 0.8, "p90": 1.0, "gain": 0.0, "gain_error": 0.1}
+    for run, beaten in zip(runs, (False, True), strict=True):
+        edit_metrics(constant=block | {"beaten": beaten})(run)
+    text = unescape(compare(runs, tmp_path / "out").read_text())
+    verdicts = {
+        row["run"]: row["verdict"] for row in rows_of(tmp_path / "out" / "differences.csv") if "IDW" in row["against"]
+    }
+    assert verdicts == {"constant": NO_GAIN, "fine": "better"}
+    assert text.count('class="better"') == 1
+    lines = [unbeaten(json.loads((run / "metrics.json").read_text())) for run in runs]
+    assert lines[1] is None
+    assert f"constant: {lines[0]}" in text
 
 
 @pytest.mark.usefixtures("undrawn")
