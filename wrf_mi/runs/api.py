@@ -43,8 +43,8 @@ from .folder import (
     RunRequest,
     Settings,
     check_new,
-    clear_begun,
     load_rows,
+    new_run_folder,
     run_parts,
     start_run,
     write_configs,
@@ -189,6 +189,7 @@ def train(
     scene: str | Path | Scene | None = None,
     *,
     out: str | Path | None = None,
+    overwrite: bool = False,
     preset: str | None = None,
     material: str | None = None,
     antennas: AntennaOptions = AS_STATED,
@@ -213,6 +214,7 @@ def train(
         model: name of the model, a key of `wrf_mi.models.MODELS`.
         scene: scene, or name, scene folder, Mitsuba XML or mesh to trace, for models that take one.
         out: run folder to make; must not exist or be empty. None: a temporary one, removed with the run.
+        overwrite: ``out`` may be that of a run, which is replaced.
         preset: settings by a name of `wrf_mi.models.Model.presets`, such as ``"fast"``; ``settings`` are beside them.
         material: radio material of a bare mesh.
         antennas: patterns and polarisations that override the data set; with a scene.
@@ -248,7 +250,7 @@ def train(
     20
     """
     if out is not None:
-        check_new(Path(out))
+        check_new(Path(out), overwrite)
     if deterministic:  # before anything is read: reading a data set may choose the GPU
         init("llvm", threads=1)
     place = scene.folder if isinstance(scene, Scene) else scene
@@ -262,16 +264,9 @@ def train(
     if config.deterministic:
         init("llvm", threads=1)
     folder = Path(tempfile.mkdtemp(prefix="wrf-mi-") if out is None else out)
-    folder.mkdir(parents=True, exist_ok=True)
-    with locked_folder(folder):
-        clear_begun(folder)
+    with new_run_folder(folder, overwrite):
         start_run(folder, config, splits)
-        try:
-            _complete(folder, config, problem, Session(folder, folder, on_progress, stop, scheduler, progress))
-        except InputError:
-            if not any(any(folder.rglob(name)) for name in (FITTED, CHECKPOINT)):
-                shutil.rmtree(folder)
-            raise
+        _complete(folder, config, problem, Session(folder, folder, on_progress, stop, scheduler, progress))
     run = Run(folder, problem.record, kept=scene)
     if out is None:
         weakref.finalize(run, shutil.rmtree, folder, ignore_errors=True)
