@@ -28,6 +28,7 @@ from .compare_tables import (
     COLUMNS,
     DIFFERENCES,
     METHODS,
+    NO_GAIN,
     OTHER_ROWS,
     WORSE,
     Difference,
@@ -115,7 +116,8 @@ The median comes first here, the verdicts below are of differences of means: the
 <p class="note">Each run against its reference{_text(others)}, on the test rows that both have: mean difference per row,
 positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of blocks of rows: clusters of their
 positions, since near rows resemble each other, or else stretches of consecutive rows. {BETTER} and {WORSE}: the
-interval excludes zero, in all seeds; else a tie. {OTHER_ROWS}: differences would be those of the training
+interval excludes zero, in all seeds; else a tie. {NO_GAIN}: the run would be {BETTER}, but is not better than the
+constant prediction. {OTHER_ROWS}: differences would be those of the training
 rows.{words}</p>
 {gains}
 {images}

@@ -33,7 +33,7 @@ METHODS |= {"mean": "mean, mean of seeds", "mean_sd": "its standard deviation"}
 METHODS |= {"difference": "difference from the best", "low": "95 % from", "high": "to"}
 """Columns of ``methods.csv`` and their headings on the page."""
 BETTER, TIE, WORSE, SAME, FEW = "better", "tie", "worse", "another seed", "too few rows"
-NO_GAIN = "above the other, but no better than a constant"
+NO_GAIN = "no better than a constant"
 OTHER_ROWS, UNKNOWN_ROWS = "not comparable: trained on other rows", "not comparable: training rows are not stored"
 FEWEST = 2  # least number of common rows of a difference with an interval
 MOST_BLOCKS, ROWS_OF_BLOCK, LEAST_BLOCKS = 20, 5, 10
