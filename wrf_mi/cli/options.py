@@ -136,6 +136,11 @@ def add_n_train(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--n-train", type=_number, metavar="N", help="number or fraction of the training rows to use")
 
 
+def add_replace(parser: argparse._ActionsContainer) -> None:
+    """Add ``--replace`` of commands that make a run folder."""
+    parser.add_argument("--replace", action="store_true", help="replace the run in --out")
+
+
 def add_scheduler(parser: argparse.ArgumentParser) -> None:
     """Add ``--scheduler``."""
     text = "workers: local, local:N (on this machine) or the address of a Dask scheduler, tcp://HOST:PORT"

@@ -44,9 +44,9 @@ from .folder import (
     RunRequest,
     Settings,
     check_new,
-    clear_begun,
     has_progress,
     load_rows,
+    new_run_folder,
     run_parts,
     start_run,
     write_configs,
@@ -191,6 +191,7 @@ def train(
     scene: str | Path | Scene | None = None,
     *,
     out: str | Path | None = None,
+    overwrite: bool = False,
     preset: str | None = None,
     material: str | None = None,
     antennas: AntennaOptions = AS_STATED,
@@ -215,6 +216,7 @@ def train(
         model: name of the model, a key of `wrf_mi.models.MODELS`.
         scene: scene, or name, scene folder, Mitsuba XML or mesh to trace, for models that take one.
         out: run folder to make; must not exist or be empty. None: a temporary one, removed with the run.
+        overwrite: ``out`` may be that of a run, which is replaced.
         preset: settings by a name of `wrf_mi.models.Model.presets`, such as ``"fast"``; ``settings`` are beside them.
         material: radio material of a bare mesh.
         antennas: patterns and polarisations that override the data set; with a scene.
@@ -251,7 +253,7 @@ def train(
     20
     """
     if out is not None:
-        check_new(Path(out))
+        check_new(Path(out), overwrite)
     if deterministic:  # before anything is read: reading a data set may choose the GPU
         init("llvm", threads=1)
     place = scene.folder if isinstance(scene, Scene) else scene
@@ -265,18 +267,11 @@ def train(
     if config.deterministic:
         init("llvm", threads=1)
     folder = Path(tempfile.mkdtemp(prefix="wrf-mi-") if out is None else out)
-    folder.mkdir(parents=True, exist_ok=True)
-    with locked_folder(folder):
-        clear_begun(folder)
+    with new_run_folder(folder, overwrite):
         start_run(folder, config, splits)
         session = Session(folder, folder, on_progress, stop, scheduler, progress)
-        try:
-            with _noting_resumption(folder):
-                _complete(folder, config, problem, session)
-        except InputError:
-            if not has_progress(folder):
-                shutil.rmtree(folder)
-            raise
+        with _noting_resumption(folder):
+            _complete(folder, config, problem, session)
     run = Run(folder, problem.record, kept=scene)
     if out is None:
         weakref.finalize(run, shutil.rmtree, folder, ignore_errors=True)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..core import AntennaOptions, InputError, Prediction, Record
 from ..core.array_files import stored_arrays
 from ..core.files import readable
-from ..core.locks import locked_folder
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.folder_files import read_csv
@@ -21,7 +20,7 @@ from ..models import MODELS
 from ..synthetic import load_record
 from ..tasks import TASKS
 from .evaluate import Scores, evaluate, pool, write_results
-from .folder import RunConfig, check_new, clear_begun, start_run
+from .folder import RunConfig, check_new, new_run_folder, start_run
 from .released_outputs import read_released
 from .run import Run
 
@@ -39,6 +38,7 @@ def score_predictions(
     split: str = "official",
     n_train: int | float | None = None,
     seed: int = 0,
+    overwrite: bool = False,
 ) -> Run:
     """Score predictions that another program made, in a run folder that `wrf_mi.compare` takes like its own.
 
@@ -56,6 +56,7 @@ def score_predictions(
         split: split on whose test rows the predictions are scored; they must not have been trained on.
         n_train: number or fraction of the training rows that the model had, as of `wrf_mi.train`.
         seed: seed of the split.
+        overwrite: ``out`` may be that of a run, which is replaced.
 
     Returns:
         The run, with its scores in ``metrics``; it cannot predict.
@@ -73,7 +74,7 @@ def score_predictions(
     record = data if isinstance(data, Record) else load_record(str(data))
     splits = make_splits(record, split, seed, n_train)
     path, folder = Path(predictions), Path(out)
-    check_new(folder)
+    check_new(folder, overwrite)
     arrays = _read(path, record)
     place = _places(path, arrays, record, np.unique(np.concatenate([part.test for part in splits])))
 
@@ -88,9 +89,7 @@ def score_predictions(
     stated: tuple[Any, ...] = (None, None, AntennaOptions(), False, False, {})
     config = RunConfig(name, source, record.task, split, n_train, seed, *stated)
     header = {"model": name, "dataset": source, "split": split, "seed": seed, "predictions": str(path)}
-    folder.mkdir(parents=True, exist_ok=True)
-    with locked_folder(folder):
-        clear_begun(folder)
+    with new_run_folder(folder, overwrite):
         start_run(folder, config, splits)
         write_results(folder, header | metrics | costs, scored)
     return Run(folder, record)
