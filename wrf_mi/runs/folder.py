@@ -44,7 +44,6 @@ from ..models.calibrated import WithIntervals
 from ..models.few_rows import with_few_rows
 from ..models.model import Arrays
 from ..tasks import TASKS
-from ..training.checkpoint import CHECKPOINT
 from ..training.fit_plan import check_rows
 from ..version import __version__
 
