@@ -10,8 +10,8 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from ...core import DataFault, InputError
-from ...core.files import one_line
-from ..unknown import STRENGTH, listed, long_columns, name_words
+from ...core.files import listed, one_line
+from ..unknown import STRENGTH, long_columns, name_words
 from .files import Table
 
 AFFIXES = ("", "coord", "coordinate", "pos", "position", "loc", "location", "point", "p", "gt", "true", "tag")
@@ -109,7 +109,7 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
 
 def shown_names(names: Sequence[str]) -> str:
     """The first names of columns, for a message."""
-    return one_line(listed(names, 12))
+    return one_line(listed(names))
 
 
 def named_columns(names: Sequence[str], stated: Mapping[str, str]) -> dict[str, str]:
