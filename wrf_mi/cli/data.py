@@ -126,7 +126,7 @@ def import_command(a: Arguments) -> int:
     report = import_measurements(a.files, a.out, a.replace, **options)
     check = check_data(a.out)
     facts = summary(report.record)
-    next_command = f"wrf-mi train {a.out}"
+    next_command = f"wrf-mi train {a.out} [--scene SCENE] --out RUN"
     values: dict[str, Any] = {"folder": str(report.folder), "columns": report.columns, "notes": report.notes}
     values |= {"summary": facts, "check": check.as_dict(), "next": next_command}
     rows = f"{a.out}: {facts['rows']} rows, {len(facts['receivers'])} receivers; plan.png shows them"
