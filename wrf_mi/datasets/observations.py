@@ -70,6 +70,15 @@ def warn_of_left_out(record: Record, left_out: Mapping[str, int], least: int = L
         logger.warning(text, record.name, least, named)
 
 
+def warn_of_one_place(record: Record, splits: Sequence[Split]) -> None:
+    """Log a split whose training rows, two or more, are all at one place."""
+    for split in splits if record.has_positions else ():
+        rows = split.all_train
+        if len(rows) > 1 and (record.tx_pos_m[rows] == record.tx_pos_m[rows[0]]).all():
+            text = "%s, split %s: all of %d training rows are at one place, which tells nothing of others; %s"
+            logger.warning(text, record.name, split.name, len(rows), "measure at more places")
+
+
 def check_observations(record: Record, split: Split, complete: bool = False, may_be_silent: bool = False) -> None:
     """Refuse training rows that cannot be learned from, and uplinks that nothing can be predicted from.
 
