@@ -121,7 +121,8 @@ def test_train_prints_a_table_and_progress_elsewhere(folder: Path, tmp_path: Pat
     assert where == f"results: {out_folder}"
     assert (metrics["model"], metrics["seed"], metrics["steps"]) == ("wrf-gs", 3, 4)
     assert re.fullmatch(
-        r"training 4/4  loss 0\.\d+  SSIM -?\d\.\d+ \(validation rows, now trained on\)  8 Gaussians  0:00 left\n", err
+        r"training 4/4  loss 0\.\d+  SSIM -?\d\.\d+ \(2 validation rows, now trained on\)  8 Gaussians  0:00 left\n",
+        err,
     )
 
 
@@ -272,6 +273,9 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.Capt
     with Watch() as watch:
         watch.on_progress("training", 0.25, progress())
         watch.on_progress("training", 0.5, progress(step=20, validation_score=0.5))
+        of_rows = {"validation_rows": 9, "validation_m": 0.05, "test_m": 0.17}
+        watch.on_progress("fold0", 0.5, progress(step=20, validation_score=0.95, **of_rows))
+        watch.on_progress("paths", 0.5, progress(step=20, validation_score=0.95, **of_rows, far_score=0.79))
         watch.on_progress("fold1", 0.5, progress(step=20, validation_score=0.75, held_out=False))
         watch.on_progress("fold2", 0.5, progress(step=20, validation_score=float("nan")))
         watch.on_progress("vae", 0.5, progress(step=20, validation_score=0.5, gaussians=0))
@@ -279,6 +283,10 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.Capt
             watch.on_progress(stage, share)
     assert capsys.readouterr().err.splitlines() == [
         "training 20/40  loss 0.2500  SSIM 0.500 (validation rows)  8 Gaussians  1:01 left",
+        "fold0 20/40  loss 0.2500  SSIM 0.950 (9 validation rows, median 0.05 m from training rows, test rows 0.17 m)"
+        "  8 Gaussians  1:01 left",
+        "paths 20/40  loss 0.2500  SSIM 0.950 (9 validation rows, median 0.05 m from training rows, test rows 0.17 m; "
+        "0.790 of those as far as test rows)  8 Gaussians  1:01 left",
         "fold1 20/40  loss 0.2500  SSIM 0.750 (validation rows, now trained on)  8 Gaussians  1:01 left",
         "fold2 20/40  loss 0.2500    8 Gaussians  1:01 left",
         "vae 20/40  loss 0.2500  SSIM 0.500 (validation rows)  1:01 left",

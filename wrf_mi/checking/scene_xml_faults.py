@@ -16,7 +16,7 @@ from defusedxml.common import DefusedXmlException
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from ..core import InputError
-from ..core.files import MOST_NAME, inside, one_line
+from ..core.files import MOST_NAME, inside, listed, one_line
 from ..core.memory import require_memory
 from ..scene.folder import FACTS_FILE
 from ..scene.scattering import SCATTERING, check_scattering, stated_scattering
@@ -370,7 +370,7 @@ def _material(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
     if not materials:
         yield Finding("no-material", path, name, "has no material", GIVE)
     if len(materials) > 1:
-        text = f"has {len(materials)} materials: {', '.join(identifier for identifier, _ in materials)}"
+        text = f"has {len(materials)} materials: {listed(identifier for identifier, _ in materials)}"
         yield Finding("two-materials", path, name, text, "leave one of them")
     for identifier, bsdf in materials:
         if bsdf is None:

@@ -11,6 +11,7 @@ from scipy.constants import speed_of_light
 
 from ..core import Record
 from ..core.angles import FloatArray
+from ..core.files import listed
 
 Found = Iterator[tuple[str, str]]  # name and text of suspicions
 
@@ -183,7 +184,7 @@ def strength_scale(record: Record) -> Found:
             scale = _scale(observed[np.concatenate([parts[part] for part in above])])
             wrong.setdefault((" and ".join(above), scale), []).append(receiver.name)
     for (part, scale), names in wrong.items():
-        yield "strengths", f"signal strengths in {part} of {', '.join(names)} are {scale}"
+        yield "strengths", f"signal strengths in {part} of {listed(names)} are {scale}"
 
 
 def is_above_0_dbm(observed: NDArray[Any]) -> bool:

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 if TYPE_CHECKING:
     from ..training.loop import Progress as FitProgress
-
+from ..core.files import listed
 
 QUANTITIES = ("median", "mean", "p10", "p90")
 
@@ -98,7 +98,7 @@ def _show_receivers(metrics: dict[str, Any]) -> None:
         print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
     for key, what in (("receivers_with_few_rows", "few training rows"), ("receivers_left_out", "too few, left out")):
         if key in metrics:
-            named = ", ".join(f"{name} ({rows})" for name, rows in metrics[key].items())
+            named = listed(f"{name} ({rows})" for name, rows in metrics[key].items())
             print(f"receivers with {what} (number): {named}")
     for name, place in metrics.get("receiver_places", {}).items():
         axes = zip("xyz", place["position_m"], place["std_m"], strict=True)
@@ -208,10 +208,21 @@ class Watch:
 
     def _text(self, p: FitProgress) -> str:
         if p.validation_score is not None and not math.isnan(p.validation_score):  # NaN without validation rows
-            rows = "validation rows" if p.held_out else "validation rows, now trained on"
-            self._score = f"{p.label} {p.validation_score:.3f} ({rows})"
+            self._score = f"{p.label} {p.validation_score:.3f} ({_validation_text(p)})"
         gaussians = f"{p.gaussians} Gaussians  " if p.gaussians else ""
         return f"loss {p.loss:.4f}  {self._score}  {gaussians}{_minutes(p.left_s)}"
+
+
+def _validation_text(p: FitProgress) -> str:
+    """The rows that are scored in training, and how far from training rows they and the test rows are."""
+    text = f"{p.validation_rows or ''} validation rows".strip()
+    if not p.held_out:
+        return f"{text}, now trained on"
+    if p.validation_m is not None:
+        text += f", median {p.validation_m:.2g} m from training rows"
+    if p.test_m is not None:
+        text += f", test rows {p.test_m:.2g} m"
+    return text if p.far_score is None else f"{text}; {p.far_score:.3f} of those as far as test rows"
 
 
 def _minutes(left_s: float) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..core import DataFault, InputError
-from ..core.files import one_line, text_lines
+from ..core.files import listed, one_line, text_lines
 
 WANTED = (
     "a data set is a folder with receivers.csv, train.csv and test.csv (signal strengths), with "
@@ -35,7 +35,6 @@ RECEIVER = (
     *("pci", "node", "device", "ssid", "id", "name"),
 )
 """Words in the names of columns that tell receivers apart, the most particular first."""
-SHOWN = 8  # columns or files that a message names
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def unknown_data(path: Path, inner: Sequence[Path] = ()) -> InputError:
     content = sorted(path.iterdir())
     if not content:
         return DataFault(path, f"an empty folder; {WANTED}")
-    names = one_line(listed([file.name for file in content], SHOWN, ","))
+    names = one_line(listed([file.name for file in content], mark=","))
     holding = f"holds {names} and is no data set itself"
     if inner:
         return DataFault(path, f"{holding}; give {one_line(inner[0])}")
@@ -69,7 +68,7 @@ def table_text(table: Table) -> str:
     """What a table lacks as signal strengths, and the command that makes a data set of it."""
     kind = "" if long_columns(table.header) is None else ", a row for each reading"
     remedy = f"make a data set of it by wrf-mi data import {one_line(table.name)} --out FOLDER"
-    columns = one_line(listed(table.header, SHOWN, ","))
+    columns = one_line(listed(table.header, mark=","))
     return f"{table.name} has the columns {columns}{kind}; {TABLE}: {remedy}"
 
 
@@ -108,8 +107,3 @@ def _read_header(file: Path) -> Table | None:
     except (InputError, csv.Error):
         return None
     return Table(file.name, tuple(header)) if len(header) > 1 else None
-
-
-def listed(names: Sequence[str], most: int = 6, mark: str = ", ") -> str:
-    """The first names, and the number of the others."""
-    return mark.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

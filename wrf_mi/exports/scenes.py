@@ -13,7 +13,7 @@ import trimesh
 from wrf_mi_scenes.mitsuba_xml import ABSORBER, COLOURS, OTHER_COLOUR, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
-from ..core.files import atomic_folder, one_line, write_atomically
+from ..core.files import atomic_folder, listed, one_line, write_atomically
 from ..core.types import IntArray
 from ..runs.scene_view import surfaces_of
 from ..scene.coordinates import Y_UP
@@ -115,7 +115,7 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
         write_atomically(folder / LOOKS, scene_xml(materials, looks=True))
         text = json.dumps({"frequency_hz": frequency_hz, "materials": exported.facts}, indent=1)
         write_atomically(folder / FACTS, f"{text}\n")
-    fixed = ", ".join(exported.constants) or "none"
+    fixed = listed(exported.constants) or "none"
     return {"surfaces": len(parts), "materials": len(exported.facts), f"constants at {frequency_hz / 1e9:g} GHz": fixed}
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.carriers import carriers_text
+from ..core.files import listed
 from ..datasets.observations import count_not_finite, place_of
 from ..tasks import task_of
 from .model import Inputs
@@ -44,7 +45,7 @@ def check_held_receivers(record: Record, split: Split, method: Model, others: It
     if not split.held_receivers:
         return
     if not {*split.held_receivers} < {*range(len(record.receivers))}:
-        numbers = ", ".join(map(str, split.held_receivers))
+        numbers = listed(map(str, split.held_receivers))
         text = f"split {split.name} holds out receivers {numbers} of {len(record.receivers)}"
         raise InputError(f"{place_of(record)}: {text}; leave some to train on")
     if not task_of(record).in_decibel:

@@ -36,7 +36,7 @@ from threadpoolctl import threadpool_limits
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
-from ..core.files import readable, write_atomically
+from ..core.files import listed, readable, write_atomically
 from ..core.types import IntArray
 from ..tasks import task_of
 from ..tasks.scores import REAL_90
@@ -338,7 +338,7 @@ def check_placeable(problem: Problem, splits: Sequence[Split]) -> None:
         received = np.isfinite(record.seen(split).observation[:, split.all_train])
         lacking = [k for k, receiver in enumerate(record.receivers) if not (receiver.is_surveyed or received[k].any())]
         if lacking:
-            names = ", ".join(record.receivers[number].name for number in lacking)
+            names = listed(record.receivers[number].name for number in lacking)
             text = f"position of receiver {names} unknown, without a training row in split {split.name}"
             raise InputError(f"{record.source or record.name}: {text}; give x, y, z, or omit --scene")
 

@@ -23,7 +23,14 @@ from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
 from ..core.settings import setting_texts
 from ..datasets import make_splits
-from ..datasets.observations import LEAST_ROWS, check_observations, fitted_receivers, place_of, warn_of_left_out
+from ..datasets.observations import (
+    LEAST_ROWS,
+    check_observations,
+    fitted_receivers,
+    place_of,
+    warn_of_left_out,
+    warn_of_one_place,
+)
 from ..datasets.splits import NONE, default_split, splits_below
 from ..models import MODELS, Model, Problem, Session, known_model
 from ..models.checks import check_held_receivers, check_record
@@ -263,6 +270,7 @@ def train(
     problem, config, splits = plan_run(data, request, progress, on_progress)
     warn_of_suspicions(problem.record)
     warn_of_left_out(problem.record, config.left_out, _least_rows(problem.record, request))
+    warn_of_one_place(problem.record, splits)
     _warn_of_known_rows(problem, splits)
     if config.deterministic:
         init("llvm", threads=1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core import AntennaOptions, InputError, Prediction, Record
 from ..core.array_files import stored_arrays
-from ..core.files import readable
+from ..core.files import listed, readable
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.folder_files import read_csv
@@ -129,7 +129,9 @@ def _in_order(path: Path, arrays: dict[str, NDArray[Any]], record: Record) -> di
     names = [str(name) for name in arrays["receiver_name"]]
     asked = [receiver.name for receiver in record.receivers]
     if sorted(names) != sorted(asked):
-        raise InputError(f"{path}: receivers {', '.join(names)}; {record.name} has {', '.join(asked)}")
+        # Names that the other lacks come first: they would be cut off among hundreds.
+        unknown, lacking = (sorted(of, key=others.__contains__) for of, others in ((names, asked), (asked, names)))
+        raise InputError(f"{path}: receivers {listed(unknown)}; {record.name} has {listed(lacking)}")
     order = [names.index(receiver) for receiver in asked]
     return {key: arrays[key][order] for key in ("prediction", "std") if key in arrays}
 

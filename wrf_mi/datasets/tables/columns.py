@@ -10,8 +10,8 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from ...core import DataFault, InputError
-from ...core.files import one_line
-from ..unknown import SENT, STRENGTH, listed, long_columns, name_words, preferred
+from ...core.files import listed, one_line
+from ..unknown import SENT, STRENGTH, long_columns, name_words, preferred
 from .files import Table
 
 AFFIXES = ("", "coord", "coordinate", "pos", "position", "loc", "location", "point", "p", "gt", "true", "tag")
@@ -126,7 +126,7 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
 
 def shown_names(names: Sequence[str]) -> str:
     """The first names of columns, for a message."""
-    return one_line(listed(names, 12))
+    return one_line(listed(names))
 
 
 def named_columns(names: Sequence[str], stated: Mapping[str, str]) -> dict[str, str]:

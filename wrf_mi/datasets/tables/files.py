@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
-from ...core.files import one_line, readable
+from ...core.files import listed, one_line, readable
 from ..folder_files import SINGLE_MAX
 from ..receivers_file import plain_id
-from ..unknown import listed
 
 Frame = Any  # pandas.DataFrame, which is imported where it is used
 

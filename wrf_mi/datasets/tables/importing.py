@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from ...core import DataFault, InputError, Receiver, Record
 from ...core.angles import FloatArray
-from ...core.files import one_line
+from ...core.files import listed, one_line
 from ...core.types import IntArray
 from ..ble_folder import CARRIER_HZ, write_ble_folder
-from ..unknown import SENT, listed, name_words
+from ..unknown import SENT, name_words
 from .columns import HERTZ, described, find_columns, parsed_columns, unit_of
 from .files import Table, joined, read_table
 from .options import ImportOptions, option_name
@@ -314,8 +314,8 @@ class _Import:
         means = mean_strengths(readings, place, places, options.average)
         groups = virtual_networks(readings.ids, means.dbm)
         if groups:
-            names = "; ".join(listed([readings.ids[number] for number in group]) for group in groups[:3])
-            text = f"{sum(map(len, groups))} addresses are networks of {len(groups)} radios ({names})"
+            names = listed(readings.ids[number] for number in groups[0])
+            text = f"{sum(map(len, groups))} addresses are networks of {len(groups)} radios (the first: {names})"
             self.notes.append(text + (": merged" if options.merge_radios else "; --merge-radios makes them one"))
             if options.merge_radios:
                 readings = merged(readings, groups)
@@ -427,9 +427,7 @@ def _plan_picture(record: Record) -> bytes:
         axes.annotate(name, place[:2], (5, 3), textcoords="offset points", fontsize="small")
     title = f"{record.name}: strongest receiver of each row"
     if (~surveyed).any():
-        several = (~surveyed).sum() > MOST_NAMED
-        unknown = str((~surveyed).sum()) if several else ", ".join(names[~surveyed])
-        title = f"{title}\n" + textwrap.fill(f"receivers at unknown places: {unknown}", 90)
+        title = f"{title}\n" + textwrap.fill(f"receivers at unknown places: {listed(names[~surveyed])}", 90)
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     axes.set_title(title, fontsize="medium")
     figure.legend(loc="outside lower center", ncols=4, fontsize="small")

@@ -14,11 +14,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ...core.angles import FloatArray
-from ...core.files import one_line
+from ...core.files import listed, one_line
 from ...core.types import IntArray
 from ..receivers_file import plain_id
 from ..sentinels import CUSTOMARY_DBM, suspicious_values
-from ..unknown import listed
 from .columns import MAC, METRES, RANGES, Columns, unit_of
 from .files import Table, package
 
@@ -272,7 +271,7 @@ def further_columns(
         values |= {f"{quantity}_{normal_id(receiver_id)}{unit}": column for receiver_id, column in means.items()}
     values |= {one_line(name): _of_places(table, name, place) for name in columns.kept}
     if values:
-        notes.append(f"kept as columns that no model uses: {listed(list(values))}")
+        notes.append(f"kept as columns that no model uses: {listed(values)}")
     return {_free(name): column for name, column in values.items()}, list(dict.fromkeys(notes))
 
 

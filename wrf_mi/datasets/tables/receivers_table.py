@@ -13,9 +13,10 @@ from ...core import DataFault, Receiver
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.carriers import FREQUENCY
+from ...core.files import listed
 from ..folder_files import CsvTable
 from ..receivers_file import COLUMNS, TX_COLUMNS, read_antennas, read_orientations, receiver_of
-from ..unknown import RECEIVER, listed, name_words
+from ..unknown import RECEIVER, name_words
 from .columns import named_columns, shown_names, unit_of
 from .files import Table
 from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale

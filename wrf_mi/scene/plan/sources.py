@@ -19,7 +19,7 @@ from scipy import ndimage
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.array_files import stored_arrays
-from ...core.files import inside, one_line, text_lines
+from ...core.files import inside, listed, one_line, text_lines
 from ...datasets.folder_files import read_columns
 from .pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES, WHITE, read_pixels, read_sheet
 
@@ -207,7 +207,7 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
     if "log_odds" in numbers:
         return _grid_of_arrays(path, {**content, **numbers}, resolution_m, row_0)
     if "xy_m" not in numbers:
-        text = f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}"
+        text = f"{path}: has neither log_odds nor xy_m but {listed(content) or 'nothing'}"
         raise InputError(f"{text}; give one of them")
     if row_0 is not None:
         raise _no_rows(path, "it holds points, which have no rows")

@@ -15,8 +15,8 @@ from rich.progress import Progress
 
 from ...core import Antenna, InputError, Paths, Receiver
 from ...core.antenna import ANTENNA
+from ...core.files import listed
 from ...core.types import FloatArray, IntArray
-from ...datasets.unknown import listed
 from ..options import DEFAULTS, MAX_RAYS, TraceOptions
 from ..search.chains import Legs, ReflectionChains, check_search, join, shoot
 from ..search.devices import before_surfaces, check_devices, from_behind

@@ -26,7 +26,7 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 from ... import backend
 from ...core import InputError
 from ...core.angles import FloatArray
-from ...core.files import one_line
+from ...core.files import listed, one_line
 from ...core.yaml_files import read_yaml
 from ...scene.coordinates import require_near, warn_of_up
 from ...scene.folder import FACTS_FILE, read_scene_folder, scene_file
@@ -292,7 +292,7 @@ def reason(error: Exception) -> str:
         if text.endswith("Pattern() takes no arguments"):  # which gets every property that the material does not know
             text = f"a radio material has an unknown property; known are {', '.join(PROPERTIES)}"
     elif unknown := re.findall(r'^\s*- (\w+ "[^"]*")', text, re.MULTILINE):
-        text = f"unknown property {', '.join(unknown)}"
+        text = f"unknown property {listed(unknown)}"
     return one_line(PLACE.sub("", text))
 
 
