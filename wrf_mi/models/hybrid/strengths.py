@@ -31,7 +31,7 @@ from ...tracing.tracer import check_polarization
 from ...training.by_distance import unit_means
 from ...training.selection import HeldOut, hold_out
 from ..held_out import HeldOutPrediction, held_out_predictions
-from ..interpolation.by_task import STOPS, StrengthKriging
+from ..interpolation.by_task import StrengthKriging
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from ..model import Arrays, Model, Problem, Session
 from .scene_side import MEAN, SCENE, SceneSide, corrected, in_scene, inside, write_reports
@@ -136,7 +136,7 @@ class StrengthsInScene(Model):
     """
 
     name, source, settings = "strengths", StrengthKriging.source, object
-    tasks, gaps = ("rssi",), (STOPS,)
+    tasks, gaps = ("rssi",), StrengthKriging.gaps
     scene, uplink, headings = "required", "optional", True
     several_carriers, new_receivers = True, True
 

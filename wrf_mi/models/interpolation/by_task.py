@@ -11,7 +11,7 @@ from ..model import Arrays, Fitted, Model, Problem, known_positions
 from .diffuse import ChannelKriging
 from .kriging import GenericKriging, KrigingSettings
 from .spectra import SpectrumKriging, SpectrumKrigingSettings
-from .strengths import Strengths, StrengthSettings, fit_strengths
+from .strengths import EXACT, Strengths, StrengthSettings, fit_strengths
 
 STOPS = "stop.value_dbm"
 """Array of pooled strengths, which generic kriging has not: readings, NaN where a receiver did not report at a stop."""
@@ -20,7 +20,7 @@ STOPS = "stop.value_dbm"
 class StrengthKriging(GenericKriging):
     """Kriging of signal strengths, pooled over receivers where a single, known carrier states free space."""
 
-    settings, new_receivers, gaps = StrengthSettings, True, (STOPS,)
+    settings, new_receivers, gaps = StrengthSettings, True, (STOPS, EXACT)
 
     def pools_receivers(self, problem: Problem) -> bool:
         """Whether strengths have a single, known carrier and settings ask for no other covariance."""

@@ -49,6 +49,7 @@ EXPONENT_SD = (1.0, 0.3)
 TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
 BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
+EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ class Strengths(Fitted):
         if prior.traced is not None:
             arrays |= field_arrays(prior.traced.local if prior.traced.exact else prior.traced, "map.")
             if prior.traced.exact:
-                arrays["exact.traced_dbm"] = prior.traced.traced_dbm(stops.poses.position_m)
+                arrays[EXACT] = prior.traced.traced_dbm(stops.poses.position_m)
         return {name: np.asarray(value) for name, value in arrays.items()}
 
     @classmethod
@@ -201,10 +202,10 @@ class Strengths(Fitted):
             from ...tracing.power_map import PowerMap, TracedPower  # the tracer is imported where there is a scene
 
             traced = from_field_arrays(PowerMap, arrays, "map.")
-            if "exact.traced_dbm" in arrays:
+            if EXACT in arrays:
                 assert trace is not None
                 positions_m = arrays["stop.position_m"]
-                power_dbm = arrays["exact.traced_dbm"].T
+                power_dbm = arrays[EXACT].T
                 known = dict(zip(map(np.ndarray.tobytes, positions_m), power_dbm, strict=True))
                 traced = TracedPower(traced, trace, np.arange(power_dbm.shape[1]), known, keeps=False)
         transmit_dbm, frequency_hz = float(arrays["base"][0]), arrays["base"][1:]
