@@ -220,7 +220,7 @@ def reference_network(weights: dict[str, np.ndarray], parts: dict[str, np.ndarra
 
 
 def test_wrf_gs_plus_adds_offsets_of_its_network():
-    """Signal = static + offset; rotation likewise before it is normalised; scale in its logarithm."""
+    """Signal = static + offset; rotation likewise before it is normalised; scale in its logarithm, bounded."""
     field, n, batch = WrfGsPlus(width=40), 3, 2
     weights = {name: values.astype(float) for name, values in start(field, n).items()}
     tx = np.random.default_rng(9).standard_normal((3, batch))
@@ -228,6 +228,7 @@ def test_wrf_gs_plus_adds_offsets_of_its_network():
     position, transmitter = paper_encoding(weights["position"], 10), paper_encoding(tx, 10)
     pairs = {"position": np.tile(position, batch), "transmitter": np.repeat(transmitter, n, axis=1)}
     offsets = reference_network(weights, pairs)
+    offsets["scale"] = offsets["scale"] / np.sqrt(1 + offsets["scale"] ** 2)
     for name, static, rows in (
         ("signal", "signal", g.signal),
         ("rotation", "rotation", g.rotation),

@@ -12,7 +12,7 @@ from calling import contents, copied
 from commands import Command, arrays_in
 from small_fits import settings, stop_after
 
-from wrf_mi.core import InputError
+from wrf_mi.core import InputError, Prediction
 from wrf_mi.core.array_files import stored_array, stored_arrays, write_arrays
 from wrf_mi.core.files import remove_leftovers
 from wrf_mi.core.locks import LOCK, alone_in_process, locked_folder
@@ -148,6 +148,14 @@ def test_a_checkpoint_of_other_arrays_is_refused(change: str, stopped: Path, tmp
     write_arrays(file, arrays, checksum=True)
     with pytest.raises(InputError, match="train the run anew"):
         resume(tmp_path / "run")
+
+
+def test_infinite_predictions_are_refused(kriging: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = open_run(kriging)
+    infinite = Prediction(np.full(1, np.inf, np.float32))
+    monkeypatch.setattr(run.fitted, "predict", lambda inputs, receiver: infinite)
+    with pytest.raises(InputError, match="predictions are infinite, as parameters are too large; train it anew"):
+        run.predict(np.zeros((1, 3)), receiver=0)
 
 
 def test_sizes_are_checked_before_they_are_allocated(tmp_path: Path) -> None:

@@ -61,6 +61,13 @@ def test_lobes_of_any_kind_are_learned(model: str, kind: str, tmp_path: Path) ->
     check(model, SIZE, kind, tmp_path / "run")
 
 
+def test_few_steps_do_not_make_narrow_lobes_black(tmp_path: Path) -> None:
+    """Counted by pixels alone, the many dark ones would have all of them dark within these steps."""
+    settings = (*OF_FIELD, "steps=400")
+    metrics = wrf_mi.train(lobes(SIZE, width_deg=15.0), "wrf-gs", out=tmp_path / "run", settings=settings).metrics
+    assert metrics[VARIATION]["ratio"] > LEAST_VARIATION
+
+
 def test_lobes_are_learned_by_rays(tmp_path: Path) -> None:
     check("nerf2", SIZES[0], "one lobe", tmp_path / "run")
 

@@ -353,8 +353,8 @@ def warnings_of(metrics: dict[str, Any]) -> list[str]:
         lines.append(f"{what}: {task.label}, {', '.join(both)} ({gain}); see docs/data.md, Scores")
     if changes is not None and changes["ratio"] < LEAST_VARIATION:
         what = f"{metrics['model']} predicts nearly the same at all positions: standard deviation over the test rows"
-        both = f"{changes['prediction']:.2g}, of the truth {changes['truth']:.2g}"
-        lines.append(f"{what} {both}; do not use it to tell positions apart")
+        deviations = f"{changes['prediction']:.2g}, of the truth {changes['truth']:.2g}"
+        lines.append(f"{what} {deviations}; do not use it to tell positions apart")
     return lines
 
 

@@ -256,7 +256,7 @@ class GaussianField(Model):
     def _plan(self, problem: Problem, split: Split) -> FitPlan:
         """Plan of a fit, taken from `check` where data, rows, settings and scene are the same."""
         (record, rows), scene = trained_part(problem.record, split), _scene(problem, split)
-        config, known = problem.settings.resolved(record.tx_pos_m[rows.all_train]), list(problem.checked)
+        config, known = problem.settings.resolved(record.tx_pos_m[rows.all_train]), list[FitPlan](problem.checked)
         problem.checked.clear()  # a training changes the graph of its plan
         for plan in known:
             same = plan.record is record and plan.config == config and plan.graph.scene is scene
