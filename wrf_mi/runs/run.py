@@ -87,7 +87,8 @@ class Run:
         config = self.config
         scene = (config.scene, config.material) if self.scene is None else (str(self.scene), None)
         data, left_out = self.record or config.dataset, tuple(config.left_out)
-        problem = Problem(data, config.settings, config.seed, *scene, config.antennas, self.operator, left_out)
+        stated = None if config.stated is None else frozenset(config.stated)
+        problem = Problem(data, config.settings, config.seed, *scene, config.antennas, self.operator, left_out, stated)
         return stored_problem(problem, self.folder)
 
     @cached_property

@@ -208,7 +208,7 @@ def test_search_lowers_the_held_out_error() -> None:
     record = made(120, noise_db=1.0, body_db=3.0)
     wrong = replace(DEFAULTS, shadow_db=12.0, shadow_m=0.2)
     settings = wrong, replace(wrong, search_rows=50)
-    before, after = (fit_strengths(record, np.arange(120), None, one).facts()["fitted"] for one in settings)
+    before, after = (fit_strengths(record, np.arange(120), None, one, stated=()).facts()["fitted"] for one in settings)
     assert after["held_out_db"] < before["held_out_db"] - 0.1
     assert after["shadow_db"] < 12
 

@@ -13,7 +13,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -40,8 +40,10 @@ from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, 
 from .scene_side import (
     FAST,
     FIELD,
+    MEAN,
     RESIDUAL,
     STAGES,
+    SURFACES,
     InScene,
     SceneSide,
     StageReport,
@@ -62,7 +64,8 @@ class HybridSettings(CheckedSettings):
     #: null: all that the data allow; without a scene the field, which takes minutes and which interpolation surpasses
     #: near measurements, is used where it is named
     stages: str | None = None
-    #: optimiser steps of the graph of paths and Gaussians; null: the default of `TrainConfig` for the task
+    #: optimiser steps of the graph of paths and Gaussians, or, without a scene, of the field; null: the default of
+    #: `TrainConfig` for the task
     steps: Annotated[int | None, Field(ge=1, description="1 or more")] = None
     deterministic: bool = False  #: bit-identical results from run to run, on one thread of the CPU
 
@@ -84,6 +87,18 @@ def scene_side(record: Record) -> tuple[Model, Model]:
     return TracedStages(), InScene()
 
 
+def _stages_of(problem: Problem) -> dict[str, str]:
+    """Stages that do not apply to a problem's data, and why."""
+    record = problem.record
+    if record.uplink is not None:
+        return dict.fromkeys(set(STAGES) - {MEAN, RESIDUAL}, "data with an uplink have mean and residual alone")
+    if problem.scene is None:
+        return dict.fromkeys(set(STAGES) - {FIELD, RESIDUAL}, "it is of a scene; give --scene")
+    if isinstance(scene_side(record)[0], TracedStrengths):
+        return dict.fromkeys((SURFACES, FIELD), "strengths are kriged about the local mean of traced power")
+    return {}
+
+
 def parts_of(problem: Problem, split: Split) -> dict[str, tuple[Model, Problem]]:
     """Entry and problem of each part that serves the data, the trusted one first (InputError: none does)."""
     parts: dict[str, tuple[Model, Problem]] = {}
@@ -100,7 +115,8 @@ def _means(problem: Problem) -> list[tuple[str, bool]]:
     """Names of the parts but for kriging, and whether they are given the scene."""
     settings, with_scene, means = problem.settings, problem.scene is not None, list[tuple[str, bool]]()
     if problem.record.uplink is not None:
-        means = [("r2f2-scene", True)] * with_scene + [(name, False) for name in UPLINK_PARTS]
+        of_uplink = [("r2f2-scene", True)] * with_scene + [(name, False) for name in UPLINK_PARTS]
+        means = of_uplink if MEAN in settings.wanted else []
     elif with_scene and task_of(problem.record).receiver_with_scene and {*settings.wanted} - {RESIDUAL}:
         means = [(PATHS, True)]
     if not with_scene and settings.stages is not None and FIELD in settings.wanted:
@@ -115,7 +131,10 @@ def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
     model = {FIELD: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
     entry = MODELS[model].serving(problem.record.task, scene)
     arguments = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
-    inner = replace(problem, dataset=problem.record, settings=default_settings(entry, (), arguments))
+    # Without a scene the hybrid's steps are those of the field.
+    steps = [f"steps={problem.settings.steps}"] if name == FIELD and problem.settings.steps else []
+    settings = default_settings(entry, steps, arguments)
+    inner = replace(problem, dataset=problem.record, settings=settings, stated=frozenset())
     entry = with_few_rows(entry, problem.record.task)
     return entry, inner if scene else replace(inner, scene=None, material=None)
 
@@ -335,12 +354,24 @@ class Hybrid(Model):
         reception = Reception.from_arrays(arrays, problem.record)
         return FittedHybrid(problem, arrays["known"], parts, mixture, residuals, intervals, facts, reception)
 
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Steps where no stage trains step by step, and stages of which none that applies by default is left out."""
+        idle, wanted, unused = _stages_of(problem), {*problem.settings.wanted}, dict[str, str]()
+        trained = [name for name, _ in _means(problem) if name == FIELD or (name == PATHS and FIELD not in idle)]
+        if not trained:
+            unused["steps"] = "no stage is trained step by step"
+        by_default = {*STAGES} - {*idle} - ({FIELD} if problem.scene is None else set())
+        if wanted & {*idle} and wanted - {*idle} == by_default:
+            unused["stages"] = f"the stages that these data have, {', '.join(sorted(by_default))}, are used by default"
+        return unused
+
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse unknown positions, and data that no part can be fitted to."""
-        settings, learned = problem.settings, {FIELD, RESIDUAL}
-        if settings.stages is not None and problem.record.uplink is None:
-            if problem.scene is None and not learned & {*settings.wanted}:
-                raise InputError(f"--stages {settings.stages}: of a scene; give --scene, or name field or residual")
+        settings, idle = problem.settings, _stages_of(problem)
+        if "stages" in problem.stated_settings:
+            for stage in settings.wanted:
+                if stage in idle:
+                    raise InputError(f"--stages {settings.stages}: {stage} has no effect: {idle[stage]}; omit it")
             if problem.scene is not None and {*settings.wanted} == {RESIDUAL}:
                 raise InputError(f"--scene {problem.scene}: not used by --stages {RESIDUAL}; omit one of them")
         for split in splits:

@@ -7,8 +7,8 @@ Cov(z(x), z(x')) = s^2 c(x, x') and Var(e) = s^2 noise. The covariance is shared
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -18,12 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.optimize import minimize
 
-from ...core import InputError, Prediction, Receiver, Record
+from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
-from ...core.settings import CheckedSettings
+from ...core.settings import CheckedSettings, names_of
 from ...tasks import task_of
 from ..error_prior import ErrorPrior, with_columns
-from ..model import Arrays
+from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
 
@@ -317,11 +317,14 @@ class KrigingSettings(CovarianceSettings):
     generic: bool = False
     heading: bool = True
 
-    @property
-    def is_generic(self) -> bool:
-        """Whether `generic` or any setting that only generic kriging has differs from its default."""
-        only = [setting for setting in fields(KrigingSettings) if setting.name != "heading"]
-        return any(getattr(self, setting.name) != setting.default for setting in only)
+
+GENERIC_ONLY = names_of(KrigingSettings) - {"generic", "heading"}
+"""Settings that only generic kriging has."""
+
+
+def asks_generic(problem: Problem) -> bool:
+    """Whether `KrigingSettings.generic` is set, or settings are stated that only generic kriging has."""
+    return problem.settings.generic or bool(GENERIC_ONLY & problem.stated_settings)
 
 
 class GenericKriging(ByReceiverModel):
@@ -334,6 +337,20 @@ class GenericKriging(ByReceiverModel):
     def takes_headings(self, record: Record, settings: KrigingSettings) -> bool:
         """Whether the settings let headings count, which matter to strengths alone."""
         return settings.heading and task_of(record).in_decibel
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of headings that do not count, and a choice of rows for a likelihood without free parameters."""
+        s, record, unused = problem.settings, problem.record, dict[str, str]()
+        turns = record.tx_heading_rad is not None and self.takes_headings(record, replace(s, heading=True))
+        if not turns:
+            unused["heading"] = "transmitters' headings are unknown, or do not count for such data"
+        if not (turns and s.heading):
+            unused["heading_length"] = "headings do not count"
+        if None not in (s.length_m, s.noise, *([s.heading_length] if turns and s.heading else [])):
+            unused["likelihood_rows"] = "lengths and noise are stated"
+        if "generic" in problem.stated_settings and not s.generic:
+            unused |= dict.fromkeys(GENERIC_ONLY, "generic=false")
+        return unused
 
     def fit_single(self, rows: ReceiverRows) -> Single:
         """Kriging of the observations themselves, see `kriged`."""

@@ -15,7 +15,7 @@ JASA 84 (the weights).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -29,7 +29,7 @@ from ...core.types import IntArray
 from ...parallel.threads import on_threads
 from ...tasks.scores import REAL_90
 from .kriging_equations import KrigingSystem
-from .strength_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, Stops, basis
+from .strength_terms import NEAREST_M, NOISE, PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced
@@ -46,6 +46,8 @@ FOLDS = 7
 STRETCH = (4, 150)
 """Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
 BUFFER = 0.25  # share of a stretch that is left out on either side of it, as consecutive rows share noise
+SEARCHED, SEARCHED_OF_HEADINGS = ("shadow_db", "shadow_m", *PARTS_OF_NOISE), ("body_db", "body_m", "lever_m")
+"""Hyperparameters that the search may change, the latter where headings count."""
 LEAST_GAIN_DB = 0.005  # least reduction of the held-out error by which the search changes a parameter
 MOST_STEPS = 5  # steps of one parameter in one direction
 TRUST = 500.0  # number of held-out values that weigh as much as the prior in estimates from their distribution
@@ -226,12 +228,14 @@ class StrengthPosterior:
         return expected + columns @ self._process.beta + field
 
 
-def by_likelihood(prior: PriorMean, stops: Stops, start: Hyperparameters) -> tuple[PriorMean, Hyperparameters]:
+def by_likelihood(
+    prior: PriorMean, stops: Stops, start: Hyperparameters, stated: Collection[str] = ()
+) -> tuple[PriorMean, Hyperparameters]:
     """Mean and hyperparameters over an area larger than the rooms that ``start`` is for.
 
     Shadowing, noise and the deviation of the receivers' patterns, which may be sectors, have the greatest posterior
     density. The length is a priori the geometric mean of the stops' spacing and half of their extent, uncertain by a
-    factor e.
+    factor e. Hyperparameters that are ``stated`` hold.
     """
     stops, few = stops.thinned(LIKELIHOOD_STOPS), prior
     if prior.traced is None and len(prior.receivers_m) > LIKELIHOOD_RECEIVERS:
@@ -246,16 +250,25 @@ def by_likelihood(prior: PriorMean, stops: Stops, start: Hyperparameters) -> tup
 
     def at(logarithms: FloatArray, prior: PriorMean) -> tuple[PriorMean, Hyperparameters]:
         shadow_db, shadow_m, noise_db, rx_sd_db = map(float, np.exp(logarithms))
-        field = replace(start, shadow_db=shadow_db, shadow_m=shadow_m, drift_db=noise_db, noise_db=noise_db)
+        chosen = {"shadow_db": shadow_db, "shadow_m": shadow_m, "drift_db": noise_db, "noise_db": noise_db}
+        field = replace(start, **{name: value for name, value in chosen.items() if name not in stated})
         return replace(prior, rx_sd_db=rx_sd_db), field
 
-    def cost(logarithms: FloatArray) -> float:
-        fit = StrengthPosterior(*at(logarithms, few), ratio, stops)
-        return fit.cost + float(np.square((logarithms - middle) / deviation).sum())
+    parts = (("shadow_db",), ("shadow_m",), PARTS_OF_NOISE)
+    free = np.array([*(not {*names} <= {*stated} for names in parts), True])
 
-    simplex = np.vstack([middle, middle + np.diag(deviation)])
+    def every(chosen: FloatArray) -> FloatArray:
+        logarithms = middle.copy()
+        logarithms[free] = chosen
+        return logarithms
+
+    def cost(chosen: FloatArray) -> float:
+        fit = StrengthPosterior(*at(every(chosen), few), ratio, stops)
+        return fit.cost + float(np.square((chosen - middle[free]) / deviation[free]).sum())
+
+    simplex = np.vstack([middle[free], middle[free] + np.diag(deviation[free])])
     options = {"initial_simplex": simplex, "maxfev": LIKELIHOOD_STEPS, "xatol": 0.05, "fatol": 0.1}
-    return at(minimize(cost, middle, method="Nelder-Mead", options=options).x, prior)
+    return at(every(minimize(cost, middle[free], method="Nelder-Mead", options=options).x), prior)
 
 
 def scales(position_m: FloatArray) -> tuple[float, float]:
@@ -334,10 +347,12 @@ class Fit:
         # Shrunk towards 1 in the logarithm: the spread of few residuals is chance.
         self.ratio = np.clip(spread / np.median(spread), *RATIO) ** (count / (count + TRUST))
 
-    def search(self, hyperparameters: Hyperparameters, on_progress: Callable[[float], None]) -> Hyperparameters:
+    def search(
+        self, hyperparameters: Hyperparameters, stated: Collection[str], on_progress: Callable[[float], None]
+    ) -> Hyperparameters:
         """Change one parameter at a time while that lowers the mean absolute held-out error by `LEAST_GAIN_DB`.
 
-        One pass through all parameters; ``on_progress`` takes the fraction done.
+        One pass through all parameters that are not ``stated``; ``on_progress`` takes the fraction done.
         """
 
         def error_db(candidate: Hyperparameters) -> float:
@@ -345,15 +360,14 @@ class Fit:
 
         names = ["shadow_db", "shadow_m", NOISE]
         if self._measured.poses.heading_rad is not None:
-            names += ["body_db", "body_m", "lever_m"]
+            names += SEARCHED_OF_HEADINGS
         # Each error fits all folds anew, a Cholesky factor for every receiver: only a few steps are affordable.
         best = error_db(hyperparameters)
         for done, name in enumerate(names, start=1):
             for sign in (1, -1):
                 for _ in range(MOST_STEPS):
-                    candidate = hyperparameters.changed(name, sign)
-                    error = error_db(candidate)
-                    if error > best - LEAST_GAIN_DB:
+                    candidate = hyperparameters.changed(name, sign, stated)
+                    if candidate == hyperparameters or (error := error_db(candidate)) > best - LEAST_GAIN_DB:
                         break
                     best, hyperparameters = error, candidate
             on_progress(done / len(names))

@@ -7,7 +7,7 @@ held-out stretches of the training rows (`strength_fit`). Terms that all receive
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -15,18 +15,30 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Prediction, Record
+from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray
+from ...core.settings import changed, names_of
 from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS
 from ...tasks import require
 from ...training.session import OnProgress, quiet
 from ..error_prior import ErrorPrior, with_columns
-from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
+from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays
 from .by_receiver import finite_positions
 from .kriging import KrigingSettings
-from .strength_fit import AREA_M, Fit, PriorMean, StrengthPosterior, by_likelihood, scales, shift_of, widening
-from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
+from .strength_fit import (
+    AREA_M,
+    SEARCHED,
+    SEARCHED_OF_HEADINGS,
+    Fit,
+    PriorMean,
+    StrengthPosterior,
+    by_likelihood,
+    scales,
+    shift_of,
+    widening,
+)
+from .strength_terms import OF_HEADINGS, Hyperparameters, Measured, Poses, Stops, stops_of
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced, Tracer
@@ -51,7 +63,9 @@ RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each re
 
 @dataclass(frozen=True)
 class StrengthSettings(KrigingSettings, Hyperparameters):
-    """Settings of kriging of signal strengths; hyperparameters are those at the start of the search.
+    """Settings of kriging of signal strengths.
+
+    Hyperparameters that are stated hold; others are those at the start of a search, or priors of a likelihood.
 
     Attributes:
         transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
@@ -70,8 +84,26 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
 
     @property
     def hyperparameters(self) -> Hyperparameters:
-        """Start of the search."""
+        """Stated hyperparameters, and the start of a search for the others."""
         return Hyperparameters(**{each.name: getattr(self, each.name) for each in fields(Hyperparameters)})
+
+
+POOLED_ONLY = names_of(StrengthSettings) - names_of(KrigingSettings)
+"""Settings that kriging of each receiver alone lacks."""
+
+
+def unused_of_pooled(problem: Problem, splits: Sequence[Split]) -> dict[str, str]:
+    """Settings without effect on pooled strengths: of headings that do not count, and of a search that is not made."""
+    s, record, unused = problem.settings, problem.record, dict[str, str]()
+    turns = s.heading and record.tx_heading_rad is not None
+    if not turns:
+        unused = dict.fromkeys(OF_HEADINGS, "headings do not count")
+    searched = [*SEARCHED, *(SEARCHED_OF_HEADINGS if turns else ())]
+    if problem.stated_settings.issuperset(searched):
+        unused["search_rows"] = "all hyperparameters of the search are stated"
+    elif all(scales(record.tx_pos_m[split.all_train])[1] > AREA_M for split in splits):
+        unused["search_rows"] = f"rows extend over more than {AREA_M:g} m, where no search chooses hyperparameters"
+    return unused
 
 
 @dataclass(eq=False, repr=False)
@@ -219,6 +251,7 @@ def fit_strengths(
     power_map: Traced | None = None,
     settings: StrengthSettings = StrengthSettings(),
     on_progress: OnProgress = quiet,
+    stated: Collection[str] | None = None,
 ) -> Strengths:
     """Fit signal strengths to some rows of a record; nothing is drawn, so there is no seed.
 
@@ -228,6 +261,8 @@ def fit_strengths(
         power_map: traced power, a local mean or at positions themselves; None: free space is expected.
         settings: settings.
         on_progress: progress callback.
+        stated: names of the hyperparameters that hold, whatever a search or likelihood chooses for the others; None:
+            those that differ from their defaults.
 
     Raises:
         InputError: a record of another task or without its carrier, or neither rows nor a map.
@@ -245,7 +280,7 @@ def fit_strengths(
     poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
     measured = Measured(poses, values, rows, record.precision(rows))
     prior = _prior(record, measured, power_map, settings)
-    hyperparameters = settings.hyperparameters
+    hyperparameters, stated = settings.hyperparameters, changed(settings) if stated is None else stated
 
     def join(rows: Measured, factor: float = 1.0) -> Stops:
         stops = stops_of(rows, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
@@ -257,12 +292,12 @@ def fit_strengths(
     shift, facts = skew_db, {"rows": float(len(rows))}
     if len(rows) > 1:
         if scales(poses.position_m)[1] > AREA_M:
-            prior, hyperparameters = by_likelihood(prior, join(measured), hyperparameters)
+            prior, hyperparameters = by_likelihood(prior, join(measured), hyperparameters, stated)
         elif len(rows) >= settings.search_rows:
             search = Fit(prior, measured, partial(join, factor=WIDER))
             search.set_ratio(hyperparameters)
             hyperparameters = search.search(
-                hyperparameters, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
+                hyperparameters, stated, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
             )
         fit = Fit(prior, measured, join)
         fit.set_ratio(hyperparameters)
