@@ -53,6 +53,9 @@ class FittedWithIntervals(Fitted):
     def _stated(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
         distance_m = self._distance(tx_pos_m, receiver)
         stated = self._intervals(prediction.mean, expected_size(task_of(self._record), prediction), distance_m)
+        if prediction.std_mean is not None:  # deviations of the mean are as wrong as those of readings
+            factor = stated.stated_std / prediction.stated_std
+            stated = replace(stated, std_mean=prediction.std_mean * factor)
         return stated if self._reception is None else self._reception(stated, tx_pos_m, receiver)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:

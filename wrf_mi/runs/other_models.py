@@ -23,6 +23,7 @@ from ..tasks import TASKS
 from .evaluate import Scores, evaluate, pool, write_results
 from .folder import RunConfig, check_new, clear_begun, start_run
 from .released_outputs import read_released
+from .results import STD_MEAN
 from .run import Run
 
 REMEDY = "store row [m] and prediction [n_rx, m, ...] as predictions.npz of a run has them"
@@ -79,7 +80,8 @@ def score_predictions(
 
     def predict(rows: IntArray, receiver: int) -> Prediction:
         at = place[rows]
-        return Prediction(arrays["prediction"][receiver, at], arrays["std"][receiver, at] if "std" in arrays else None)
+        stated = {name: arrays[name][receiver, at] for name in ("std", STD_MEAN) if name in arrays}
+        return Prediction(arrays["prediction"][receiver, at], **stated)
 
     scores: list[Scores] = [evaluate(record, part, predict) for part in splits]
     metrics, scored = scores[0] if len(scores) == 1 else pool(scores)

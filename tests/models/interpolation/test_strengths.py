@@ -10,7 +10,8 @@ from changed_folders import needs
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.models.interpolation import strengths
-from wrf_mi.models.interpolation.strength_fit import PooledProcess, ReceiverObservations, folds, shift_of, widening
+from wrf_mi.models.interpolation.pooled_process import PooledProcess, ReceiverObservations
+from wrf_mi.models.interpolation.strength_fit import folds, shift_of, widening
 from wrf_mi.models.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
 from wrf_mi.models.interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from wrf_mi.models.model import Inputs

@@ -149,11 +149,15 @@ class UncertainKriged(Kriged):
         return np.asarray(self.weights / np.diag(self._system.precision)[:, None])
 
     def prediction(self, tx_pos: FloatArray) -> Prediction:
-        """Observations and standard deviations at positions [m, 3], metres."""
+        """Observations, and standard deviations of these and of their mean, at positions [m, 3], metres."""
         mean, length_m = self.predict(tx_pos), self.lengths[0]
         cross = correlation(tx_pos / length_m, self.positions_m / length_m, self.kernel)
-        unknown = self.noise + self._system.variance(1.0, cross, self.trend(tx_pos))
-        return Prediction(mean, (np.sqrt(unknown)[:, None] * self.scale).reshape(mean.shape))
+        of_mean = self._system.variance(1.0, cross, self.trend(tx_pos))
+        std, std_mean = (
+            (np.sqrt(variance)[:, None] * self.scale).reshape(mean.shape)
+            for variance in (of_mean + self.noise, of_mean)
+        )
+        return Prediction(mean, std, std_mean=std_mean)
 
     def facts(self) -> dict[str, Any]:
         """Form, correlation length and noise."""

@@ -30,12 +30,14 @@ from .strength_fit import (
     AREA_M,
     SEARCHED,
     SEARCHED_OF_HEADINGS,
+    UNSCALED,
     Fit,
     PriorMean,
     StrengthPosterior,
     by_likelihood,
     scales,
     shift_of,
+    variance_scale,
     widening,
 )
 from .strength_terms import OF_HEADINGS, Hyperparameters, Measured, Poses, Stops, stops_of
@@ -108,7 +110,7 @@ def unused_of_pooled(problem: Problem, splits: Sequence[Split]) -> dict[str, str
 
 @dataclass(eq=False, repr=False)
 class Strengths(Fitted):
-    """Fitted signal strengths; made by `fit_strengths`. Standard deviations are those of a single report."""
+    """Fitted signal strengths; made by `fit_strengths`."""
 
     field: StrengthPosterior
     shift_db: float
@@ -120,19 +122,21 @@ class Strengths(Fitted):
         self.uses_heading = self.field.headings
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Signal strengths in dBm and their standard deviations, see `Fitted`.
+        """Signal strengths in dBm with standard deviations of a reading and of the local mean power, see `Fitted`.
 
         Raises:
             InputError: positions that are not known.
         """
         position_m = finite_positions(inputs, "kriging")
-        mean, std = np.empty((2, len(position_m)))
+        mean, std, std_mean = np.empty((3, len(position_m)))
+        noise = self.field.noise(receiver) * self.widen[receiver] ** 2
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
             means, variances = zip(*self.field.predict(poses, receiver), strict=True)
             # Of unknown headings: variance within each, and between their means.
             variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
-            mean[rows], std[rows] = np.mean(means, axis=0) + self.shift_db, np.sqrt(variance)
-        return Prediction(mean, std)
+            mean[rows] = np.mean(means, axis=0) + self.shift_db
+            std[rows], std_mean[rows] = np.sqrt(variance + noise), np.sqrt(variance)
+        return Prediction(mean, std, std_mean=std_mean)
 
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict` in a fraction of its time: variances take the most of that."""
@@ -158,7 +162,7 @@ class Strengths(Fitted):
 
     def error_prior(self, receiver: int) -> ErrorPrior:
         """Shadowing and the uncertain terms of the mean, about the stops of the training rows."""
-        field, widen = self.field, self.widen[receiver] ** 2
+        field, widen = self.field, self.field.scale[0] * self.widen[receiver] ** 2
         h, received = field.hyperparameters, np.isfinite(field.stops.value_dbm[receiver])
         # Headings of a plan are not known: the part of the field that depends on them is noise there.
         turned = h.body_db**2 if field.headings else 0.0
@@ -172,7 +176,7 @@ class Strengths(Fitted):
 
         deviation = field.prior.columns(field.stops.poses.take(np.zeros(0, np.int64)), receiver)[2]
         noise = h.drift_db**2 + h.noise_db**2 / field.stops.count[receiver, received]
-        scale = widen * field.ratio[receiver] ** 2
+        scale = self.widen[receiver] ** 2 * field.scale[1] * field.ratio[receiver] ** 2
         return ErrorPrior(
             with_columns(covariance, columns, deviation),
             field.stops.poses.position_m[received],
@@ -193,6 +197,7 @@ class Strengths(Fitted):
             "prior.rx": prior.rx_sd_db,
             "ratio": field.ratio,
             "rounds": field.rounds,
+            "scale": field.scale,
             "shift_db": self.shift_db,
             "widen": self.widen,
             "fact.name": np.array(list(self.fit_facts)),
@@ -225,7 +230,8 @@ class Strengths(Fitted):
         poses = from_field_arrays(Poses, arrays, "stop.")
         stops = Stops(poses, *(arrays[f"stop.{name}"] for name in ("value_dbm", "count", "row")))
         hyperparameters = from_field_arrays(Hyperparameters, arrays, "knob.")
-        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]))
+        scale = arrays.get("scale", UNSCALED)  # earlier versions stored none
+        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]), scale)
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         return cls(field, float(arrays["shift_db"]), arrays["widen"], facts)
 
@@ -240,6 +246,9 @@ class Strengths(Fitted):
             "noise_ratio": [float(ratio) for ratio in self.field.ratio],
             "shift_db": self.shift_db,
             "widen": [float(factor) for factor in self.widen],
+            "noise_of_reading_db": [
+                float(np.sqrt(self.field.noise(k)) * factor) for k, factor in enumerate(self.widen)
+            ],
             **self.fit_facts,
         }
         return {"fitted": fitted}
@@ -286,12 +295,13 @@ def fit_strengths(
         stops = stops_of(rows, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
         return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(values))))
 
-    ratio, widen = np.ones((2, len(values)))
+    (ratio, widen), scale = np.ones((2, len(values))), UNSCALED
     # Traces at exact positions have no fades left in what they do not predict.
     skew_db = 0.0 if power_map is not None and power_map.exact else SKEW_DB
     shift, facts = skew_db, {"rows": float(len(rows))}
     if len(rows) > 1:
-        if scales(poses.position_m)[1] > AREA_M:
+        over_area = scales(poses.position_m)[1] > AREA_M
+        if over_area:
             prior, hyperparameters = by_likelihood(prior, join(measured), hyperparameters, stated)
         elif len(rows) >= settings.search_rows:
             search = Fit(prior, measured, partial(join, factor=WIDER))
@@ -301,6 +311,8 @@ def fit_strengths(
             )
         fit = Fit(prior, measured, join)
         fit.set_ratio(hyperparameters)
+        if not over_area:  # there the hyperparameters are those of a likelihood
+            fit.scale = scale = variance_scale(prior, join(measured), hyperparameters, stated)
         on_progress("strengths: held-out rows", 0.8)
         mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
         residual = values - mean
@@ -314,7 +326,7 @@ def fit_strengths(
         if np.isfinite(residual).any():
             facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
     on_progress("strengths: all rows", 0.9)
-    field = StrengthPosterior(prior, hyperparameters, ratio, join(measured), ROBUST_ROUNDS)
+    field = StrengthPosterior(prior, hyperparameters, ratio, join(measured), ROBUST_ROUNDS, scale)
     on_progress("strengths: all rows", 1.0)
     return Strengths(field, shift, widen, facts)
 
