@@ -112,7 +112,7 @@ def _read_npz(path: Path, record: Record) -> dict[str, NDArray[Any]]:
         raise InputError(f"{path}: no array prediction; {REMEDY}")
     task, number = TASKS[record.task], len(record.receivers)
     expected = record.observation.shape[2:]
-    for key in {"prediction", "std"} & arrays.keys():
+    for key in {"prediction", "std", STD_MEAN} & arrays.keys():
         values = arrays[key]
         if number == 1 and values.shape[1:] == expected:
             values = values[None]
@@ -134,7 +134,7 @@ def _in_order(path: Path, arrays: dict[str, NDArray[Any]], record: Record) -> di
     if sorted(names) != sorted(asked):
         raise InputError(f"{path}: receivers {', '.join(names)}; {record.name} has {', '.join(asked)}")
     order = [names.index(receiver) for receiver in asked]
-    return {key: arrays[key][order] for key in ("prediction", "std") if key in arrays}
+    return {key: arrays[key][order] for key in ("prediction", "std", STD_MEAN) if key in arrays}
 
 
 def _read_csv(path: Path, record: Record) -> dict[str, NDArray[Any]]:
@@ -147,9 +147,10 @@ def _read_csv(path: Path, record: Record) -> dict[str, NDArray[Any]]:
     if lacking := [column for column in wanted if column not in table.header]:
         raise InputError(f"{path}: no column {lacking[0]}; give one of each receiver of {place_of(record)}")
     arrays = {"prediction": np.stack([table.numbers(column) for column in wanted])}
-    deviations = [f"{name}_std_db" for name in names]
-    if all(column in table.header for column in deviations):
-        arrays["std"] = np.stack([table.numbers(column) for column in deviations])
+    for key in ("std", STD_MEAN):
+        deviations = [f"{name}_{key}_db" for name in names]
+        if all(column in table.header for column in deviations):
+            arrays[key] = np.stack([table.numbers(column) for column in deviations])
     if "row" in table.header:
         return arrays | {"row": table.numbers("row")}
     return arrays | {"tx_pos": np.stack([table.numbers(axis) for axis in "xyz"], axis=-1)}

@@ -168,7 +168,7 @@ def write_prediction_file(
         return write_predictions(out, arrays | observations)
     # A list, as receivers may have equal names.
     columns: list[tuple[str, Any]] = [*zip("xyz", inputs.tx_pos_m.T, strict=True), *stated]
-    deviations = ("std", "std_db"), (STD_MEAN, "std_mean_db")
+    deviations = ("std", "std_db"), (STD_MEAN, f"{STD_MEAN}_db")
     for key, suffix in (("prediction", "dbm"), *deviations, (RECEPTION, "received")):
         if key in observations:
             columns += [(f"{name}_{suffix}", v) for name, v in zip(receivers, observations[key], strict=True)]
