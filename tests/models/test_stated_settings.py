@@ -267,3 +267,31 @@ def test_stated_default_of_generic_kriging_chooses_it() -> None:
     assert not MODELS["kriging"].serving("rssi", with_scene=False).pools_receivers(problem)
     with pytest.raises(InputError, match=r"setting shadow_m=2.0: .* kriged alone with kernel; omit it"):
         plan_run(strengths(), request("kriging", ["kernel=exponential", "shadow_m=2"]))
+
+
+@pytest.mark.parametrize(
+    ("model", "name", "settings"),
+    [
+        ("nerf2", "strengths", "batch=16"),
+        ("nerf2", "channels with an uplink", "tx_octaves=4"),
+        ("nerf2", "spectra of an unknown array", "sphere_rays=64"),
+        ("nerf2", "strengths", "networks.skip=8"),
+        ("fire", "channels with an uplink", "batch=256 sample=row"),
+        ("fire", "channels with an uplink", "spacing_hz=1e6"),
+        ("r2f2", "channels with an uplink", "depth=5"),
+        ("wrf-gs", "strengths", "optimiser.opacity=0.02"),
+        ("wrf-gs", "strengths", "network.terms=0"),
+        ("wrf-gs+", "strengths", "loss.ssim_weight=0.2"),
+        ("wrf-gs+", "strengths", "density.start=0.05"),
+        ("wrf-gs+", "strengths", "view.components=6"),
+        ("wrf-gs+", "spectra of an unknown array", "optimiser.level=0.02"),
+        ("wrf-gs+", "spectra of an unknown array", "traced.depth=3"),
+        ("factorised", "strengths", "encoding.position_octaves=4"),
+        ("kriging", "strengths", "body_m=1.5"),
+        ("kriging", "strengths over an area", "search_rows=500"),
+        ("trees", "strengths", "heading=true"),
+    ],
+)
+def test_setting_that_a_fit_replaces_or_leaves_is_refused(model: str, name: str, settings: str) -> None:
+    stated = dict(text.split("=") for text in settings.split())
+    assert refused_setting(model, RECORDS[name](), stated) == next(iter(stated))
