@@ -47,7 +47,7 @@ def test_settings_of_kinds_of_path_that_are_not_traced_have_no_effect(settings: 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--phase-error", "1"], "phase_error=1: no effect on ray-tracing of .*: spectra alone are expectations"),
+        (["--phase-error", "1"], "phase_error=1.0: no effect on ray-tracing of .*: spectra alone are expectations"),
         (["--calibrate", "gain", "--scheduler", "local:1"], "--scheduler has no effect beside --calibrate"),
         (["--material", "concrete"], "radio materials of its own"),
         (["--target-error", "1", "--depth", "3"], "--depth is chosen by --target-error"),
@@ -91,7 +91,6 @@ def test_seed_of_a_trace_without_rays_is_that_of_a_drawn_split(flat_folder: Path
         ("--model idw --stages mean", "--stages belongs to --model hybrid, not to idw; omit it"),
         ("--stages mean,surfaces", "--stages mean,surfaces: mean has no effect: it is of a scene; give --scene"),
         ("--stages mean,field --scene {room}", "field has no effect: strengths are kriged about the local mean"),
-        ("--preset fast", "preset: no effect on hybrid of .*: the stages that these data have, residual, are used"),
         ("--set steps=9", "setting steps=9: no effect on hybrid of .*: no stage is trained step by step"),
         ("--model idw --set power=1 --set power=2", "setting power: stated as 1 and as 2; give one of both"),
         ("--model wrf-gs --seed 1 --set seed=2", "setting seed: 2, where the argument is 1; give one of both"),

@@ -41,8 +41,8 @@ def _names(models: Sequence[Model], form: str) -> str:
     return form.format(", ".join(model.name for model in models)) if models else ""
 
 
-def check_stated(method: Model, problem: Problem, splits: Sequence[Split], preset: Iterable[str] = ()) -> None:
-    """Refuse settings that are stated, or a preset whose settings all, have no effect on a fit; raises InputError."""
+def check_stated(method: Model, problem: Problem, splits: Sequence[Split]) -> None:
+    """Refuse settings that are stated and have no effect on a fit; raises InputError."""
     unused, values = method.unused_settings(problem, splits), dict(flat(asdict(problem.settings)))
 
     def reason(name: str) -> str | None:
@@ -53,9 +53,6 @@ def check_stated(method: Model, problem: Problem, splits: Sequence[Split], prese
     for name in values:
         if name in problem.stated_settings and (why := reason(name)):
             raise InputError(f"setting {name}={values[name]}: no effect on {place}: {why}; omit it")
-    reasons = [reason(name) for name in preset]
-    if reasons and all(reasons):
-        raise InputError(f"preset: no effect on {place}: {reasons[0]}; omit it")
 
 
 def check_held_receivers(record: Record, split: Split, method: Model, others: Iterable[Model]) -> None:

@@ -85,8 +85,7 @@ def plan_run(
     config = RunConfig(request.model, source, record.task, name, request.n_train, *options, names)
     placed = placed_problem(problem.seen(splits[-1]), splits[-1].all_train)
     config.entry.check(placed, splits)
-    preset = stated_values(settings, _preset(model, request.preset))
-    check_stated(model, placed, splits, set(preset) - (stated or set()))
+    check_stated(model, placed, splits)
     tell_places(placed)
     return problem, config, splits
 

@@ -169,7 +169,7 @@ class Run:
         every = [self.predict_inputs(inputs, number) for number in numbers]
         joined = _joined(every, np.concatenate if of_one else np.stack)
         names = tuple(known[number].name for number in numbers)
-        places = {"tx_pos_m": inputs.tx_pos_m, "receiver_names": names}
+        places: dict[str, Any] = {"tx_pos_m": inputs.tx_pos_m, "receiver_names": names}
         return LabelledPrediction(**joined, **places, task=self.config.task, of_one=of_one)
 
     def score(self, split: str | None = None) -> dict[str, Any]:

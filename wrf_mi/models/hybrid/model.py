@@ -364,15 +364,10 @@ class Hybrid(Model):
         return FittedHybrid(problem, arrays["known"], parts, mixture, residuals, intervals, facts, reception)
 
     def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
-        """Steps where no stage trains step by step, and stages of which none that applies by default is left out."""
-        idle, wanted, unused = _stages_of(problem), {*problem.settings.wanted}, dict[str, str]()
+        """Steps where no stage trains step by step."""
+        idle = _stages_of(problem)
         trained = [name for name, _ in _means(problem) if name == FIELD or (name == PATHS and FIELD not in idle)]
-        if not trained:
-            unused["steps"] = "no stage is trained step by step"
-        by_default = {*STAGES} - {*idle} - ({FIELD} if problem.scene is None else set())
-        if wanted & {*idle} and wanted - {*idle} == by_default:
-            unused["stages"] = f"the stages that these data have, {', '.join(sorted(by_default))}, are used by default"
-        return unused
+        return {} if trained else {"steps": "no stage is trained step by step"}
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse unknown positions, and data that no part can be fitted to."""
