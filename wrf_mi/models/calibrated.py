@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -134,6 +134,10 @@ class WithIntervals(Model):
         for split in splits:
             _fold(self.model, problem, split)
         self.model.check(problem, splits)
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """As of the model."""
+        return self.model.unused_settings(problem, splits)
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> Any:
         """Settings of the model without open choices."""

@@ -85,7 +85,7 @@ def plan_run(
     config = RunConfig(request.model, source, record.task, name, request.n_train, *options, names)
     placed = placed_problem(problem.seen(splits[-1]), splits[-1].all_train)
     config.entry.check(placed, splits)
-    check_stated(model, placed, splits)
+    check_stated(config.entry, placed, splits)
     tell_places(placed)
     return problem, config, splits
 

@@ -58,8 +58,7 @@ def validates(splits: Sequence[Split]) -> bool:
 def unused_of_loop(config: LoopConfig, has_validation: bool) -> dict[str, str]:
     """Settings of the training loop without an effect where no samples choose the state, and why."""
     if not has_validation:
-        names = ("holdout_steps_fraction", "patience", "validate_every")
-        return dict.fromkeys(names, "no training row is kept for validation")
+        return dict.fromkeys(("holdout_steps_fraction", "patience"), "no training row is kept for validation")
     return {} if config.holdout_steps_fraction else {"patience": "holdout_steps_fraction=0 leaves no validation rows"}
 
 

@@ -347,9 +347,10 @@ class GenericKriging(ByReceiverModel):
         s, record, unused = problem.settings, problem.record, dict[str, str]()
         turns = record.tx_heading_rad is not None and self.takes_headings(record, replace(s, heading=True))
         if not turns:
-            unused["heading"] = "transmitters' headings are unknown, or do not count for such data"
-        if not (turns and s.heading):
-            unused["heading_length"] = "headings do not count"
+            why = "the data have no headings" if record.tx_heading_rad is None else "they count for strengths alone"
+            unused |= dict.fromkeys(("heading", "heading_length"), why)
+        elif not s.heading:
+            unused["heading_length"] = "heading=false"
         if None not in (s.length_m, s.noise, *([s.heading_length] if turns and s.heading else [])):
             unused["likelihood_rows"] = "lengths and noise are stated"
         if "generic" in problem.stated_settings and not s.generic:

@@ -99,7 +99,7 @@ def unused_of_pooled(problem: Problem, splits: Sequence[Split]) -> dict[str, str
     s, record, unused = problem.settings, problem.record, dict[str, str]()
     turns = s.heading and record.tx_heading_rad is not None
     if not turns:
-        unused = dict.fromkeys(OF_HEADINGS, "headings do not count")
+        unused = dict.fromkeys(OF_HEADINGS, "heading=false" if not s.heading else "the data have no headings")
     searched = [*SEARCHED, *(SEARCHED_OF_HEADINGS if turns else ())]
     if problem.stated_settings.issuperset(searched):
         unused["search_rows"] = "all hyperparameters of the search are stated"
