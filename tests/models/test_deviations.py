@@ -133,12 +133,12 @@ def test_model_that_cannot_tell_noise_leaves_the_deviation_of_the_mean_out(tmp_p
     assert run.metrics["intervals_of"] == "reading"
 
 
-def test_files_of_a_fit_without_scale_state_its_deviations_as_they_were() -> None:
+def test_files_of_earlier_fits_state_their_deviations_as_they_were() -> None:
     record = shadowed(0, 60, 15, 4, 2, 2.0)
     model = fit_strengths(record, record.official[0])
     arrays = model.arrays()
     unscaled = predicted(
-        Strengths.from_arrays({name: values for name, values in arrays.items() if name != "scale"}),
+        Strengths.from_arrays({name: values for name, values in arrays.items() if not name.startswith("spread.")}),
         record,
         np.arange(5),
     )

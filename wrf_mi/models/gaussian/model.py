@@ -7,7 +7,7 @@ calibrates `wrf_mi.models.ray_tracing`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, fields, replace
+from dataclasses import astuple, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...backend.device import release_memory
 from ...core import Antenna, InputError, Prediction, Receiver, Record, Split, receiver_arrays, stored_receivers
 from ...core.array_files import keyed, under
+from ...core.settings import names_of
 from ...graph.graph import LEVEL, Graph
 from ...graph.receivers import GAPS, Form
 from ...graph.settings import TRACED_NAMES
@@ -217,10 +218,8 @@ def _unused_of_gaussians(plan: FitPlan, name: str) -> dict[str, str]:
     if source := next((name for name in ("points", "mesh", "paths") if getattr(s.initial, name)), None):
         random = ("size_deg", "nearest_m", "farthest_m")
         unused |= {f"initial.{name}": f"Gaussians start from initial.{source}" for name in random}
-    if not plan.schedule.density:
-        names = [setting.name for setting in fields(s.density) if setting.name != "every" or s.density.every]
-        why = f"no round of density control falls into {s.steps} steps with density.every={s.density.every}"
-        unused |= {f"density.{name}": why for name in names}
+    if not s.density.every:
+        unused |= {f"density.{name}": "density.every=0" for name in names_of(type(s.density)) - {"every"}}
     return unused
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,7 +42,6 @@ whose rooms the default hyperparameters belong."""
 AREA_SHADOW_DB, AREA_NOISE_DB = 6.0, 2.0  # shadowing of areas a priori, and both parts of the noise
 LIKELIHOOD_STOPS, LIKELIHOOD_RECEIVERS, LIKELIHOOD_STEPS = 400, 12, 80
 """Largest numbers of stops and receivers in the likelihood, those with most rows, and of its evaluations."""
-UNSCALED = np.ones(2)  # factors of variances, see `variance_scale`
 COVERED = 0.9  # share of residuals that calibrated intervals cover
 
 
@@ -77,7 +77,7 @@ class StrengthPosterior:
     """Posterior of the signal strengths, given stops (possibly none) and hyperparameters.
 
     ``ratio`` [n_rx] is that of each receiver's noise to the noise of all; ``rounds`` reweight for Student-t noise.
-    ``scale`` [2] has factors of the stated variances, of the mean and of the noise; they change no mean.
+    Means are those of ``hyperparameters``, deviations those of ``spread`` (`likely_deviations`); None: the same.
     """
 
     def __init__(
@@ -87,11 +87,15 @@ class StrengthPosterior:
         ratio: FloatArray,
         stops: Stops,
         rounds: int = 0,
-        scale: FloatArray = UNSCALED,
+        spread: Hyperparameters | None = None,
     ) -> None:
         self.prior, self.hyperparameters, self.ratio, self.stops = prior, hyperparameters, ratio, stops
-        self.scale, self.rounds, self.headings = scale, rounds, stops.poses.heading_rad is not None
-        h, parts = hyperparameters, []
+        self.spread, self.rounds = spread or hyperparameters, rounds
+        self.headings = stops.poses.heading_rad is not None
+        self._process = self._process_of(hyperparameters)
+
+    def _process_of(self, h: Hyperparameters) -> PooledProcess:
+        prior, stops, ratio, parts = self.prior, self.stops, self.ratio, []
         for receiver in range(len(prior.receivers_m)):
             received = np.isfinite(stops.value_dbm[receiver])
             poses = stops.poses.take(received).moved(h.lever_m)
@@ -99,7 +103,11 @@ class StrengthPosterior:
             # Reports of a stop average their own noise out, but not the fading that persists during the stop.
             variance = (h.drift_db**2 + h.noise_db**2 / stops.count[receiver, received]) * ratio[receiver] ** 2
             parts.append(ReceiverObservations(poses, columns, stops.value_dbm[receiver, received] - expected, variance))
-        self._process = PooledProcess(parts, h.covariance, sd, h.variance(self.headings), rounds)
+        return PooledProcess(parts, h.covariance, sd, h.variance(self.headings), self.rounds)
+
+    @cached_property
+    def _spread_process(self) -> PooledProcess:
+        return self._process if self.spread == self.hyperparameters else self._process_of(self.spread)
 
     @property
     def cost(self) -> float:
@@ -115,14 +123,16 @@ class StrengthPosterior:
 
         def posterior(k: int) -> tuple[FloatArray, FloatArray]:
             mean, variance = self._process.predict(receiver, moved[k], terms[k][1])
-            return terms[k][0] + mean, self.scale[0] * variance
+            if spread is not self._process:
+                variance = spread.predict(receiver, moved[k], terms[k][1])[1]
+            return terms[k][0] + mean, variance
 
+        spread = self._spread_process  # computed here, not on threads
         return of_each(posterior, range(len(poses)), sum(map(len, poses)))
 
     def noise(self, receiver: int) -> float:
         """Variance of a single report about the local mean power, dB^2."""
-        h = self.hyperparameters
-        return float(self.scale[1] * (h.drift_db**2 + h.noise_db**2) * self.ratio[receiver] ** 2)
+        return float((self.spread.drift_db**2 + self.spread.noise_db**2) * self.ratio[receiver] ** 2)
 
     def mean(self, poses: Poses, receiver: int) -> FloatArray:
         """The mean of `predict`, dBm."""
@@ -175,18 +185,16 @@ def by_likelihood(
     return at(every(minimize(cost, middle[free], method="Nelder-Mead", options=options).x), prior)
 
 
-def variance_scale(
+def likely_deviations(
     prior: PriorMean, stops: Stops, hyperparameters: Hyperparameters, stated: Collection[str]
-) -> FloatArray:
-    """Factors [2] of the variances of the field and of the noise by likelihood, at the stated or chosen length.
+) -> Hyperparameters:
+    """Hyperparameters with the deviations of shadowing and noise by likelihood, at the stated or chosen length.
 
     Hyperparameters that predict well may state deviations that are wrong: a mean depends on the ratio of field and
     noise, and little on that. The likelihood tells both, by differences of rows at all distances, so that what a
     reading adds to the uncertainty of the mean is known. Parameters that are ``stated`` hold.
     """
-    h, likely = hyperparameters, by_likelihood(prior, stops, hyperparameters, {*stated, "shadow_m"})[1]
-    noise, likely_noise = (each.drift_db**2 + each.noise_db**2 for each in (h, likely))
-    return np.array([likely.shadow_db**2 / h.shadow_db**2, likely_noise / noise])
+    return by_likelihood(prior, stops, hyperparameters, {*stated, "shadow_m"})[1]
 
 
 def scales(position_m: FloatArray) -> tuple[float, float]:
@@ -220,7 +228,8 @@ class Fit:
 
     def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops]) -> None:
         self._prior, self._measured = prior, measured
-        self.ratio, self.scale = np.ones(len(prior.receivers_m)), UNSCALED
+        self.ratio = np.ones(len(prior.receivers_m))
+        self.spread: Hyperparameters | None = None
         self._folds = [(join(measured.take(train)), held_out) for train, held_out in folds(len(measured.rows))]
 
     def held_out(
@@ -236,7 +245,7 @@ class Fit:
             hidden = (np.arange(len(mean)) % 2 == number) & unheard
             value_dbm = np.where(hidden[:, None], np.nan, stops.value_dbm)
             field = StrengthPosterior(
-                self._prior, hyperparameters, self.ratio, replace(stops, value_dbm=value_dbm), rounds, self.scale
+                self._prior, hyperparameters, self.ratio, replace(stops, value_dbm=value_dbm), rounds, self.spread
             )
             predicts = hidden | (not unheard)
             measured_dbm = np.where(predicts[:, None], self._measured.value_dbm, np.nan)

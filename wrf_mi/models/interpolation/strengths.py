@@ -30,14 +30,13 @@ from .strength_fit import (
     AREA_M,
     SEARCHED,
     SEARCHED_OF_HEADINGS,
-    UNSCALED,
     Fit,
     PriorMean,
     StrengthPosterior,
     by_likelihood,
+    likely_deviations,
     scales,
     shift_of,
-    variance_scale,
     widening,
 )
 from .strength_terms import OF_HEADINGS, Hyperparameters, Measured, Poses, Stops, stops_of
@@ -162,8 +161,8 @@ class Strengths(Fitted):
 
     def error_prior(self, receiver: int) -> ErrorPrior:
         """Shadowing and the uncertain terms of the mean, about the stops of the training rows."""
-        field, widen = self.field, self.field.scale[0] * self.widen[receiver] ** 2
-        h, received = field.hyperparameters, np.isfinite(field.stops.value_dbm[receiver])
+        field, widen = self.field, self.widen[receiver] ** 2
+        h, received = field.spread, np.isfinite(field.stops.value_dbm[receiver])
         # Headings of a plan are not known: the part of the field that depends on them is noise there.
         turned = h.body_db**2 if field.headings else 0.0
 
@@ -176,7 +175,7 @@ class Strengths(Fitted):
 
         deviation = field.prior.columns(field.stops.poses.take(np.zeros(0, np.int64)), receiver)[2]
         noise = h.drift_db**2 + h.noise_db**2 / field.stops.count[receiver, received]
-        scale = self.widen[receiver] ** 2 * field.scale[1] * field.ratio[receiver] ** 2
+        scale = widen * field.ratio[receiver] ** 2
         return ErrorPrior(
             with_columns(covariance, columns, deviation),
             field.stops.poses.position_m[received],
@@ -197,12 +196,12 @@ class Strengths(Fitted):
             "prior.rx": prior.rx_sd_db,
             "ratio": field.ratio,
             "rounds": field.rounds,
-            "scale": field.scale,
             "shift_db": self.shift_db,
             "widen": self.widen,
             "fact.name": np.array(list(self.fit_facts)),
             "fact.value": np.array(list(self.fit_facts.values()), float),
             **field_arrays(field.hyperparameters, "knob."),
+            **field_arrays(field.spread, "spread."),
         }
         if prior.traced is not None:
             arrays |= field_arrays(prior.traced.local if prior.traced.exact else prior.traced, "map.")
@@ -230,8 +229,10 @@ class Strengths(Fitted):
         poses = from_field_arrays(Poses, arrays, "stop.")
         stops = Stops(poses, *(arrays[f"stop.{name}"] for name in ("value_dbm", "count", "row")))
         hyperparameters = from_field_arrays(Hyperparameters, arrays, "knob.")
-        scale = arrays.get("scale", UNSCALED)  # earlier versions stored none
-        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]), scale)
+        spread = hyperparameters  # earlier versions stored no other
+        if "spread.shadow_m" in arrays:
+            spread = from_field_arrays(Hyperparameters, arrays, "spread.")
+        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]), spread)
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         return cls(field, float(arrays["shift_db"]), arrays["widen"], facts)
 
@@ -295,7 +296,8 @@ def fit_strengths(
         stops = stops_of(rows, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
         return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(values))))
 
-    (ratio, widen), scale = np.ones((2, len(values))), UNSCALED
+    ratio, widen = np.ones((2, len(values)))
+    spread: Hyperparameters | None = None
     # Traces at exact positions have no fades left in what they do not predict.
     skew_db = 0.0 if power_map is not None and power_map.exact else SKEW_DB
     shift, facts = skew_db, {"rows": float(len(rows))}
@@ -312,7 +314,7 @@ def fit_strengths(
         fit = Fit(prior, measured, join)
         fit.set_ratio(hyperparameters)
         if not over_area:  # there the hyperparameters are those of a likelihood
-            fit.scale = scale = variance_scale(prior, join(measured), hyperparameters, stated)
+            fit.spread = spread = likely_deviations(prior, join(measured), hyperparameters, stated)
         on_progress("strengths: held-out rows", 0.8)
         mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
         residual = values - mean
@@ -326,7 +328,7 @@ def fit_strengths(
         if np.isfinite(residual).any():
             facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
     on_progress("strengths: all rows", 0.9)
-    field = StrengthPosterior(prior, hyperparameters, ratio, join(measured), ROBUST_ROUNDS, scale)
+    field = StrengthPosterior(prior, hyperparameters, ratio, join(measured), ROBUST_ROUNDS, spread)
     on_progress("strengths: all rows", 1.0)
     return Strengths(field, shift, widen, facts)
 
