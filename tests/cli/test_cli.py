@@ -49,8 +49,11 @@ def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Ite
                 yield from commands(sub, (*name, key))
 
 
-def training(folder: Path, out: Path, *more: Any, model: str = "wrf-gs+") -> list[Any]:
-    return ["train", folder, "--model", model, "--out", out, *SET, *more]
+def training(folder: Path, out: Path, *more: Any, model: str = "wrf-gs+", **changed: float) -> list[Any]:
+    stated = [word for word in SET if word != "--set" and word.partition("=")[0] not in changed]
+    stated += [f"{name}={value}" for name, value in changed.items()]
+    settings = [word for setting in stated for word in ("--set", setting)]
+    return ["train", folder, "--model", model, "--out", out, *settings, *more]
 
 
 def test_every_command_has_help(command: Command) -> None:
@@ -200,9 +203,7 @@ def test_data_list(folder: Path, monkeypatch: pytest.MonkeyPatch, command: Comma
 
 def test_non_finite_fit_ends_with_status_1(folder: Path, tmp_path: Path, command: Command) -> None:
     """The error is one line, without traceback."""
-    status, out, err = command(
-        training(folder, tmp_path / "run", "--set", "optimiser.signal=1e38", "--set", "steps=20")
-    )
+    status, out, err = command(training(folder, tmp_path / "run", "--set", "optimiser.signal=1e38", steps=20))
     assert (status, out) == (1, "")
     assert re.fullmatch(r"wrf-mi: .*not finite.*\n", err.splitlines(keepends=True)[-1])
     assert "Traceback" not in err
@@ -225,7 +226,7 @@ def test_stopped_run_ends_with_status_130(
 def test_signal_to_end_writes_a_checkpoint_to_resume_from(ending: int, folder: Path, tmp_path: Path) -> None:
     """A training process receives the signal of Ctrl-C, or that of batch systems."""
     out = tmp_path / "run"
-    words = training(folder, out, "--set", "steps=200", "--set", "log_every=1", "--set", "validate_every=200")
+    words = training(folder, out, steps=200, log_every=1, validate_every=200)
     process = subprocess.Popen(
         [sys.executable, "-m", "wrf_mi.cli", *map(str, words)],
         stdout=subprocess.PIPE,

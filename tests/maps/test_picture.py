@@ -59,7 +59,7 @@ def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
     assert not {"threshold_dbm", "transmit_power_dbm"} & set(dataset.attrs)
     assert "no signal strengths" in heading(figure)
     titles = [axes.get_title().split(": ")[-1] for axes in figure.axes[:3]]
-    assert titles == ["expected power", "standard deviation", "probability of more than -10 dB"]
+    assert titles == ["expected power", "standard deviation of a reading", "probability of more than -10 dB"]
     assert [axes.get_ylabel().split()[0] for axes in figure.axes[3:]] == ["dB", "dB", "probability"]
     assert "open crosses" not in heading(figure)
     place = {"position_m": [0.0, 0.0, 0.0], "std_m": [0.5, 0.25, 0.0]}

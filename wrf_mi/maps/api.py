@@ -57,7 +57,7 @@ from ..tasks import Task, task_of
 from ..training.session import OnProgress, quiet
 from . import grid
 from .coverage import coverage_probability
-from .dataset import COVERAGE, POWER, STD, map_dataset, maps_package
+from .dataset import COVERAGE, POWER, STD, STD_OF_MEAN, map_dataset, maps_package
 
 if TYPE_CHECKING:
     import xarray
@@ -269,8 +269,12 @@ def _of_chunk(
     variables: dict[str, Any] = {POWER: means.mean(axis=1) + added}
     if level.std is not None:
         # The law of total variance: within a heading, and between headings.
-        std_db = np.sqrt(np.square(of_headings(level.std)).mean(axis=1) + means.var(axis=1))
-        variables[STD] = std_db
+        def over_headings(std: Any) -> FloatArray:
+            return np.sqrt(np.square(of_headings(std)).mean(axis=1) + means.var(axis=1))
+
+        variables[STD] = std_db = over_headings(level.std)
+        if level.std_mean is not None:
+            variables[STD_OF_MEAN] = over_headings(level.std_mean)
         reception = parts.prediction.reception
         received = None if reception is None else of_headings(reception).mean(axis=1)
         if received is not None:

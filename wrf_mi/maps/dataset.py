@@ -19,9 +19,11 @@ if TYPE_CHECKING:
     import xarray
 
 POWER, STD, COVERAGE, BEST = "power_dbm", "power_std_db", "coverage_probability", "best_receiver"
+STD_OF_MEAN = "power_std_mean_db"
 VARIABLES = {
     POWER: ("dBm", "expected received power"),
-    STD: ("dB", "standard deviation of the received power"),
+    STD: ("dB", "standard deviation of a reading of the received power, its noise included"),
+    STD_OF_MEAN: ("dB", "standard deviation of the mean received power, without noise of readings"),
     RECEPTION: ("1", "probability that a transmission is received"),
     COVERAGE: ("1", "probability that the received power exceeds the threshold"),
     "path_gain_db": ("dB", "path gain, gains of both antennas included"),

@@ -28,7 +28,7 @@ from ..runs.scene_view import surfaces_of
 from ..scene.mesh.surfaces import cut_lines
 from ..scene.preview import AZIMUTH_DEG, ELEVATION_DEG, MOST_FACES
 from ..tasks import task_of
-from .dataset import COVERAGE, POWER, STD
+from .dataset import COVERAGE, POWER, STD, STD_OF_MEAN
 
 if TYPE_CHECKING:
     import xarray
@@ -141,11 +141,13 @@ def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Pan
     rows = None if several else measured[0]
     panels: list[_Panel | None] = []
     panels.append(_Panel(f"{who}: expected power", of_best(POWER), colours, unit, "both", number, rows))
-    each = STD in dataset and 1 < len(names) <= MOST_DEVIATIONS
-    if STD in dataset:
-        drawn = dataset[STD].values if each else of_best(STD)
+    # The map is of the mean power: its deviation where the model states it, else that of a reading.
+    deviation, of = (STD_OF_MEAN, "the mean") if STD_OF_MEAN in dataset else (STD, "a reading")
+    title, each = "{}: standard deviation of " + of, deviation in dataset and 1 < len(names) <= MOST_DEVIATIONS
+    if deviation in dataset:
+        drawn = dataset[deviation].values if each else of_best(deviation)
         shades = ScalarMappable(Normalize(0, max(float(np.nanmax(drawn)), 1e-3)), "magma")
-        panels.append(_Panel(f"{who}: standard deviation", of_best(STD), shades, "dB", "neither", number, None))
+        panels.append(_Panel(title.format(who), of_best(deviation), shades, "dB", "neither", number, None))
     if COVERAGE in dataset:
         probable = ScalarMappable(Normalize(0, 1), "cividis")
         values = of_best(COVERAGE)
@@ -154,7 +156,7 @@ def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Pan
     powers = [_Panel(f"{names[k]}: expected power", power[k], colours, unit, "both", k, measured[k]) for k in numbers]
     if not each:
         return panels + powers
-    title, std = "{}: standard deviation", dataset[STD].values
+    std = dataset[deviation].values
     spreads = [_Panel(title.format(names[k]), std[k], shades, "dB", "neither", k, None) for k in numbers]
     return [panel for line in (panels, powers, spreads) for panel in (*line, *[None] * (COLUMNS - len(line)))]
 

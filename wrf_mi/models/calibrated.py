@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,9 @@ class FittedWithIntervals(Fitted):
     def _stated(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
         distance_m = self._distance(tx_pos_m, receiver)
         stated = self._intervals(prediction.mean, expected_size(task_of(self._record), prediction), distance_m)
+        if prediction.std_mean is not None:  # deviations of the mean are as wrong as those of readings
+            factor = stated.stated_std / prediction.stated_std
+            stated = replace(stated, std_mean=prediction.std_mean * factor)
         return stated if self._reception is None else self._reception(stated, tx_pos_m, receiver)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
@@ -145,6 +148,10 @@ class WithIntervals(Model):
         for split in splits:
             _fold(self.model, problem, split)
         self.model.check(problem, splits)
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """As of the model."""
+        return self.model.unused_settings(problem, splits)
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> Any:
         """Settings of the model without open choices."""

@@ -10,7 +10,7 @@ Source: Robinson, "That BLUP is a good thing: the estimation of random effects" 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -243,6 +243,12 @@ class WithFewRows(Model):
         """Refuse what the model refuses of the receivers with enough rows."""
         numbers, _ = self._numbers(problem, splits)
         self.model.check(self._part(problem, numbers), [split.at_receivers(numbers) for split in splits])
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """As of the model with the receivers with enough rows."""
+        numbers, _ = self._numbers(problem, splits)
+        parts = [split.at_receivers(numbers) for split in splits]
+        return self.model.unused_settings(self._part(problem, numbers), parts)
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> Any:
         """Settings of the model without open choices."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..core import AntennaOptions, InputError, Prediction, Receiver, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
-from ..core.settings import settings_from, with_settings
+from ..core.settings import changed, settings_from, with_settings
 from ..core.types import Inputs as Inputs
 from ..core.types import IntArray
 from ..parallel import Scheduler
@@ -50,6 +50,8 @@ class Problem:
     left_out: tuple[str, ...] = ()  #: names of receivers that are left out of the data, as if they had not been there
     #: what `Model.check` computed that the fit after it takes
     checked: list[Any] = field(default_factory=list, repr=False, compare=False)
+    #: dotted names of the settings that the user stated; None: those that differ from the defaults of their class
+    stated: frozenset[str] | None = None
 
     @cached_property
     def record(self) -> Record:
@@ -65,6 +67,11 @@ class Problem:
             names = [receiver.name for receiver in record.receivers]
             record = record.at_receivers([k for k, name in enumerate(names) if name not in self.left_out])
         return record.with_antennas(self.antennas)
+
+    @property
+    def stated_settings(self) -> frozenset[str]:
+        """Dotted names of the settings that hold as they are: no search or likelihood may change them."""
+        return changed(self.settings) if self.stated is None else self.stated
 
     @cached_property
     def opened_scene(self) -> Any | None:
@@ -267,6 +274,14 @@ class Model(ABC):
         Raises:
             InputError: settings, data or scene that it cannot be fitted to.
         """
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings that change nothing in a fit to these data with the problem's other settings, and why.
+
+        `wrf_mi.train` refuses them where they are stated (`check_stated`). A name stands for all settings below it:
+        ``traced`` for ``traced.depth``, too.
+        """
+        return {}
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> Any:
         """Settings without open choices; called before the first fit, and again when an interrupted fit is resumed."""

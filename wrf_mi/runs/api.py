@@ -21,7 +21,7 @@ from ..checking import warn_of_suspicions
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
-from ..core.settings import setting_texts
+from ..core.settings import setting_texts, stated_values
 from ..datasets import make_splits
 from ..datasets.observations import (
     LEAST_ROWS,
@@ -33,7 +33,7 @@ from ..datasets.observations import (
 )
 from ..datasets.splits import NONE, default_split, splits_below
 from ..models import MODELS, Model, Problem, Session, known_model
-from ..models.checks import check_held_receivers, check_record
+from ..models.checks import check_held_receivers, check_record, check_stated
 from ..models.model import default_settings
 from ..models.receiver_places import check_placeable, placed_problem, tell_places, write_places
 from ..parallel import Scheduler
@@ -76,7 +76,8 @@ def plan_run(
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset), progress=progress)
     model = _serving_model(record, request)
     _check_scene(model, record, scene, request)
-    settings, seed, deterministic = _settings_of(model, request), request.seed, request.deterministic
+    settings, stated = _settings_of(model, request)
+    seed, deterministic = request.seed, request.deterministic
     if "seed" in model.train_arguments:
         seed, deterministic = settings.seed, settings.deterministic
     split = _split_of(record, request)
@@ -84,14 +85,16 @@ def plan_run(
     for rows in splits:
         check_held_receivers(record, rows, model, MODELS.values())
         check_observations(record, rows, model.complete, may_be_silent=TASKS[record.task].in_decibel)
-    problem = Problem(record, settings, seed, scene, request.material, request.antennas)
+    problem = Problem(record, settings, seed, scene, request.material, request.antennas, stated=stated)
     check_placeable(problem, splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = split.name if isinstance(split, Split) else split
     options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
-    config = RunConfig(request.model, source, record.task, name, request.n_train, *options)
+    names = None if stated is None else tuple(sorted(stated))
+    config = RunConfig(request.model, source, record.task, name, request.n_train, *options, names)
     placed = placed_problem(problem.seen(splits[-1]), splits[-1], config.entry, on_progress)
     config.entry.check(placed, splits)
+    check_stated(config.entry, placed, splits)
     tell_places(placed)
     return problem, config, splits
 
@@ -119,9 +122,10 @@ def _split_of(record: Record, request: RunRequest) -> str | Split:
     return split
 
 
-def _settings_of(model: Model, request: RunRequest) -> Any:
+def _settings_of(model: Model, request: RunRequest) -> tuple[Any, frozenset[str] | None]:
+    """Settings, and the names of those that are stated; None: those of a dataclass that differ from its defaults."""
     kind: Any = model.settings
-    stated = request.settings
+    stated, names = request.settings, None
     if is_dataclass(stated) and not isinstance(stated, type):
         if request.preset is not None:
             raise InputError(f"preset {request.preset}: the settings state all values; give one of both")
@@ -131,13 +135,18 @@ def _settings_of(model: Model, request: RunRequest) -> Any:
     else:
         assert isinstance(stated, Iterable)
         texts = [*(setting_texts(stated) if isinstance(stated, Mapping) else stated)]
-        preset, named = _preset(model, request.preset), {text.partition("=")[0].strip() for text in texts}
-        if preset and {text.partition("=")[0] for text in preset} <= named:
+        preset, given = _preset(model, request.preset), {name: getattr(request, name) for name in GIVEN}
+        settings = default_settings(model, [*preset, *texts], given)
+        names = frozenset(stated_values(settings, texts))
+        if preset and stated_values(settings, preset).keys() <= names:
             raise InputError(f"preset {request.preset}: the settings state all that it does; omit one of them")
-        settings = default_settings(model, [*preset, *texts], {name: getattr(request, name) for name in GIVEN})
+        for name in names.intersection(model.train_arguments) - {"model"}:
+            value = getattr(settings, name)
+            if given[name] not in (None, type(value)(), value):
+                raise InputError(f"setting {name}: {value}, where the argument is {given[name]}; give one of both")
     if "model" in model.train_arguments and settings.model != model.name:
         raise InputError(f"setting model: {settings.model}, where the model is {model.name}; choose it with --model")
-    return settings
+    return settings, names
 
 
 def _preset(model: Model, name: str | None) -> tuple[str, ...]:

@@ -95,6 +95,8 @@ class RunConfig:
     settings: Any  # all settings of the model
     # training rows of the receivers that are left out for having too few, by name
     left_out: Mapping[str, int] = field(default_factory=dict)
+    # names of the settings that were stated; None: a run of an earlier version, or settings as a dataclass
+    stated: tuple[str, ...] | None = None
 
     @cached_property
     def entry(self) -> Model:
@@ -131,7 +133,7 @@ def read_config(folder: Path) -> RunConfig:
         needed = ("model", "dataset", "task", "split", "n_train", "seed", "scene", "material", "antennas")
         stated = {name: content[name] for name in needed}
         stated |= {name: content.get(name) or False for name in ("deterministic", "intervals")}
-        stated["left_out"] = content.get("left_out") or {}
+        stated |= {"left_out": content.get("left_out") or {}, "stated": content.get("stated")}
         stated |= {name: _from_here(stated[name], content.get(PLACE)) for name in ("dataset", "scene")}
         config = settings_from(RunConfig, {**stated, "settings": None}, str(path))
         if config.task not in TASKS or config.seed < 0:

@@ -22,6 +22,7 @@ from ..tasks import TASKS
 from .evaluate import Scores, evaluate, pool, write_results
 from .folder import RunConfig, check_new, new_run_folder, start_run
 from .released_outputs import read_released
+from .results import STD_MEAN
 from .run import Run
 
 REMEDY = "store row [m] and prediction [n_rx, m, ...] as predictions.npz of a run has them"
@@ -80,7 +81,8 @@ def score_predictions(
 
     def predict(rows: IntArray, receiver: int) -> Prediction:
         at = place[rows]
-        return Prediction(arrays["prediction"][receiver, at], arrays["std"][receiver, at] if "std" in arrays else None)
+        stated = {name: arrays[name][receiver, at] for name in ("std", STD_MEAN) if name in arrays}
+        return Prediction(arrays["prediction"][receiver, at], **stated)
 
     scores: list[Scores] = [evaluate(record, part, predict) for part in splits]
     metrics, scored = scores[0] if len(scores) == 1 else pool(scores)
@@ -109,7 +111,7 @@ def _read_npz(path: Path, record: Record) -> dict[str, NDArray[Any]]:
         raise InputError(f"{path}: no array prediction; {REMEDY}")
     task, number = TASKS[record.task], len(record.receivers)
     expected = record.observation.shape[2:]
-    for key in {"prediction", "std"} & arrays.keys():
+    for key in {"prediction", "std", STD_MEAN} & arrays.keys():
         values = arrays[key]
         if number == 1 and values.shape[1:] == expected:
             values = values[None]
@@ -133,7 +135,7 @@ def _in_order(path: Path, arrays: dict[str, NDArray[Any]], record: Record) -> di
         unknown, lacking = (sorted(of, key=others.__contains__) for of, others in ((names, asked), (asked, names)))
         raise InputError(f"{path}: receivers {listed(unknown)}; {record.name} has {listed(lacking)}")
     order = [names.index(receiver) for receiver in asked]
-    return {key: arrays[key][order] for key in ("prediction", "std") if key in arrays}
+    return {key: arrays[key][order] for key in ("prediction", "std", STD_MEAN) if key in arrays}
 
 
 def _read_csv(path: Path, record: Record) -> dict[str, NDArray[Any]]:
@@ -146,9 +148,10 @@ def _read_csv(path: Path, record: Record) -> dict[str, NDArray[Any]]:
     if lacking := [column for column in wanted if column not in table.header]:
         raise InputError(f"{path}: no column {lacking[0]}; give one of each receiver of {place_of(record)}")
     arrays = {"prediction": np.stack([table.numbers(column) for column in wanted])}
-    deviations = [f"{name}_std_db" for name in names]
-    if all(column in table.header for column in deviations):
-        arrays["std"] = np.stack([table.numbers(column) for column in deviations])
+    for key in ("std", STD_MEAN):
+        deviations = [f"{name}_{key}_db" for name in names]
+        if all(column in table.header for column in deviations):
+            arrays[key] = np.stack([table.numbers(column) for column in deviations])
     if "row" in table.header:
         return arrays | {"row": table.numbers("row")}
     return arrays | {"tx_pos": np.stack([table.numbers(axis) for axis in "xyz"], axis=-1)}

@@ -128,7 +128,7 @@ def stated_kinds(text: str) -> dict[str, bool]:
 
 
 def without_effect(options: TraceOptions) -> dict[str, str]:
-    """Names of settings that differ from their defaults and change no path, with the reason."""
+    """Names of settings that change no path with the values of the others, with the reason."""
     interacts = any(getattr(options, kind) for kind in ("reflection", "transmission", *FURTHER))
     without_rays = not max(options.most_reflections, options.sampled)
     needs_rays = without_rays, "no reflection, diffraction or scattering is traced"
@@ -139,9 +139,8 @@ def without_effect(options: TraceOptions) -> dict[str, str]:
         "reflections": ((options.reflections or 0) > most, limit),
         "rays": needs_rays,
         "seed": needs_rays,
-        **dict.fromkeys(FURTHER, (options.depth == 0, "depth is 0")),
+        **{kind: (getattr(options, kind) and options.depth == 0, "depth is 0") for kind in FURTHER},
         "scattering_coefficient": (not options.scattering, "no scattering is traced"),
         "phase_error": needs_rays,
     }
-    idle = {name: reason for name, (is_idle, reason) in reasons.items() if is_idle}
-    return {name: reason for name, reason in idle.items() if getattr(options, name) != getattr(DEFAULTS, name)}
+    return {name: reason for name, (is_idle, reason) in reasons.items() if is_idle}

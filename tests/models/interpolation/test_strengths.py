@@ -11,7 +11,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.models.interpolation import strengths
-from wrf_mi.models.interpolation.strength_fit import PooledProcess, ReceiverObservations, folds, shift_of, widening
+from wrf_mi.models.interpolation.pooled_process import PooledProcess, ReceiverObservations
+from wrf_mi.models.interpolation.strength_fit import folds, shift_of, widening
 from wrf_mi.models.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
 from wrf_mi.models.interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from wrf_mi.models.model import Inputs
@@ -228,7 +229,7 @@ def test_search_lowers_the_held_out_error() -> None:
     record = made(120, noise_db=1.0, body_db=3.0)
     wrong = replace(DEFAULTS, shadow_db=12.0, shadow_m=0.2)
     settings = wrong, replace(wrong, search_rows=50)
-    before, after = (fit_strengths(record, np.arange(120), None, one).facts()["fitted"] for one in settings)
+    before, after = (fit_strengths(record, np.arange(120), None, one, stated=()).facts()["fitted"] for one in settings)
     assert after["held_out_db"] < before["held_out_db"] - 0.1
     assert after["shadow_db"] < 12
 

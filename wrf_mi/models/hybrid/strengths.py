@@ -148,7 +148,7 @@ class StrengthsInScene(Model):
         session.report("tracing a map", 0.0)
         record = problem.record
         power = _local_mean(problem) if self.mean is None else self.mean(record.receivers)
-        fitted = fit_strengths(record, problem.rows(split), power, self.search, session.report)
+        fitted = fit_strengths(record, problem.rows(split), power, self.search, session.report, stated=())
         if power.exact:
             field = fitted.field
             field.prior = replace(field.prior, traced=power.of_predictions(field.stops.poses.position_m))

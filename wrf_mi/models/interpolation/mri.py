@@ -11,7 +11,7 @@ Mobile Computing 14, 1231 (2015); Rappaport, "Wireless Communications" (2002), s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,6 +80,10 @@ class Mri(ByReceiverModel):
     def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
         """The law is of the distance from them."""
         return True
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """``shared`` for a single receiver."""
+        return {"shared": "there is one receiver"} if len(problem.record.receivers) == 1 else {}
 
     def fit_single(self, rows: ReceiverRows) -> PathLoss:
         """The law of a receiver, or that of all receivers."""
