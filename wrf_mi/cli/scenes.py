@@ -65,7 +65,12 @@ def mesh_command(a: Arguments) -> int:
     counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
     floors = [name for name, kind in scene.materials.surfaces.items() if kind == "floor"]
     floor_m2 = sum(part.area for name in floors for part in mesh_parts(scene.folder / "meshes" / f"{name}.ply"))
-    facts = {"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts}
+    facts: dict[str, Any] = {
+        "scene": str(scene.folder),
+        "xml": str(scene.xml),
+        "surfaces": counts,
+        "counts": scene.counts,
+    }
     lines = [", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}"]
     lines.append(f"floor: {floor_m2:.1f} m2")
     if scene.origin_m is not None:

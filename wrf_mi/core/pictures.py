@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,7 +15,7 @@ PICTURE_ERRORS = (MemoryError, OSError, SyntaxError, ValueError, struct.error, z
 
 
 @contextmanager
-def open_picture(path: Path, most_pixels: int, formats: Sequence[str] = ("PNG", "PPM")) -> Iterator[Image.Image]:
+def open_picture(path: Path, most_pixels: int, formats: tuple[str, ...] = ("PNG", "PPM")) -> Iterator[Image.Image]:
     """Open a picture of given formats, whose pixels are decoded when they are first used; errors: `PICTURE_ERRORS`.
 
     `ValueError` for more pixels than ``most_pixels``, as a small file may state any size.

@@ -48,10 +48,10 @@ class Problem:
     antennas: AntennaOptions = AS_STATED  #: patterns and polarisations in place of those of the data
     operator: bool = True  #: learned fields predict by operator where they can, see `wrf_mi.training.predictor`
     left_out: tuple[str, ...] = ()  #: names of receivers that are left out of the data, as if they had not been there
-    #: what `Model.check` computed that the fit after it takes
-    checked: list[Any] = field(default_factory=list, repr=False, compare=False)
     #: dotted names of the settings that the user stated; None: those that differ from the defaults of their class
     stated: frozenset[str] | None = None
+    #: what `Model.check` computed that the fit after it takes
+    checked: list[Any] = field(default_factory=list, repr=False, compare=False)
 
     @cached_property
     def record(self) -> Record:

@@ -130,7 +130,7 @@ def _cells(
     ``likelihood`` is the logarithm at quantiles [n, 3]; coordinates that are ``known`` [3] are not divided.
     """
     number = np.where(known, 1, CELLS)
-    width = np.tile(np.ptp(bounds, axis=1) / number, (np.prod(number), 1))
+    width = np.tile(np.ptp(bounds, axis=1) / number, (int(np.prod(number)), 1))
     low = bounds[:, 0] + width * np.stack(np.unravel_index(np.arange(len(width)), number), axis=1)
     density = likelihood(low + width / 2)
     for _ in range(MOST_HALVINGS):

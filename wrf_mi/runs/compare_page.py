@@ -38,7 +38,7 @@ from .compare_tables import (
     first_differences,
 )
 from .folder import CONFIG, RunConfig, known_config, stored_versions
-from .results import PREDICTED, Results, unbeaten
+from .results import PREDICTED, Results, warnings_of
 
 NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
 CONSTANT = ("dataset", "metric")  # columns that are equal in a section, whose heading states them
@@ -128,7 +128,7 @@ rows.{words}</p>
 
 def _unbeaten(runs: Sequence[Results]) -> str:
     """What the command says of runs that are no better than the constant prediction."""
-    lines = [f"{run.name}: {line}" for run in runs if (line := unbeaten(run.metrics))]
+    lines = [f"{run.name}: {line}" for run in runs for line in warnings_of(run.metrics)]
     return "".join(f'<p class="note">{_text(line)}</p>\n' for line in lines)
 
 

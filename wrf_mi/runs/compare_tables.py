@@ -17,7 +17,7 @@ from ..tasks import TASKS
 from ..tasks.scores import block_bootstrap
 from ..training.selection import clusters
 from .folder import known_config
-from .results import CONSTANT, PREDICTED, Results, constant_of, unbeaten
+from .results import CONSTANT, PREDICTED, Results, constant_of, warnings_of
 
 COLUMNS = {"run": "run", "model": "model", "dataset": "data set", "split": "split", "seed": "seed"}
 COLUMNS |= {"n_train": "training rows (mean of folds)", "n_test": "test rows", "metric": "score"}
@@ -83,7 +83,7 @@ def differences(runs: Sequence[Results]) -> list[Difference]:
 
     "Better" and "worse": the 95 % interval of the difference, of resampled blocks of test rows, excludes zero in all
     seeds; all else is a tie. `NO_GAIN`: better, but some seed is no better than the constant prediction
-    (`wrf_mi.runs.results.unbeaten`). Runs that differ in their seed alone are seeds of one method; methods are compared
+    (`wrf_mi.runs.results.warnings_of`). Runs that differ in their seed alone are seeds of one method; methods are compared
     by runs of the same seed. Runs that predict the common rows from other training rows are not comparable.
     """
     best, of_name, by_name = best_run(runs), methods(runs), {run.name: run for run in runs}
@@ -133,7 +133,7 @@ def _of_seeds(run: Results, seeds: Sequence[Results], against: Callable[[Results
     compared = sum(each.difference is not None for each in by_run.values())
     verdict = words.pop() if len(words) == 1 else TIE
     # Of such a run the commands say that it is no better than a constant: no praise here.
-    if verdict == BETTER and any(unbeaten(seed.metrics) for seed in seeds):
+    if verdict == BETTER and any(warnings_of(seed.metrics) for seed in seeds):
         verdict = NO_GAIN
     return replace(gain, verdict=verdict, seeds=compared)
 
