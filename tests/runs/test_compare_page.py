@@ -38,7 +38,7 @@ from wrf_mi.runs.compare_tables import (
     method_rows,
 )
 from wrf_mi.runs.folder import AntennaOptions, RunRequest, read_config, start_run
-from wrf_mi.runs.results import Results, unbeaten
+from wrf_mi.runs.results import Results, warnings_of
 from wrf_mi.runs.run import open_run
 
 
@@ -240,9 +240,9 @@ def test_run_that_the_command_calls_no_better_than_a_constant_is_not_praised(tmp
     }
     assert verdicts == {"constant": NO_GAIN, "fine": "better"}
     assert text.count('class="better"') == 1
-    lines = [unbeaten(json.loads((run / "metrics.json").read_text())) for run in runs]
-    assert lines[1] is None
-    assert f"constant: {lines[0]}" in text
+    lines = [warnings_of(json.loads((run / "metrics.json").read_text())) for run in runs]
+    assert lines[1] == []
+    assert f"constant: {lines[0][0]}" in text
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -83,8 +83,8 @@ def differences(runs: Sequence[Results]) -> list[Difference]:
 
     "Better" and "worse": the 95 % interval of the difference, of resampled blocks of test rows, excludes zero in all
     seeds; all else is a tie. `NO_GAIN`: better, but some seed is no better than the constant prediction
-    (`wrf_mi.runs.results.warnings_of`). Runs that differ in their seed alone are seeds of one method; methods are compared
-    by runs of the same seed. Runs that predict the common rows from other training rows are not comparable.
+    (`wrf_mi.runs.results.warnings_of`). Runs that differ in their seed alone are seeds of one method; methods are
+    compared by runs of the same seed. Runs that predict the common rows from other training rows are not comparable.
     """
     best, of_name, by_name = best_run(runs), methods(runs), {run.name: run for run in runs}
 
