@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import re
 import shlex
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +23,7 @@ from ..unknown import SENT, name_words
 from .columns import HERTZ, described, find_columns, parsed_columns, unit_of
 from .files import Table, joined, read_table
 from .options import ImportOptions, option_name
+from .picture import plan_picture
 from .places import (
     POSITION_DIGITS,
     LocalFrame,
@@ -62,7 +61,6 @@ RADIOS = frozenset(
 )
 """Values of a column of kinds of radio, in small letters."""
 SENT_IN_NAME = re.compile(r"(?<![\d.])(-?\d+(?:\.\d+)?)[ _]?dbm", re.IGNORECASE)
-MOST_NAMED = 9  # receivers with a colour of their own in the plan; the others are grey
 STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
 
 
@@ -166,7 +164,7 @@ class _Import:
         self.facts |= {"columns": lines, "frame": frame.facts(), "not_heard_dbm": not_heard, "notes": self.notes}
         extra: dict[str, str | bytes] = {
             FACTS: yaml.safe_dump(self.facts, sort_keys=False, allow_unicode=True, width=120),
-            PICTURE: _plan_picture(record),
+            PICTURE: plan_picture(record),
         }
         write_ble_folder(self.out, record, replace, extra, further)
         return ImportReport(self.out, record, tuple(lines), tuple(self.notes))
@@ -397,42 +395,3 @@ def _hertz(table: Table, column: str) -> FloatArray:
         raise table.fault(f"{one_line(column)} is {values[row]:g}; give the carrier, or --columns frequency=-", row)
     largest = values.max()
     return values * HERTZ.get(unit_of(column), 1e9 if largest < 1e3 else 1e6 if largest < 1e6 else 1.0)
-
-
-def _plan_picture(record: Record) -> bytes:
-    """PNG with the rows of signal strengths in their plan and the receivers at known positions."""
-    from matplotlib.figure import Figure  # not before: every command imports the data sets
-    from matplotlib.text import Text
-
-    extent_m = np.ptp(record.tx_pos_m[:, :2], axis=0)
-    aspect = float(np.clip(extent_m[1] / max(extent_m[0], 1e-6), 0.3, 1.5))
-    figure = Figure(figsize=(8, 6.6 * aspect + 1.8), layout="constrained")
-    axes = figure.add_subplot()
-    heard = np.isfinite(record.observation).any(axis=0)
-    strongest = np.where(heard, np.argmax(np.nan_to_num(record.observation, nan=-np.inf), axis=0), -1)
-    numbers, counts = np.unique(strongest[heard], return_counts=True)
-    named = numbers[np.argsort(-counts, kind="stable")][:MOST_NAMED]
-    others = ~np.isin(strongest, named)
-    for number in named:
-        rows = record.tx_pos_m[strongest == number]
-        axes.plot(*rows[:, :2].T, ".", markersize=4, label=record.receivers[number].name[:24])
-    if others.any():
-        axes.plot(*record.tx_pos_m[others, :2].T, ".", color="0.7", markersize=3, label="another or none", zorder=0)
-    places = np.stack([receiver.position_m for receiver in record.receivers])
-    surveyed = np.isfinite(places).all(axis=1)
-    if surveyed.any():
-        axes.plot(*places[:, :2].T, "k^", markersize=7, label="receivers")
-    names = np.array([receiver.name[:24] for receiver in record.receivers])
-    for name, place in zip(names[surveyed], places[surveyed], strict=True) if surveyed.sum() <= MOST_NAMED else ():
-        axes.annotate(name, place[:2], (5, 3), textcoords="offset points", fontsize="small")
-    title = f"{record.name}: strongest receiver of each row"
-    if (~surveyed).any():
-        title = f"{title}\n" + textwrap.fill(f"receivers at unknown places: {listed(names[~surveyed])}", 90)
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    axes.set_title(title, fontsize="medium")
-    figure.legend(loc="outside lower center", ncols=4, fontsize="small")
-    for text in figure.findobj(Text):
-        text.set_parse_math(False)  # names may contain dollar signs
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
-    return stream.getvalue()
