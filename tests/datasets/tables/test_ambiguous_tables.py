@@ -83,6 +83,10 @@ def test_what_is_not_one_quantity_is_not_pooled(columns: dict[str, Any], message
     error_line(import_measurements, tmp_path / "t.csv", tmp_path / "data", message)
 
 
+def test_missing_kinds_of_radio_are_no_kind(tmp_path: Path) -> None:
+    assert len(imported(tmp_path, readings(Type=["WIFI", None] * 10)).receivers) == 2
+
+
 def test_each_beacon_may_send_its_own_power(tmp_path: Path) -> None:
     assert len(imported(tmp_path, readings(TxPower=[-8, 0] * 10)).receivers) == 2
 

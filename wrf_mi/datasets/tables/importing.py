@@ -56,9 +56,7 @@ FACTS, PICTURE = "import.yml", "plan.png"  # files beside the tables: what the i
 MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
 MOST_CELLS = 50_000_000  # largest number of receivers times places: 2 GB while means are computed
 TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
-RADIOS = frozenset(
-    {"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "umts", "tdscdma", "lte", "nr", "5g", "nan"}
-)
+RADIOS = frozenset({"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "umts", "tdscdma", "lte", "nr", "5g"})
 """Values of a column of kinds of radio, in small letters."""
 SENT_IN_NAME = re.compile(r"(?<![\d.])(-?\d+(?:\.\d+)?)[ _]?dbm", re.IGNORECASE)
 STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
@@ -261,9 +259,10 @@ class _Import:
         """Refuse strengths of one receiver at several powers that were sent, or several kinds of radio."""
         frame = self.table.frame
         for name in frame.columns:
-            words, values = name_words(name), frame[name].iloc[readings.row].astype(str).str.strip()
+            words, stated = name_words(name), frame[name].notna().to_numpy()[readings.row]
+            values = frame[name].iloc[readings.row[stated]].astype(str).str.strip()
             if words & SENT and self.table.is_numeric(name):
-                several = values.groupby(readings.receiver).nunique().max() > 1
+                several = values.groupby(readings.receiver[stated]).nunique().max() > 1
             else:
                 several = values.nunique() > 1 and set(values.str.lower()) <= RADIOS
             if several:
