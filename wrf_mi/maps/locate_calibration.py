@@ -144,17 +144,16 @@ def _predicted_fold(
     file = folder.with_suffix(".npz")
     arrays = stored_arrays(file) if file.exists() else {}
     if "predicted" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
+        folder.mkdir(parents=True, exist_ok=True)  # with the files of a stopped fit, if any
         inner = replace(session, folder=folder, run=folder)
         with threadpool_limits(1, "blas"):
             fitted, numbers = fit_fold(run.model, run.problem, fold, inner)
             predicted = predict_candidates(
                 fitted, len(numbers), headings_of(run), candidates, partial(inner.report, "map")
             )
-        shutil.rmtree(folder)
         arrays = {"predicted": predicted, "positions_m": candidates.positions_m, "receivers": numbers}
         write_arrays(file, arrays)
+        shutil.rmtree(folder)
     return arrays["receivers"], arrays["predicted"]
 
 
