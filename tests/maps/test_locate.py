@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import write_ble_folder
+from wrf_mi.maps import locate_calibration
 from wrf_mi.maps.grid import Candidates, candidates_of, grid_over
 from wrf_mi.maps.locate import locate
 from wrf_mi.maps.locate_calibration import FILE, Located, choose, fit_silence, widest
@@ -313,6 +316,32 @@ def test_bad_arguments_are_refused(fitted: tuple[Path, Record], tmp_path: Path, 
         with pytest.raises(InputError, match=message):
             locate(folder, strengths_dbm, **options)
     command.refused(["locate", run, "--out", tmp_path / "out.txt"], "written as .csv")
+
+
+def test_fold_that_was_stopped_goes_on_from_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where its predictions could not be stored, as on a full disk."""
+    places = np.random.default_rng(0).uniform(0.5, 5.5, (60, 3)) * [1, 1, 0] + [0, 0, 1]
+    record = record_of(places, strengths(places), 50)
+    run = train(record, "kriging", out=tmp_path / "run")
+    fit, begun = locate_calibration.fit_fold, list[list[str]]()
+
+    def noting(entry: Any, problem: Any, fold: Any, session: Any) -> Any:
+        begun.append([path.name for path in session.folder.iterdir()])
+        (session.folder / "checkpoint.npz").touch()
+        return fit(entry, problem, fold, session)
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(locate_calibration, "fit_fold", noting)
+    monkeypatch.setattr(type(run.fitted), "refit", lambda *_: None)  # as of models that are fitted anew to each fold
+    with monkeypatch.context() as patched:
+        patched.setattr(locate_calibration, "write_arrays", full)
+        with pytest.raises(OSError, match="No space left"):
+            locate(run, np.full((3, 1), -50.0), step_m=0.5)
+    locate(run, np.full((3, 1), -50.0), step_m=0.5)
+    assert begun[:2] == [[], ["checkpoint.npz"]]
+    assert not (run.folder / locate_calibration.FOLDER).exists()
 
 
 def test_widest_form_within_a_standard_error_is_chosen() -> None:

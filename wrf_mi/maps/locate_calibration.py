@@ -165,17 +165,16 @@ def _predicted_fold(
     file = folder.with_suffix(".npz")
     arrays = stored_arrays(file) if file.exists() else {}
     if "predicted" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
+        folder.mkdir(parents=True, exist_ok=True)  # with the files of a stopped fit, if any
         # One line for all folds: a fit may have twenty stages.
         inner = replace(session, folder=folder, run=folder, on_progress=lambda *_: report(0.0))
         with threadpool_limits(1, "blas"):
             of_fold, numbers = fit_fold(run.model, run.problem, fold, inner)
             places = np.arange(len(numbers))
             predicted = predict_candidates(of_fold.tracing_once(), places, headings_of(run), candidates, report)
-        shutil.rmtree(folder)
         arrays = {"predicted": predicted, "positions_m": candidates.positions_m, "receivers": numbers}
         write_arrays(file, arrays)
+        shutil.rmtree(folder)
     return arrays["receivers"], arrays["predicted"]
 
 
