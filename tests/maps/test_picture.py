@@ -13,7 +13,7 @@ import xarray as xr
 from commands import Command
 from made_channels import channels
 from made_waves import wave_record
-from matplotlib.collections import PathCollection
+from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 
 import wrf_mi
@@ -23,6 +23,7 @@ from wrf_mi.maps import picture
 from wrf_mi.maps.api import radio_map
 from wrf_mi.maps.dataset import write_map
 from wrf_mi.maps.picture import map_figure
+from wrf_mi.scene.make import make_scene
 
 BANDS_HZ = (9e8, 2.4e9)
 
@@ -43,6 +44,22 @@ def dots(figure: Figure, panel: int) -> dict[str, np.ndarray]:
     drawn = [one for one in figure.axes[panel].collections if isinstance(one, PathCollection)]
     squares, circles = (np.asarray(one.get_array()) for one in drawn[1:])
     return {"trained": circles, "other": squares}
+
+
+def make_scene_of(folder: Path) -> Path:
+    """A room of 5 m x 4 m with floor and ceiling."""
+    (folder / "layout.csv").write_text("x,y\n0,0\n5,0\n5,4\n0,4\n0,0\n")
+    return make_scene(folder / "layout.csv", folder / "scene", height_m=2.5).folder
+
+
+def strengths_in_a_room() -> Record:
+    rng = np.random.default_rng(2)
+    positions = np.column_stack([rng.uniform(0.5, 3.5, (40, 2)), np.full(40, 1.3)])
+    receiver = wrf_mi.Receiver("wall", np.array([0.5, 0.5, 2]), np.array([0.0, 0, 0, 1]))
+    observed = -40 - 20 * np.log10(np.linalg.norm(positions - receiver.position_m, axis=1)) + rng.normal(0, 1, 40)
+    split = (np.arange(30), np.arange(30, 40))
+    values = observed[None].astype(np.float32)
+    return Record("room", "rssi", positions, (receiver,), values, frequencies_hz=np.array([2.4e9]), official=split)
 
 
 def heading(figure: Figure) -> str:
@@ -97,6 +114,16 @@ def test_picture_leaves_estimated_receivers_far_outside_out(
         assert np.ptp(figure.axes[0].get_xlim()) < 2 * np.ptp(near.axes[0].get_xlim())
         outside = "1 estimated outside of the map, not drawn" in heading(figure)
         assert (outside, len(figure.axes[0].patches)) == ((True, 0) if place_m[0] < 0 else (False, 1))
+
+
+def test_picture_of_a_scene_draws_the_walls_at_its_height(tmp_path: Path) -> None:
+    """A floor and a ceiling are not cut by any height between them."""
+    scene = make_scene_of(tmp_path)
+    record = strengths_in_a_room()
+    run = wrf_mi.train(record, "ray-tracing", scene=scene, out=tmp_path / "run", settings={"depth": 1, "rays": 1000})
+    figure = map_figure(radio_map(run, step_m=1.0), run)
+    walls = [one for one in figure.axes[0].collections if isinstance(one, LineCollection)]
+    assert len(walls) == 4
 
 
 def test_picture_of_channels_has_levels_at_the_transmit_power(tmp_path: Path, command: Command) -> None:

@@ -250,9 +250,10 @@ def _aspect(dataset: xarray.Dataset) -> float:
 
 
 def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:
-    """Lines [n, 2, 2] in which a height cuts each surface of a run's scene, metres; empty without a scene."""
+    """Lines [n, 2, 2] in which a height cuts surfaces of a run's scene, metres, of those that it cuts."""
     scene = run.problem.opened_scene
-    return [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
+    cuts = [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
+    return [lines for lines in cuts if len(lines)]  # a floor has none
 
 
 def _draw_plan(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Any) -> None:
