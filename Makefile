@@ -22,7 +22,7 @@ setup: $(READY)
 	@echo "ready; next: make demo, or . .venv/bin/activate and your own data (docs/howto/own-data.md)"
 
 # Only what is declared in pyproject.toml can change what is installed.
-$(READY): pyproject.toml .ci/setup.sh
+$(READY): pyproject.toml .ci/setup.sh .ci/system.sh
 	@PYTHON="$(PYTHON)" .ci/setup.sh
 	@touch $@
 
@@ -37,8 +37,10 @@ lint: $(READY)
 
 # A worker for each core; four at most, of one to two gigabytes each. The laboratory is traced first where it is not
 # kept yet, so that no two workers do. Notebooks take longest and begin first, so that no worker is left alone with one
-# in the end; a file stays with one worker, whose tests share what its fixtures fitted.
+# in the end; a file stays with one worker, whose tests share what its fixtures fitted. A browser is installed for tests
+# of pages: as root or with a sudo that asks nothing.
 test: lint
+	@.ci/test_programs.sh
 	@$(BIN)/python -c 'import wrf_mi; wrf_mi.load("laboratory")'
 	$(BIN)/pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --nbmake notebooks tests
 

@@ -20,6 +20,7 @@ from wrf_mi.backend import init
 
 if TYPE_CHECKING:
     from commands import Command
+    from playwright.sync_api import Browser
 
     from wrf_mi.core import Record
     from wrf_mi.parallel import Scheduler
@@ -64,6 +65,15 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
     from commands import Command
 
     return Command(capsys)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """Chromium; for a module, as its client keeps an event loop running in which no other can run."""
+    from pages import started
+
+    with started() as running:
+        yield running
 
 
 @pytest.fixture

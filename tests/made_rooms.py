@@ -75,13 +75,17 @@ def scene_file(folder: Path, parts: list[Mesh]) -> Path:
     return folder / "room.xml"
 
 
-def write_las(file: Path, points: np.ndarray, scale: float = 1e-3, vlrs: Any = (), **version: Any) -> Path:
-    """Points in steps of a scale, with records on their coordinates."""
+def write_las(
+    file: Path, points: np.ndarray, scale: float = 1e-3, vlrs: Any = (), mark: Any = None, **version: Any
+) -> Path:
+    """Points in steps of a scale, with records on their coordinates; ``mark`` sets their classes and flags."""
     header = laspy.LasHeader(**({"point_format": 0, "version": "1.2"} | version))
     header.scales, header.offsets = np.full(3, scale), np.floor(points.min(axis=0))
     header.vlrs.extend(vlrs)
     cloud = laspy.LasData(header)
     cloud.xyz = points
+    if mark is not None:
+        mark(cloud)
     cloud.write(file)
     return file
 

@@ -24,7 +24,7 @@ from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tracing import TraceOptions, set_frequency, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
-from wrf_mi.tracing.sionna.path_solver import scattering_materials
+from wrf_mi.tracing.sionna.scattering import scattering_materials
 
 from .limits import opened, room
 from .sionna_reference import sionna_paths

@@ -33,6 +33,7 @@ from wrf_mi.synthetic.floor_receivers import DEFAULT, NAME
 from wrf_mi.synthetic.searches import SCATTERING, set_scattering
 from wrf_mi.synthetic.stored import SCAN
 from wrf_mi.tasks import TASKS
+from wrf_mi.tasks.scores import inside_interval
 from wrf_mi.tracing import open_scene, trace_paths
 
 from .comparison import STORED, data_folder
@@ -196,7 +197,8 @@ def true_power(receiver: wrf_mi.Receiver, positions_m: FloatArray) -> FloatArray
         set_scattering(scene, DEFAULT.scattering)
         for options in DEFAULT.options():
             # Points of a grid may lie in bodies, where no path arrives.
-            paths = trace_paths(scene, positions_m, receiver, options, progress=True, check=False).paths
+            how: dict[str, Any] = {"progress": True, "check": False, "search_from": "receivers"}
+            paths = trace_paths(scene, positions_m, receiver, options, **how).paths
             scattered = (paths.interactions == SCATTERING).any(axis=1)
             total += received_power(paths.select(scattered == options.scattering))[0]
     return np.asarray(strength_db(total))
@@ -209,7 +211,7 @@ def picture(folder: Path) -> Figure:
     run_of_cell(cell, NAME, folder / "idw", "idw")
     run, idw = (wrf_mi.open_run(folder / name) for name in (HYBRID, "idw"))
     dataset = run.map(height_m=HEIGHT_M, step_m=STEP_M, receivers=[RECEIVER])
-    power, std_db = (dataset[name].values[0] for name in ("power_dbm", "power_std_db"))
+    power, std_db = (dataset[name].values[0] for name in ("power_dbm", "power_std_mean_db"))
     record = run.problem.record
     number = receiver_index(record.receivers, RECEIVER)
 
@@ -239,7 +241,8 @@ def picture(folder: Path) -> Figure:
     true.pcolormesh(x, y, truth, shading="nearest", rasterized=True, **shades)
     true.set_title("True power")
     bar = spread.pcolormesh(x, y, std_db, shading="nearest", cmap="magma", rasterized=True)
-    spread.set_title(f"Predicted standard deviation, {DEFAULT.noise_db:g} dB of noise included")
+    inside = inside_interval(power[free], std_db[free], truth[free])
+    spread.set_title(f"Its standard deviation: {100 * inside:.0f} % of the truth in 90 % intervals")
     for axes in panels.flat:
         for lines in scene_cuts(run, HEIGHT_M) if axes is not given else ():
             axes.add_collection(LineCollection(list(lines), colors="black", linewidths=0.8))

@@ -123,7 +123,9 @@ SIZE = 45, 180  # elevations and azimuths of a spectrum
 ELEMENTS = 4  # elements along each side of the square array, half a wavelength apart
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 CEILING_M = 1.8  # height above which an array looks down, metres; one below looks up
-TRUTH = TraceOptions(transmission=True, diffraction=True, scattering=True, depth=3, rays=1 << 13)
+TRUTH = TraceOptions(
+    transmission=True, diffraction=True, scattering=True, scattering_coefficient=0.3, depth=3, rays=1 << 13
+)
 """Search for the true paths, with diffuse reflection and diffraction."""
 PREDICTION = TraceOptions(transmission=True, depth=3, rays=1 << 16)
 

@@ -11,8 +11,8 @@ import mitsuba as mi
 
 from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import InputError
-from wrf_mi.tracing.paths.field_calculator import slab
 from wrf_mi.tracing.sionna.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ
+from wrf_mi.tracing.slabs import slab
 
 from .blend_rays import Walls
 from .ray_response import to_world
@@ -108,7 +108,7 @@ def walls_of(
 ) -> Walls | None:
     """The complex transmission along rays, differentiable in the parameters of Sionna RT's radio materials.
 
-    Each wall is one slab (`wrf_mi.tracing.paths.field_calculator.slab`), and passes the receiver's polarisation by
+    Each wall is one slab (`wrf_mi.tracing.slabs.slab`), and passes the receiver's polarisation by
     T = T_TE s + T_TM (1 - s), where s is the share of it across the plane of incidence.
 
     Args:

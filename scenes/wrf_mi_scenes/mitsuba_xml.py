@@ -73,12 +73,13 @@ PERFECT_CONSTANTS = {
     "conductivity": PERFECT_CONDUCTIVITY,
     "thickness": PERFECT_THICKNESS_M,
 }
+SCATTERING = ("scattering_coefficient", "xpd_coefficient")  # numbers that a BSDF of Sionna RT may have, too
 
 
 def scene_xml(
     materials: Mapping[str, str],
     constants: Constants = MappingProxyType({}),
-    slabs: Mapping[str, tuple[str, float]] = MappingProxyType({}),
+    slabs: Mapping[str, tuple[str, Mapping[str, float]]] = MappingProxyType({}),
     looks: bool = False,
 ) -> str:
     """The Mitsuba scene file over ``meshes/<part>.ply``.
@@ -89,9 +90,10 @@ def scene_xml(
 
     Args:
         materials: radio material (``itu_*``, `PERFECT`, `ABSORBER` or a key of ``constants``) of each part by name.
-        constants: constants of further materials.
-        slabs: ITU material (without ``itu_``) and thickness in metres of materials; those with one are radio materials
-            of Sionna RT with that thickness, as plain ``sionna.rt.load_scene`` takes 0.1 m for all others.
+        constants: constants of further materials, and numbers of `SCATTERING`.
+        slabs: ITU material (without ``itu_``), and thickness in metres and numbers of `SCATTERING`, of materials; those
+            with one are radio materials of Sionna RT with these numbers, as plain ``sionna.rt.load_scene`` takes 0.1 m
+            for all others.
         looks: write the colours of all materials and no radio material, for pictures by Mitsuba alone.
     """
     known = {} if looks else {PERFECT: PERFECT_CONSTANTS, **constants}
@@ -101,14 +103,12 @@ def scene_xml(
         look = f'<rgb name="color" value="{colour}"/>'
         if material in known:
             kind = "radio-material"
-            stated = [(name, value) for name, value in known[material].items() if name in PERFECT_CONSTANTS]
-            content = [f'<float name="{name}" value="{value:.9g}"/>' for name, value in stated]
+            content = _floats(known[material])
         elif material == ABSORBER and not looks:
             kind, content = "absorber-radio-material", [look]
         elif material in slabs and not looks:
-            itu, thickness_m = slabs[material]
-            thickness = f'<float name="thickness" value="{thickness_m:.9g}"/>'
-            kind, content = "itu-radio-material", [f'<string name="type" value="{itu}"/>', thickness, look]
+            itu, numbers = slabs[material]
+            kind, content = "itu-radio-material", [f'<string name="type" value="{itu}"/>', *_floats(numbers), look]
         else:
             kind = "twosided"
             content = [f'<bsdf type="diffuse"><rgb name="reflectance" value="{colour}"/></bsdf>']
@@ -126,6 +126,11 @@ def scene_xml(
             "    </shape>",
         ]
     return "\n".join([*lines, "</scene>", ""])
+
+
+def _floats(numbers: Mapping[str, float]) -> list[str]:
+    stated = [(name, value) for name, value in numbers.items() if name in (*PERFECT_CONSTANTS, *SCATTERING)]
+    return [f'<float name="{name}" value="{value:.9g}"/>' for name, value in stated]
 
 
 def write_scene(

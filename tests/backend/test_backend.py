@@ -210,7 +210,7 @@ def test_process_with_an_old_llvm_ends_with_one_line(major, imported_before):
     ended = run_python(f"{imported_before}import wrf_mi.backend as b; b.init()", **{libraries.LLVM_VARIABLE: path})
     assert ended.returncode == 1
     last = ended.stderr.strip().splitlines()[-1]
-    assert last.startswith("wrf_mi.core.errors.BackendError: ")
+    assert last.startswith("wrf_mi.core.errors.LibraryVariableError: ")
     assert libraries.LLVM_VARIABLE in last or "install" in last
 
 
@@ -276,3 +276,40 @@ def test_arguments_are_checked():
         backend.init("opencl")
     with pytest.raises(InputError, match="threads: must be at least 1, got 0"):
         backend.init(threads=0)
+
+
+@pytest.fixture
+def wrong_library(tmp_path: Path):
+    """Path that the variable may name: a missing file, a file that is no library, and an LLVM that is too old."""
+    (tmp_path / "text.so").write_text("no library")
+    (tmp_path / "libLLVM-14.so.1").touch()
+    return {"missing": tmp_path / "none.so", "no LLVM": tmp_path / "text.so", "old": tmp_path / "libLLVM-14.so.1"}
+
+
+@pytest.mark.parametrize("kind", ["missing", "no LLVM", "old"])
+@pytest.mark.parametrize("imported_before", ["", "import drjit; "])
+def test_variable_of_an_unusable_library_is_named_with_its_path(wrong_library, kind, imported_before):
+    path = str(wrong_library[kind])
+    ended = run_python(
+        f"{imported_before}import wrf_mi.backend as b; b.init('llvm')", **{libraries.LLVM_VARIABLE: path}
+    )
+    last = ended.stderr.strip().splitlines()[-1]
+    assert re.search(
+        rf"LibraryVariableError: {libraries.LLVM_VARIABLE} is set, but .*{re.escape(path)}.*: unset it", last
+    )
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "train nowhere --model idw --out run",
+        "compare run --out page",
+        "correct nowhere --scene box --out fit",
+        "check box",
+    ],
+)
+def test_commands_end_with_one_line_on_a_wrong_variable(wrong_library, words, tmp_path):
+    code = f"import sys; from wrf_mi.cli.main import main; sys.exit(main({words.split()}))"
+    ended = run_python(code, **{libraries.LLVM_VARIABLE: str(wrong_library["missing"]), "CUDA_VISIBLE_DEVICES": ""})
+    assert (ended.returncode, len(ended.stderr.splitlines())) == (2, 1), ended.stderr
+    assert ended.stderr.startswith(f"wrf-mi: {libraries.LLVM_VARIABLE} is set, but {wrong_library['missing']} is not a")

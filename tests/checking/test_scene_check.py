@@ -132,6 +132,36 @@ def test_skewed_axes_camel_case_and_unknown_parameters_are_faults(tmp_path):
         load_scene(path)
 
 
+def with_defaults(folder: Path, defaults: str) -> Path:
+    """A scene as Blender's exporter writes it: values of the sensor, and here of the shape's transform, by name."""
+    moved = '<transform name="to_world"><translate x="$shift"/></transform>'
+    path = scene_file(folder, "ply", moved)
+    sensor = (
+        '<sensor type="perspective"><sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>'
+    )
+    path.write_text(path.read_text().replace("<bsdf", f"{defaults}{sensor}</sensor><bsdf", 1))
+    return path
+
+
+def test_defaults_of_a_scene_file_are_its_values(tmp_path):
+    defaults = '<default name="spp" value="64"/><default name="shift" value="5"/><default name="shift" value="7"/>'
+    path = with_defaults(tmp_path, defaults)
+    assert alarms(check_scene(path)) == []
+    scene = read_xml(path)
+    assert isinstance(scene, SceneXml)
+    (part,) = [result for result in scene_parts(scene) if isinstance(result, ShapePart)]
+    np.testing.assert_allclose(part.corners_m, in_sionna(path), atol=8 * PLACED_M)
+    assert part.corners_m[..., 0].mean() == pytest.approx(5)
+    assert list(load_scene(path)[0].objects) == ["a"]
+
+
+def test_a_value_without_a_default_is_a_fault(tmp_path):
+    path = with_defaults(tmp_path, '<default name="spp" value="64"/>')
+    assert kinds(path, "fault") == ["transform"]
+    path = with_defaults(tmp_path, '<default name="shift" value="5"/>')
+    assert kinds(path, "fault") == ["parameter"]
+
+
 @pytest.mark.parametrize(("gap_m", "lost"), [(0.0, False), (1e-3, True), (0.9 * FARTHEST_M, True), (0.02, False)])
 def test_paths_through_double_sheets_are_lost_in_sionna(gap_m, lost, tmp_path):
     from sionna import rt

@@ -49,8 +49,11 @@ def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Ite
                 yield from commands(sub, (*name, key))
 
 
-def training(folder: Path, out: Path, *more: Any, model: str = "wrf-gs+") -> list[Any]:
-    return ["train", folder, "--model", model, "--out", out, *SET, *more]
+def training(folder: Path, out: Path, *more: Any, model: str = "wrf-gs+", **changed: float) -> list[Any]:
+    stated = [word for word in SET if word != "--set" and word.partition("=")[0] not in changed]
+    stated += [f"{name}={value}" for name, value in changed.items()]
+    settings = [word for setting in stated for word in ("--set", setting)]
+    return ["train", folder, "--model", model, "--out", out, *settings, *more]
 
 
 def test_every_command_has_help(command: Command) -> None:
@@ -121,7 +124,8 @@ def test_train_prints_a_table_and_progress_elsewhere(folder: Path, tmp_path: Pat
     assert where == f"results: {out_folder}"
     assert (metrics["model"], metrics["seed"], metrics["steps"]) == ("wrf-gs", 3, 4)
     assert re.fullmatch(
-        r"training 4/4  loss 0\.\d+  SSIM -?\d\.\d+ \(validation rows, now trained on\)  8 Gaussians  0:00 left\n", err
+        r"training 4/4  loss 0\.\d+  SSIM -?\d\.\d+ \(2 validation rows, now trained on\)  8 Gaussians  0:00 left\n",
+        err,
     )
 
 
@@ -199,9 +203,7 @@ def test_data_list(folder: Path, monkeypatch: pytest.MonkeyPatch, command: Comma
 
 def test_non_finite_fit_ends_with_status_1(folder: Path, tmp_path: Path, command: Command) -> None:
     """The error is one line, without traceback."""
-    status, out, err = command(
-        training(folder, tmp_path / "run", "--set", "optimiser.signal=1e38", "--set", "steps=20")
-    )
+    status, out, err = command(training(folder, tmp_path / "run", "--set", "optimiser.signal=1e38", steps=20))
     assert (status, out) == (1, "")
     assert re.fullmatch(r"wrf-mi: .*not finite.*\n", err.splitlines(keepends=True)[-1])
     assert "Traceback" not in err
@@ -220,10 +222,11 @@ def test_stopped_run_ends_with_status_130(
     assert command.json(["train", "--resume", run])["steps"] == 4
 
 
-def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path) -> None:
-    """A training process receives SIGINT."""
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_signal_to_end_writes_a_checkpoint_to_resume_from(ending: int, folder: Path, tmp_path: Path) -> None:
+    """A training process receives the signal of Ctrl-C, or that of batch systems."""
     out = tmp_path / "run"
-    words = training(folder, out, "--set", "steps=200", "--set", "log_every=1", "--set", "validate_every=200")
+    words = training(folder, out, steps=200, log_every=1, validate_every=200)
     process = subprocess.Popen(
         [sys.executable, "-m", "wrf_mi.cli", *map(str, words)],
         stdout=subprocess.PIPE,
@@ -235,7 +238,7 @@ def test_ctrl_c_writes_a_checkpoint_to_resume_from(folder: Path, tmp_path: Path)
         end = time.monotonic() + SECONDS_TO_START
         while not (out / "log.jsonl").exists() and process.poll() is None and time.monotonic() < end:
             time.sleep(0.02)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(ending)
         stdout, stderr = process.communicate(timeout=SECONDS_TO_START)
     assert process.returncode == 130, stderr
     assert stdout == ""
@@ -271,6 +274,9 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.Capt
     with Watch() as watch:
         watch.on_progress("training", 0.25, progress())
         watch.on_progress("training", 0.5, progress(step=20, validation_score=0.5))
+        of_rows = {"validation_rows": 9, "validation_m": 0.05, "test_m": 0.17}
+        watch.on_progress("fold0", 0.5, progress(step=20, validation_score=0.95, **of_rows))
+        watch.on_progress("paths", 0.5, progress(step=20, validation_score=0.95, **of_rows, far_score=0.79))
         watch.on_progress("fold1", 0.5, progress(step=20, validation_score=0.75, held_out=False))
         watch.on_progress("fold2", 0.5, progress(step=20, validation_score=float("nan")))
         watch.on_progress("vae", 0.5, progress(step=20, validation_score=0.5, gaussians=0))
@@ -278,12 +284,31 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.Capt
             watch.on_progress(stage, share)
     assert capsys.readouterr().err.splitlines() == [
         "training 20/40  loss 0.2500  SSIM 0.500 (validation rows)  8 Gaussians  1:01 left",
+        "fold0 20/40  loss 0.2500  SSIM 0.950 (9 validation rows, median 0.05 m from training rows, test rows 0.17 m)"
+        "  8 Gaussians  1:01 left",
+        "paths 20/40  loss 0.2500  SSIM 0.950 (9 validation rows, median 0.05 m from training rows, test rows 0.17 m; "
+        "0.790 of those as far as test rows)  8 Gaussians  1:01 left",
         "fold1 20/40  loss 0.2500  SSIM 0.750 (validation rows, now trained on)  8 Gaussians  1:01 left",
         "fold2 20/40  loss 0.2500    8 Gaussians  1:01 left",
         "vae 20/40  loss 0.2500  SSIM 0.500 (validation rows)  1:01 left",
         "a",
         "b",
     ]
+
+
+def test_watch_states_the_time_left_of_a_long_stage_where_there_is_no_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = 100.0
+    monkeypatch.setattr("time.perf_counter", lambda: now)
+    with Watch() as watch:
+        for second in range(513):
+            now = 100.0 + second
+            watch.on_progress("mapping", second / 512)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:3] == ["mapping", "mapping  1%  8:27 left", "mapping  2%  8:22 left"]
+    assert lines[-1] == "mapping  62%  3:12 left"
+    assert len(lines) == 8  # at 0, 5, 10, 20, 40, ... 320 seconds
 
 
 def test_watch_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

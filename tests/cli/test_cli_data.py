@@ -123,7 +123,7 @@ def test_import_states_columns_assumptions_and_the_next_command(
         "device     kept, not used             120",
         "projected to metres east and north",
         "by reciprocity",
-        f"{folder}: no fault, no suspicion\nnext: wrf-mi train {folder}\n",
+        f"{folder}: no fault, no suspicion\nnext: wrf-mi train {folder} [--scene SCENE] --out RUN\n",
     ):
         assert line in out
     assert {"import.yml", "plan.png"} < contents(folder)

@@ -34,6 +34,19 @@ def test_bad_arguments_are_refused(command: Command) -> None:
 
 
 @pytest.mark.parametrize(
+    ("words", "asked"),
+    [
+        ("train data --bogus", "wrf-mi train"),
+        ("train data --out run extra", "wrf-mi train"),
+        ("data check data --bogus 3", "wrf-mi data check"),
+        ("--bogus data list", "wrf-mi"),
+    ],
+)
+def test_unknown_arguments_name_the_help_of_their_command(words: str, asked: str, command: Command) -> None:
+    command.refused(words.split(), f"^{asked}: unrecognized arguments: .*; see {asked} --help$")
+
+
+@pytest.mark.parametrize(
     ("option", "message"),
     [
         ("--set steps", "--set steps: expected key=value"),

@@ -60,3 +60,13 @@ def test_bad_input_is_one_line_and_nothing_is_written(
     np.savetxt("millimetres.xyz", np.random.default_rng(1).uniform(0, [5000, 4000, 2500], (2000, 3)))
     command.refused(["mesh", *words.split()], message)
     assert not Path("scene").exists()
+
+
+def test_mesh_reports_faults_of_the_scene_that_it_writes(tmp_path: Path, command: Command) -> None:
+    room = trimesh.creation.box(bounds=[[0, 0, 0], [4, 3, 2.5]])
+    room.invert()
+    corners = [[0.001, y, z] for y, z in ((0.5, 0), (2.5, 0), (2.5, 2.5), (0.5, 2.5))]
+    sheet = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    trimesh.util.concatenate([room, sheet]).export(tmp_path / "room.obj")
+    facts = command.json(["mesh", tmp_path / "room.obj", "--out", tmp_path / "scene"])
+    assert [finding["kind"] for finding in facts["check"]["findings"]] == ["double-sheet"]

@@ -12,9 +12,11 @@ from calling import call, refused, stored
 from changed_folders import error_line, refusal
 from small_fits import official, settings
 
-from wrf_mi.core import Record, Split
+from wrf_mi.checking.rows import few_rows
+from wrf_mi.cli.data import render, summary
+from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.datasets import load
-from wrf_mi.datasets.observations import scorable
+from wrf_mi.datasets.observations import fitted_receivers, scorable, warn_of_left_out, warn_of_one_place
 from wrf_mi.models import ray_tracing
 from wrf_mi.runs import api as runs
 from wrf_mi.runs import sweep
@@ -184,3 +186,48 @@ def test_a_stopped_trace_goes_on_with_its_paths(
     assert status == 0, err
     assert (out / "paths.npz").stat().st_mtime_ns == written
     assert read_run(out).metrics["paths"] > 0
+
+
+MANY = tuple(Receiver(f"ap{number}", np.zeros(3), np.array([0.0, 0, 0, 1])) for number in range(300))
+SIX = "ap0{0}, ap1{0}, ap2{0}, ap3{0}, ap4{0}, ap5{0} and 294 more"
+
+
+def strengths_of_many(dbm: float) -> tuple[Record, Split]:
+    """Twelve rows of 300 receivers, of which the first three train, and their split."""
+    rows = np.arange(12)
+    tx_pos_m = np.stack([rows, rows % 3, np.ones(12)], axis=1).astype(float)
+    observation = np.full((300, 12), -60.0, np.float32)
+    observation[:, :3] = dbm
+    split = Split("official", 0, rows[:3], rows[:0], rows[3:])
+    return Record("many", "rssi", tx_pos_m, MANY, observation, official=(rows[:3], rows[3:])), split
+
+
+def test_refusal_of_hundreds_of_receivers_names_six():
+    record, split = strengths_of_many(np.nan)
+    refusal(fitted_receivers, record, [split], rf"by any receiver \({SIX.format('')}\); use another split")
+
+
+def test_warning_of_hundreds_of_receivers_left_out_names_six(caplog: pytest.LogCaptureFixture):
+    warn_of_left_out(strengths_of_many(-60)[0], {receiver.name: 1 for receiver in MANY})
+    assert caplog.messages[0].endswith(f"with their number of rows: {SIX.format(' (1)')}")
+
+
+def test_suspicion_of_hundreds_of_receivers_with_few_rows_names_six():
+    record, _ = strengths_of_many(-60)
+    silent = changed(record, (np.s_[:299, 3:], np.nan))
+    ((_, text),) = few_rows(replace(silent, official=None))
+    assert "received by ap0 (3), ap1 (3), ap2 (3), ap3 (3), ap4 (3), ap5 (3) and 293 more: fits" in text
+
+
+def test_summary_of_hundreds_of_receivers_names_six():
+    assert f"received:         {SIX.format(' 12')}\n" in render(summary(strengths_of_many(-60)[0]))
+
+
+def test_training_rows_at_one_place_are_told(caplog: pytest.LogCaptureFixture):
+    record, split = strengths_of_many(-60)
+    warn_of_one_place(record, [split])
+    assert not caplog.messages
+    tx_pos_m = record.tx_pos_m.copy()
+    tx_pos_m[split.train] = 1.0
+    warn_of_one_place(replace(record, tx_pos_m=tx_pos_m), [split])
+    assert "all of 3 training rows are at one place" in caplog.messages[0]

@@ -250,6 +250,7 @@ def test_fractions_count_from_the_rows_of_each_split(options: dict, part: str, c
 
 RECORD, RECEIVERS = make_record(), several_receivers(3)
 NOWHERE = replace(several_carriers(False), tx_pos_m=np.full((150, 3), np.nan))
+ONE_PLACE = replace(make_record(folds=False), tx_pos_m=np.full((50, 3), 2.0))
 NO_RUNS = r"made-up: split other-run .* {}; give a column run .* with two"
 
 
@@ -277,6 +278,9 @@ NO_RUNS = r"made-up: split other-run .* {}; give a column run .* with two"
         (replace(RECORD, official=None), {"name": "official"}, "no official split"),
         (make_record(4, folds=False), {"name": "blocked"}, "4 distinct positions"),
         (make_record(2), {"name": "trajectory"}, "2 rows"),
+        (ONE_PLACE, {"name": "blocked"}, "all of 50 rows are at one place; measure at more places$"),
+        (make_record(1), {"name": "random"}, "all of 1 rows are at one place; measure at more places$"),
+        (make_record(1, folds=False), {"name": "none"}, "all of 1 rows are at one place; measure at more places$"),
         (NOWHERE, {"name": "frequency"}, "positions are not known, which this split holds out"),
         (RECEIVERS, {"name": "receiver+30:2"}, r"gateway2 received 14 of the training rows, and .*\+30:2 leaves it 30"),
         *(

@@ -1,7 +1,6 @@
 """Exported fields: PLY of 3D Gaussian splatting in other programs' readers, and files that give back the run."""
 
 import csv
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 import trimesh
 from calling import call, refused
 from changed_folders import error_line
+from programs import installed
 from small_fits import settings
 
 from wrf_mi.core import Record
@@ -27,10 +27,6 @@ SINGLE = 1e-5
 """Logarithms and logits are stored in single precision: 1e-7 of values up to 14."""
 COMPRESSED_M = 1e-2
 """Compressed PLY stores positions of each 256 Gaussians in 11 or 10 bits of their box, here of some 8 m."""
-CHECKOUT = Path(__file__).resolve().parents[2]
-SPLAT_TRANSFORM = shutil.which("splat-transform") or shutil.which(
-    "splat-transform", path=CHECKOUT / "node_modules/.bin"
-)
 
 
 @pytest.fixture(scope="module")
@@ -99,13 +95,13 @@ def test_open3d_reads_the_attributes(runs: dict[str, Path], tmp_path: Path) -> N
     np.testing.assert_array_equal(points.opacity.numpy().ravel(), read["opacity"])
 
 
-@pytest.mark.skipif(SPLAT_TRANSFORM is None, reason="needs npm's @playcanvas/splat-transform on the PATH")
 @pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+"])
 def test_splat_transform_converts_it_and_back(runs: dict[str, Path], tmp_path: Path, model: str) -> None:
+    splat_transform = installed("splat-transform")
     read = exported(runs[model], tmp_path / "field.ply")
 
     def convert(source: str, out: str) -> Path:
-        asked = [str(SPLAT_TRANSFORM), "-q", "-w", str(tmp_path / source), str(tmp_path / out)]
+        asked = [splat_transform, "-q", "-w", str(tmp_path / source), str(tmp_path / out)]
         done = subprocess.run(asked, capture_output=True, text=True, timeout=120, check=False)
         assert done.returncode == 0, done.stderr
         return tmp_path / out
@@ -154,6 +150,7 @@ def test_damaged_and_other_files_are_refused(runs: dict[str, Path], tmp_path: Pa
         ({"export/format": np.array(9)}, "format 9, this version reads 1"),
         ({"export/format": None}, "not written by export"),
         ({"export/config": None}, "incomplete"),
+        ({"param/position": np.full_like(arrays["param/position"], np.nan)}, "param/position has numbers that are not"),
     ):
         np.savez(file, **{key: values for key, values in (arrays | change).items() if values is not None})
         error_line(import_field, file, tmp_path / "run", message)

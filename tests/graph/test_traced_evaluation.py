@@ -28,8 +28,8 @@ from wrf_mi.graph.receivers import Form
 from wrf_mi.graph.settings import TracedConfig
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.tasks.scores import ssim
-from wrf_mi.tracing.paths.field_calculator import slab
 from wrf_mi.tracing.paths.instrument_parameters import pose_names, receiver_pose
+from wrf_mi.tracing.slabs import slab
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import write_ble_folder
+from wrf_mi.maps import locate_calibration
 from wrf_mi.maps.grid import Candidates, candidates_of, grid_over
 from wrf_mi.maps.locate import locate
 from wrf_mi.maps.locate_calibration import FILE, Located, choose, fit_silence, widest
@@ -221,6 +224,16 @@ def test_offset_of_the_power_widens_regions(fitted: tuple[Path, Record]) -> None
     [
         ("anchor0_dbm,anchor1_dbm\n-50,-60\n", "no column of receiver anchor2; name one anchor2_dbm"),
         ("rssi_0,rssi_1,rssi_2,rssi_9\n-5,-6,-7,-8\n", "rssi_9 names no receiver of the run"),
+        (
+            "rssi_1,rssi_8,rssi_9\n-6,-7,-8\n",
+            "no column of receivers anchor0, anchor2, and columns rssi_8, rssi_9 name no",
+        ),
+        (
+            ",".join(f"rssi_{k}" for k in (0, 1, 2, *range(10, 19))) + "\n" + "-5," * 11 + "-5\n",
+            "columns rssi_10, rssi_11, rssi_12, rssi_13, rssi_14, rssi_15 and 3 more",
+        ),
+        ("x,y,BSSID,RSSI\n1,1,8,-50\n1,1,9,-60\n", "no strengths of receivers anchor0, anchor1, anchor2 among 8, 9"),
+        ("ap1 rss,ap2 rss,x,y\n-50,-60,1,1\n", "no strengths of receivers anchor0, anchor1, anchor2 among ap1, ap2"),
         ("rssi_0,rssi_1,rssi_2,anchor2_dbm\n-5,-6,-7,-8\n", "anchor2_dbm and rssi_2 are of one receiver"),
         ("rssi_0,rssi_1,rssi_2\n-5,-6,-7\n,,\n", "row 2: no receiver of the run received anything"),
         ("rssi_0,rssi_1,rssi_2\n-5,loud,-7\n", "row 1: rssi_1 is 'loud'"),
@@ -246,6 +259,48 @@ def test_empty_fields_are_receivers_without_a_value(fitted: tuple[Path, Record],
     assert true_m is None
 
 
+def scans(record: Record, rows: range) -> str:
+    """A table with a row for each reading, as a scanner writes it, of rows of a record."""
+    lines = ["time;X (cm);Y (cm);BSSID;RSSI"]
+    for row in rows:
+        place = ";".join(f"{100 * value:.6f}" for value in record.tx_pos_m[row, :2])
+        lines += [f"{row};{place};{number};{dbm}" for number, dbm in enumerate(record.observation[:, row])]
+        lines.append(f"{row};{place};aa:bb:cc:00:00:0{row % 10};-80")
+    return "\n".join(lines)
+
+
+def test_table_of_single_readings_is_read_as_by_the_import(fitted: tuple[Path, Record], tmp_path: Path) -> None:
+    _, record = fitted
+    (tmp_path / "scans.csv").write_text(scans(record, range(5)))
+    strengths_dbm, true_m = read_observations(tmp_path / "scans.csv", record.receivers)
+    np.testing.assert_allclose(strengths_dbm, record.observation[:, :5])
+    np.testing.assert_allclose(true_m, record.tx_pos_m[:5, :2], atol=SINGLE)
+
+
+def test_readings_without_positions_are_grouped_by_time(fitted: tuple[Path, Record], tmp_path: Path) -> None:
+    receivers = fitted[1].receivers
+    (tmp_path / "scans.csv").write_text("time,id,rssi\n7,0,-50\n7,2,-60\n7,0,-52\n8,1,-70\n")
+    strengths_dbm, true_m = read_observations(tmp_path / "scans.csv", receivers)
+    np.testing.assert_array_equal(strengths_dbm, [[-51, np.nan], [np.nan, -70], [-60, np.nan]])
+    assert true_m is None
+
+
+def test_imported_table_is_located_in_the_frame_of_the_import(tmp_path: Path, command: Command) -> None:
+    """Positions of a map projection and networks that were never heard do not keep the file from being read."""
+    rng = np.random.default_rng(3)
+    positions_m = rng.uniform(0.5, 5.5, (40, 2))
+    dbm = strengths(np.column_stack([positions_m, np.full(40, 1.3)])) + rng.normal(0, 1, (3, 40))
+    table = np.column_stack([positions_m + np.array([691_000, 5_335_000]), dbm.T])
+    lines = [",".join(f"{value:.3f}" for value in row) + "," for row in table]
+    file, data = tmp_path / "walk.csv", tmp_path / "data"
+    file.write_text("\n".join(["x,y,rssi_1,rssi_2,rssi_3,rssi_4", *lines]))
+    command.done(["data", "import", file, "--out", data])
+    command.done(["train", data, "--model", "kriging", "--out", tmp_path / "run"])
+    figures = command.json(["locate", tmp_path / "run", "--observed", file, "--out", tmp_path / "out.csv"])
+    assert figures["n"] == 40
+    assert figures["error_m"]["median"] < 2
+
+
 def test_bad_arguments_are_refused(fitted: tuple[Path, Record], tmp_path: Path, command: Command) -> None:
     run, record = fitted
     value = record.observation[:, :2]
@@ -261,6 +316,32 @@ def test_bad_arguments_are_refused(fitted: tuple[Path, Record], tmp_path: Path, 
         with pytest.raises(InputError, match=message):
             locate(folder, strengths_dbm, **options)
     command.refused(["locate", run, "--out", tmp_path / "out.txt"], "written as .csv")
+
+
+def test_fold_that_was_stopped_goes_on_from_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where its predictions could not be stored, as on a full disk."""
+    places = np.random.default_rng(0).uniform(0.5, 5.5, (60, 3)) * [1, 1, 0] + [0, 0, 1]
+    record = record_of(places, strengths(places), 50)
+    run = train(record, "kriging", out=tmp_path / "run")
+    fit, begun = locate_calibration.fit_fold, list[list[str]]()
+
+    def noting(entry: Any, problem: Any, fold: Any, session: Any) -> Any:
+        begun.append([path.name for path in session.folder.iterdir()])
+        (session.folder / "checkpoint.npz").touch()
+        return fit(entry, problem, fold, session)
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(locate_calibration, "fit_fold", noting)
+    monkeypatch.setattr(type(run.fitted), "refit", lambda *_: None)  # as of models that are fitted anew to each fold
+    with monkeypatch.context() as patched:
+        patched.setattr(locate_calibration, "write_arrays", full)
+        with pytest.raises(OSError, match="No space left"):
+            locate(run, np.full((3, 1), -50.0), step_m=0.5)
+    locate(run, np.full((3, 1), -50.0), step_m=0.5)
+    assert begun[:2] == [[], ["checkpoint.npz"]]
+    assert not (run.folder / locate_calibration.FOLDER).exists()
 
 
 def test_widest_form_within_a_standard_error_is_chosen() -> None:

@@ -59,22 +59,44 @@ def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
     assert not {"threshold_dbm", "transmit_power_dbm"} & set(dataset.attrs)
     assert "no signal strengths" in heading(figure)
     titles = [axes.get_title().split(": ")[-1] for axes in figure.axes[:3]]
-    assert titles == ["expected power", "standard deviation", "probability of more than -10 dB"]
+    assert titles == ["expected power", "standard deviation of a reading", "probability of more than -10 dB"]
     assert [axes.get_ylabel().split()[0] for axes in figure.axes[3:]] == ["dB", "dB", "probability"]
     assert "open crosses" not in heading(figure)
     place = {"position_m": [0.0, 0.0, 0.0], "std_m": [0.5, 0.25, 0.0]}
     (run.folder / "receiver_places.json").write_text(json.dumps({run.receivers[0].name: place}))
+    amid = {f"receiver_{axis}": ("receiver", [float(dataset[axis].mean())]) for axis in "xy"}
+    dataset = dataset.assign_coords(amid)
     estimated = map_figure(dataset, run)
     (ellipse,) = estimated.axes[0].patches
     assert (ellipse.get_width(), ellipse.get_height()) == (1.0, 0.5)
     assert "open crosses: receivers at estimated places" in heading(estimated)
     assert "crosses: receivers," not in heading(estimated)
+    assert "not drawn" not in heading(estimated)
     split = make_splits(run.problem.record, "official")[0]
     assert len(split.test) <= 12 < len(split.all_train)
     for most, trained in ((picture.MOST_POINTS, len(split.all_train)), (12, -(-len(split.all_train) // 3))):
         monkeypatch.setattr(picture, "MOST_POINTS", most)
         shown = {name: len(values) for name, values in dots(map_figure(dataset, run), 0).items()}
         assert shown == {"trained": trained, "other": len(split.test)}
+
+
+def test_picture_leaves_estimated_receivers_far_outside_out(
+    two_bands: Record, tmp_path: Path, command: Command
+) -> None:
+    """Their cross or ellipse would shrink the map to a dot."""
+    data = write_ble_folder(tmp_path / "data", two_bands)
+    dataset, near, run = mapped(data, tmp_path, command, "--frequency", BANDS_HZ[1])
+    name = run.receivers[0].name
+    for place_m, std_m in (([-400.0, 20, 2], 1.0), ([2.0, 2, 2], 400.0)):
+        place = {"position_m": place_m, "std_m": [std_m] * 3}
+        (run.folder / "receiver_places.json").write_text(json.dumps({name: place}))
+        moved = dataset.assign_coords(
+            {f"receiver_{axis}": ("receiver", [x]) for axis, x in zip("xyz", place_m, strict=True)}
+        )
+        figure = map_figure(moved, run)
+        assert np.ptp(figure.axes[0].get_xlim()) < 2 * np.ptp(near.axes[0].get_xlim())
+        outside = "1 estimated outside of the map, not drawn" in heading(figure)
+        assert (outside, len(figure.axes[0].patches)) == ((True, 0) if place_m[0] < 0 else (False, 1))
 
 
 def test_picture_of_channels_has_levels_at_the_transmit_power(tmp_path: Path, command: Command) -> None:

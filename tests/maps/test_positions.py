@@ -11,8 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wrf_mi.core import InputError
-from wrf_mi.maps.grid import grid_over, surface_of
+from wrf_mi.maps.grid import grid_over, reachable, surface_of
 from wrf_mi.scene.coordinates import Y_UP
+from wrf_mi.scene.make import make_scene
+from wrf_mi.tracing import open_scene
 
 ROUNDING_M = 1e-6
 """Rounding of coordinates of at most a hundred metres in float64, with room to spare."""
@@ -86,3 +88,17 @@ def test_bad_meshes_and_steps_are_refused(file: str, step: float | None, message
     (tmp_path / "empty.ply").write_text("nothing")
     with pytest.raises(InputError, match=message):
         surface_of(tmp_path / file, step)
+
+
+@pytest.mark.parametrize("door_m", [0.0, 0.9])
+def test_positions_behind_a_wall_without_a_door_are_not_reached(door_m: float, tmp_path: Path) -> None:
+    """Two rooms of 4 m x 3 m; the corners double back along the wall between them."""
+    corners = [(4, 0), (4, 1), (4, 0), (0, 0), (0, 3), (4, 3), (4, 1 + door_m), (4, 3), (8, 3), (8, 0), (4, 0)]
+    np.savetxt(tmp_path / "layout.csv", corners, delimiter=",", header="x,y", comments="")
+    scene = open_scene(make_scene(tmp_path / "layout.csv", tmp_path / "rooms", height_m=2.5).folder, 2.4e9)
+    x, y = np.meshgrid(np.arange(0.25, 8, 0.5), np.arange(0.6, 2.8, 0.5))
+    places = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.3)])
+    starts = np.array([[1.0, 1.0, 0.8], [np.nan, 1.0, 0.8]])
+    reached = reachable(scene, places, starts)
+    np.testing.assert_array_equal(reached, (places[:, 0] < 4) | (door_m > 0))
+    assert reachable(None, places, starts).all()

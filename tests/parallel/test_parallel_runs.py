@@ -110,10 +110,13 @@ def test_parallel_trace_and_its_prediction_equal_serial(flat: Path, room: Path, 
 def test_parallel_trace_of_random_paths_equals_serial(
     flat: Path, room: Path, two: Scheduler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Diffuse reflections are searched from receivers, diffraction from transmitters."""
+    """Diffuse reflections and diffraction, both searched for from transmitters."""
     monkeypatch.setattr(ray_tracing, "TRACED_AT_LEAST", 4)  # one part for each worker
     for kind, code in (("scattering", 2), ("diffraction", 8)):
-        known: dict[str, Any] = {"scene": room, "settings": TraceOptions(depth=1, rays=1 << 8, **{kind: True})}
+        known: dict[str, Any] = {
+            "scene": room,
+            "settings": TraceOptions(depth=1, rays=1 << 8, scattering_coefficient=0.3, **{kind: True}),
+        }
         serial = train(flat, "ray-tracing", out=tmp_path / f"{kind}-serial", **known).folder
         parallel = train(flat, "ray-tracing", out=tmp_path / f"{kind}-parallel", scheduler=two, **known).folder
         arrays = arrays_in(serial / "paths.npz")

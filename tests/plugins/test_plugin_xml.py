@@ -191,17 +191,26 @@ STANDARD_ERRORS = 4.5
 
 @pytest.fixture(scope="module")
 def names(one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The names that the page's scripts leave behind, run one after the other beside a run folder."""
+    """The names that the page's scripts leave behind, run one after the other beside a run folder.
+
+    A warning of Mitsuba is an error, such as that of a film whose pixel format does not fit the variant.
+    """
     folder = tmp_path_factory.mktemp("page")
     write_run(folder / "runs" / "first", one_gateway, "wrf-gs+")
     (xml,) = blocks(PAGE, "xml")
     (folder / "scene.xml").write_text(xml)
     left: dict[str, Any] = {"scenes": []}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        for number, script in enumerate(blocks(PAGE, "python")):
-            exec(compile(script, f"{PAGE.name}, script {number}", "exec"), left)
-            left["scenes"].append(left.get("scene"))
+    logger = mi.logger()
+    error_level = logger.error_level()
+    logger.set_error_level(mi.LogLevel.Warn)
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            for number, script in enumerate(blocks(PAGE, "python")):
+                exec(compile(script, f"{PAGE.name}, script {number}", "exec"), left)
+                left["scenes"].append(left.get("scene"))
+    finally:
+        logger.set_error_level(error_level)
     return left
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
-import subprocess
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from calling import SMALL
 from commands import rows_of
+from pages import PHONE, open_page
+from playwright.sync_api import Browser
 from test_compare import captured, edit_metrics, make_run
 
 from wrf_mi.cli.main import build_parser
@@ -26,6 +28,7 @@ from wrf_mi.runs.api import plan_run, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.compare_page import changed_settings, command
 from wrf_mi.runs.compare_tables import (
+    NO_GAIN,
     OTHER_ROWS,
     best_run,
     common,
@@ -35,10 +38,8 @@ from wrf_mi.runs.compare_tables import (
     method_rows,
 )
 from wrf_mi.runs.folder import AntennaOptions, RunRequest, read_config, start_run
-from wrf_mi.runs.results import Results
+from wrf_mi.runs.results import Results, warnings_of
 from wrf_mi.runs.run import open_run
-
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 
 def strengths(
@@ -228,6 +229,23 @@ def test_commands_parse_and_give_the_same_configuration(folder: Path, flat_folde
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_run_that_the_command_calls_no_better_than_a_constant_is_not_praised(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / name, noise=noise) for name, noise in (("constant", 0.1), ("fine", 0.1))]
+    block = {"median": 0.9, "mean": 0.9, "p10": 0.8, "p90": 1.0, "gain": 0.0, "gain_error": 0.1}
+    for run, beaten in zip(runs, (False, True), strict=True):
+        edit_metrics(constant=block | {"beaten": beaten})(run)
+    text = unescape(compare(runs, tmp_path / "out").read_text())
+    verdicts = {
+        row["run"]: row["verdict"] for row in rows_of(tmp_path / "out" / "differences.csv") if "IDW" in row["against"]
+    }
+    assert verdicts == {"constant": NO_GAIN, "fine": "better"}
+    assert text.count('class="better"') == 1
+    lines = [warnings_of(json.loads((run / "metrics.json").read_text())) for run in runs]
+    assert lines[1] == []
+    assert f"constant: {lines[0][0]}" in text
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_settings_of_a_run_are_those_that_differ(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
     steps = [*SMALL, "loss.ssim_weight=0.25"]
     run = train(folder, "wrf-gs+", out=tmp_path / "run", settings=steps, seed=2).folder
@@ -287,26 +305,23 @@ def test_page_is_one_well_formed_file_of_several_data_sets(tmp_path: Path) -> No
     ]
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
-def test_a_click_sorts_the_table_in_a_browser(tmp_path: Path) -> None:
+def test_a_click_sorts_the_table_in_a_browser(browser: Browser, tmp_path: Path) -> None:
     runs = [make_run(tmp_path / name, noise=noise) for name, noise in (("m", 0.2), ("a", 0.4), ("z", 0.1))]
-    page = compare(runs, tmp_path / "out")
-    press = """
-    const table = document.querySelectorAll('table.sorts')[1];
-    const names = () => [...table.tBodies[0].rows].map(row => row.cells[0].textContent).slice(0, 4).join(' ');
-    const head = [...table.tHead.rows[0].cells].find(cell => cell.textContent === 'median').firstElementChild;
-    head.click(); const up = names(); head.click();
-    document.title = up + ' / ' + names() + ' / ' + (document.documentElement.scrollWidth <= innerWidth);
-    """
-    page.write_text(page.read_text().replace("</script>", press + "</script>"))
-    asked = [str(CHROMIUM), "--headless", "--no-sandbox", "--dump-dom", "--window-size=500,900", f"file://{page}"]
-    done = subprocess.run(asked, capture_output=True, text=True, timeout=120, check=True)
-    found = re.search("<title>(.*?)</title>", done.stdout)
-    assert found is not None
-    up, down, fits = found[1].split(" / ")
-    assert [name for name in up.split() if name in ("a", "m", "z")] == ["a", "m", "z"]
-    assert [name for name in down.split() if name in ("a", "m", "z")] == ["z", "m", "a"]
-    assert fits == "true"  # wide tables and pictures scroll by themselves
+    view = open_page(browser, compare(runs, tmp_path / "out"), PHONE)
+    table = view.page.locator("table.sorts").nth(1)
+    median = table.locator("button", has_text=re.compile("^median$"))
+
+    def names() -> list[str]:
+        cells = table.locator("tbody tr td:first-child").all_inner_texts()
+        return [name for name in cells if name in ("a", "m", "z")]
+
+    median.click()
+    assert names() == ["a", "m", "z"]
+    median.click()
+    assert names() == ["z", "m", "a"]
+    assert view.page.evaluate("document.documentElement.scrollWidth") == PHONE[0]  # wide tables and pictures scroll
+    assert view.complaints == []
+    view.page.close()
 
 
 def test_maps_show_errors_and_the_best_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,11 +38,11 @@ WHOLE = SHOEBOX | {"ceiling": ("itu_metal", SHOEBOX["ceiling"][1])}
 KNOWN = {name: part for name, part in SHOEBOX.items() if name != "ceiling"}
 STANDING = Rotation.from_matrix([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 ARRAY = Receiver("gateway1", np.array([5.2, 2.4, 1.1]), STANDING.as_quat(), array_m=planar_array(4, 4, 0.16))
-SETTINGS = (
+FIELD_ALONE = (
     *("steps=300", "validate_every=80", "log_every=40", "checkpoint_every=80", "deterministic=true"),
     *("initial.gaussians=24", "density.every=60", "density.max_gaussians=30", "network.width=32", "network.layers=2"),
-    *("traced.reflections=1", "traced.depth=1", "traced.rays=4096"),
 )
+SETTINGS = (*FIELD_ALONE, "traced.reflections=1", "traced.depth=1", "traced.rays=4096")
 FLOAT32_GREY = 1e-4
 """Of greys that a batch of transmitters and a single one give: sums in single precision."""
 
@@ -69,7 +69,9 @@ def data(rooms: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def config(*settings: str, with_scene: bool = True) -> TrainConfig:
-    return with_settings(default_config("spectrum", with_scene), [*SETTINGS, *settings])
+    return with_settings(
+        default_config("spectrum", with_scene), [*(SETTINGS if with_scene else FIELD_ALONE), *settings]
+    )
 
 
 Fit = Callable[..., Run]
@@ -153,7 +155,7 @@ def test_run_that_validated_no_step_opens_with_an_infinite_reach(fit: Fit, tmp_p
 
 
 def test_receiver_model_of_a_field_alone_is_a_choice(data: Path, tmp_path: Path, command: Command) -> None:
-    settings = [part for setting in ("steps=20", *SETTINGS[1:]) for part in ("--set", setting)]
+    settings = [part for setting in ("steps=20", *FIELD_ALONE[1:]) for part in ("--set", setting)]
     receiver = ["--receiver-model", "array", "--out", tmp_path / "run"]
     command.done(["train", data, "--model", "wrf-gs+", *receiver, *settings])
     prediction = stored(tmp_path / "run")["prediction"]

@@ -56,7 +56,7 @@ def test_csv_predictions_equal_npz_predictions(
     printed = command.json(["predict", runs[model], "--tx", positions, "--out", out])
     assert printed["arrays"]["prediction"] == [2, 2]
     assert ("std" in arrays) == (model == "kriging")
-    units = {"prediction": "dbm", "std": "std_db"} if model == "kriging" else {"prediction": "dbm"}
+    units = {"prediction": "dbm"} | ({"std": "std_db", "std_mean": "std_mean_db"} if model == "kriging" else {})
     table = read_csv(out)
     given = positions.read_text().splitlines()[0].split(",")
     assert table.header == [*given, *(f"{name}_{unit}" for unit in units.values() for name in NAMES)]
@@ -113,5 +113,5 @@ def test_comparison_shows_names_without_formulas(runs: dict[str, Path], tmp_path
 def test_length_over_headings_is_refused(plain_flat_folder: Path, tmp_path: Path, command: Command) -> None:
     assert load(plain_flat_folder).tx_heading_rad is None
     given = ["train", plain_flat_folder, "--model", "kriging", "--out", tmp_path / "run", "--set", "heading_length=1"]
-    command.refused(given, "plain: has no headings for kriging's heading_length; omit the setting")
+    command.refused(given, "setting heading_length=1.0: no effect on kriging of .*: the data have no headings; omit it")
     assert not (tmp_path / "run").exists()

@@ -107,7 +107,7 @@ PANEL = "constants: {{panel: {{relative_permittivity: 2.9, conductivity: 0.01, t
         ("surfaces: {table: iron}", "surfaces: table: unknown material 'iron'; known are floor, .*itu_metal"),
         ("thickness_m: {itu_wood: -1}", "thickness_m: itu_wood is -1; give metres above 0"),
         ("thickness_m: {itu_wood: thin}", "thickness_m: itu_wood is 'thin'; give metres above 0"),
-        ("walls: {}", "give the keys rules, surfaces, thickness_m, constants, velocities_mps, no others"),
+        ("walls: {}", "give the keys rules, surfaces, thickness_m, constants, scattering, velocities_mps, no others"),
         ("rules: itu_wood", "rules must be a mapping"),
         ("rules: {", "not YAML"),
         (PANEL.format("conductivity_exponent: 1"), "panel: give relative_permittivity, .* with"),

@@ -86,7 +86,7 @@ def test_specular_signals_are_reciprocal(bare: Any) -> None:
 
 def test_scattered_waves_come_from_their_last_point(bare: Any) -> None:
     ends = [Receiver("0", np.array([2.0, 3.0, 1.2]), np.array([0.0, 0.0, 0.0, 1.0]))]
-    options = TraceOptions(scattering=True, depth=1, rays=1 << 8)
+    options = TraceOptions(scattering=True, scattering_coefficient=0.3, depth=1, rays=1 << 8)
     paths = trace_paths(bare, RECEIVER.position_m, ends, options).paths
     one = paths.select(np.flatnonzero((paths.interactions == 2).any(axis=1))[:1])
     found = array_channels(one, RECEIVER, ARRAY_M, FREQUENCY_HZ)[0, :, 0]
@@ -174,7 +174,7 @@ def test_channels_are_those_of_a_search_at_the_carrier(room: Path) -> None:
 def test_scattered_power_does_not_depend_on_the_carrier_of_the_search(tmp_path: Path) -> None:
     """A pane is nearly transparent at 5.8 GHz, so that a search there draws few of its scattered paths."""
     write_scene(tmp_path, {"pane": ("itu_glass", sheet(0, 0.0, (0.0, 6.0), (0.0, 3.0)))}, "test")
-    carriers, options = (2.4e9, 5.8e9), TraceOptions(scattering=True, transmission=True, depth=1, rays=1 << 17)
+    carriers, options = (2.4e9, 5.8e9), TraceOptions(scattering=True, scattering_coefficient=0.3, depth=1, rays=1 << 17)
     receiver = replace(furnished.RECEIVERS[1], position_m=np.array([2.0, 3.0, 1.5]))
     scenes = [open_scene(tmp_path, carrier_hz) for carrier_hz in carriers]
     power_db, counts = np.empty((2, 2)), []  # [search, carrier]

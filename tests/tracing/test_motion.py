@@ -16,7 +16,7 @@ from wrf_mi.receivers import csi
 from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.tracing import TraceOptions, load_trace, save_trace, trace_paths
 from wrf_mi.tracing.paths.corrected_scene import write_corrected_scene
-from wrf_mi.tracing.sionna.path_solver import scattering_materials
+from wrf_mi.tracing.sionna.scattering import scattering_materials
 
 OF_SIONNA = 1e-4
 """Share of the largest shift: Sionna RT computes directions from points in single precision."""
@@ -58,7 +58,8 @@ def sionna_shifts(scene: Any, options: TraceOptions) -> tuple[np.ndarray, np.nda
 
 
 def test_shifts_of_all_kinds_of_paths_are_sionna_rts(tmp_path: Path) -> None:
-    scene, options = furnished(tmp_path), TraceOptions(depth=2, diffraction=True, scattering=True, rays=4096)
+    kinds: dict[str, Any] = {"diffraction": True, "scattering": True, "scattering_coefficient": 0.3}
+    scene, options = furnished(tmp_path), TraceOptions(depth=2, rays=4096, **kinds)
     moving = {"tx_velocity_mps": TX_MPS[None], "rx_velocity_mps": RX_MPS[None]}
     traced = trace_paths(scene, TX_M[None], receiver(RX_M), options, **moving)
     assert set(np.unique(traced.paths.interactions)) == {0, 1, 2, 4, 8}

@@ -207,6 +207,14 @@ def test_rays_are_shot_once_for_a_geometry(shoebox, divided, monkeypatch):
     assert shot(shoebox) > 0
 
 
+@pytest.mark.parametrize(("planes", "reflections"), [(5, 3), (200_000, 8)])  # beyond 64 bits: ranks
+def test_distinct_chains_are_those_of_numpy(planes, reflections):
+    rng = np.random.default_rng(0)
+    rows = rng.integers(-1, planes, (300, reflections))[rng.integers(0, 300, 1000)]
+    np.testing.assert_array_equal(search_module._unique_rows(rows), np.unique(rows, axis=0))
+    assert search_module._unique_rows(rows[:0]).shape == (0, reflections)
+
+
 def test_number_of_rays_converges(shoebox):
     ends = inside(5), receiver([1.0, 1.0, 1.0])
     found = trace_paths(shoebox, *ends, replace(UPRIGHT, rays="auto", depth=2))
@@ -254,7 +262,7 @@ def test_scattering_takes_power_from_reflections(shoebox):
     found = trace_paths(shoebox, tx, rx, options)
     diffuse = (found.paths.interactions == 2).any(axis=1)
     mirrored = found.paths.select(~diffuse)
-    np.testing.assert_array_equal(mirrored.length_m, plain.length_m)
+    np.testing.assert_allclose(mirrored.length_m, plain.length_m, rtol=0, atol=EXACT_M)
     expected = np.where(plain.bounces == 1, np.sqrt(1 - 0.6**2), 1)
     np.testing.assert_allclose(np.abs(mirrored.gain / plain.gain), expected, rtol=SINGLE)
     power = np.bincount(found.paths.tx[diffuse], np.abs(found.paths.gain[diffuse]) ** 2, 3)
@@ -271,7 +279,7 @@ def test_wrong_arguments_are_refused(empty):
         with pytest.raises(InputError, match="give one at least"):
             trace_paths(empty, tx, rx)
     wrong_values = {"depth": (-1, 99), "reflections": (-1,), "rays": (0, "many"), "seed": (-1,)}
-    for name, values in (wrong_values | {"scattering_coefficient": (0.0,)}).items():
+    for name, values in (wrong_values | {"scattering_coefficient": (-0.1, 1.1)}).items():
         for value in values:
             with pytest.raises(InputError, match=name):
                 TraceOptions(**{name: value})

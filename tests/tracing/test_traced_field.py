@@ -17,12 +17,12 @@ from wrf_mi.backend.device import to_uint
 from wrf_mi.core import Antenna, InputError
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.paths import traced_field as traced_field_module
-from wrf_mi.tracing.paths.field_calculator import slab
 from wrf_mi.tracing.paths.instrument_parameters import pattern_factor, receiver_pose
 from wrf_mi.tracing.paths.scene_parameters import QUANTITIES
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.sionna.path_solver import field_of, to_buffer
+from wrf_mi.tracing.slabs import slab
 
 Float64 = dr.float64_array_t(mi.Float)
 Tensor64 = dr.tensor_t(Float64)

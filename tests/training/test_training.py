@@ -7,6 +7,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from made_spectra import RECEIVERS, SIZE, small_field
+from scipy.spatial.distance import cdist
 from small_fits import official, settings, stop_after
 
 from wrf_mi.backend.device import to_float
@@ -122,6 +123,20 @@ def test_gradient_that_is_nan_leaves_parameters_unchanged_and_raises_before_the_
     np.testing.assert_equal(trainer.state.params(), before)
     assert not any(m.any() for group in trainer.state.moments()[:2] for m in group.values())
     assert not trainer.state.view_gradient_norm.numpy().any()
+
+
+def test_progress_states_how_far_validation_and_test_rows_are_from_training_rows(one_gateway):
+    received, split = [], official(one_gateway)
+    split = replace(split, train=split.train[8:], validation=np.sort([*split.train[:8], *split.validation]))
+    trainer = Trainer(one_gateway, split, settings("steps=20", "holdout_steps_fraction=1", "validate_every=20"))
+    trainer.run(received.append)
+    at_m, trained_m = one_gateway.tx_pos_m, one_gateway.tx_pos_m[split.train]
+    validation_m, test_m = (cdist(at_m[rows], trained_m).min(axis=1) for rows in (split.validation, split.test))
+    last, far = received[-1], validation_m >= np.median(test_m)
+    assert last.validation_rows == len(split.validation)
+    assert (last.validation_m, last.test_m) == pytest.approx((np.median(validation_m), np.median(test_m)))
+    assert 0 < np.count_nonzero(far) < len(far)
+    assert last.far_score == pytest.approx(np.median(trainer.selection.scores[far]))
 
 
 @pytest.mark.parametrize("model", FIELDS)

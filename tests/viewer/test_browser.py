@@ -1,29 +1,22 @@
-"""Views in a browser: Chromium without a window, where it is installed."""
+"""Views in a browser."""
 
-from collections.abc import Iterator
+import io
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from browser import BROWSER, BROWSERS, Browser
 from made_views import made_view
+from pages import LAPTOP, PHONE, OpenPage, open_page
+from PIL import Image
+from playwright.sync_api import Browser
 
 from wrf_mi.viewer.content import ViewContent
 from wrf_mi.viewer.page import page
 
-pytestmark = pytest.mark.skipif(BROWSER is None, reason=f"no browser: none of {', '.join(BROWSERS)} is installed")
-
-LAPTOP, PHONE = (1366, 768), (390, 844)
+POSITIONS_ALONE = replace(made_view("curve"), scene=None, gaussians=None, paths=None, maps=[])
 ELLIPSOID = 42
 """Corners of a Gaussian's mesh."""
-READY = """
-new Promise((done) => {
-  const look = () => (document.body?.dataset.ready ? done(true) : setTimeout(look, 50));
-  look();
-})
-"""
 TOOLS = """
 const scene = document.getElementById("scene");
 const drawn = () => new Promise((done) => requestAnimationFrame(() => setTimeout(done, 0)));
@@ -74,30 +67,26 @@ CONTROLS = """
 })()
 """
 
-EYE = """Math.hypot(...Object.values(document.getElementById("scene")._fullLayout.scene.camera.eye))"""
 
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    running = Browser(tmp_path_factory.mktemp("browser"))
-    yield running
-    running.close()
-
-
-def opened(browser: Browser, folder: Path, content: ViewContent, size: tuple[int, int]) -> tuple[Any, dict[str, Any]]:
-    """An open view and what it shows at first."""
+def opened(browser: Browser, folder: Path, content: ViewContent, size: tuple[int, int]) -> OpenPage:
+    """An open view, when its scene is drawn."""
     (folder / "view.html").write_text(page(content))
-    tab = browser.open(folder / "view.html", *size)
-    assert tab.run(READY)
-    tab.run(f"{TOOLS}; 0")
-    return tab, tab.run(FIRST)
+    view = open_page(browser, folder / "view.html", size)
+    view.page.wait_for_selector("body[data-ready]")
+    view.page.add_script_tag(content=TOOLS)
+    return view
+
+
+def colourful(screenshot: bytes) -> np.ndarray:
+    """Pixels that show data [height, width]: neither text nor background has colours."""
+    return np.ptp(np.asarray(Image.open(io.BytesIO(screenshot)).convert("RGB"), int), axis=-1) > 40
 
 
 @pytest.mark.parametrize(("size", "observed"), [(LAPTOP, "image"), (PHONE, "level")])
 def test_views_need_no_network_and_answer_their_controls(browser, tmp_path, size, observed):
     content = made_view(observed)
-    tab, first = opened(browser, tmp_path, content, size)
-    assert first == {
+    view = opened(browser, tmp_path, content, size)
+    assert view.page.evaluate(FIRST) == {
         "width": size[0],
         "below": size == PHONE,
         "title": content.title,
@@ -109,35 +98,38 @@ def test_views_need_no_network_and_answer_their_controls(browser, tmp_path, size
         "paths": [3 + 4],  # a direct path and a reflection, each with a gap behind it
         "heights": [0.5],
     }
-    # The scene is drawn: neither text nor background has colours.
-    part = tab.picture()[60 : size[1] // 2 + 100, : size[0] * 2 // 3].reshape(-1, 3).astype(int)
-    assert (np.ptp(part, axis=1) > 40).mean() > 0.02
-    shown = tab.run(CONTROLS)
+    shown = view.page.evaluate(CONTROLS)
     assert shown.pop("chosen").startswith("row 15, SSIM 0.")
     assert shown == {"heights": [1.5], "direct": [3], "fewer": [3, 6, 2 * ELLIPSOID], "ceiling": [3, 6, 6]}
-    assert tab.complaints() == []
-    requests = [url for url in tab.requests() if not url.startswith(("data:", "blob:"))]
+    assert view.complaints == []
+    requests = [url for url in view.requests if not url.startswith(("data:", "blob:"))]
     assert requests == [(tmp_path / "view.html").as_uri()]
-    tab.close()
+    view.page.close()
 
 
 def test_channels_are_drawn_over_subcarriers(browser, tmp_path):
-    content = replace(made_view("curve"), scene=None, gaussians=None, paths=None, maps=[])
-    tab, first = opened(browser, tmp_path, content, PHONE)
+    view = opened(browser, tmp_path, POSITIONS_ALONE, PHONE)
+    first = view.page.evaluate(FIRST)
     assert (first["images"], first["lines"], first["layers"]) == (0, [8, 8], 3)
-    assert tab.complaints() == []
-    tab.close()
+    assert view.complaints == []
+    view.page.close()
 
 
-def test_a_map_alone_is_seen_from_further_back(browser, tmp_path):
-    """Plotly draws flat scenes wider than rooms: their corners would lie outside the picture."""
-    view, away = made_view(), []
-    low = view.receivers_m * [1, 1, 0] + [0, 0, 0.5]
-    flat = replace(view, receivers_m=low, scene=None, gaussians=None, paths=None, rows=None, maps=view.maps[:1])
-    for content in (view, flat):
-        tab, _ = opened(browser, tmp_path, content, LAPTOP)
-        away.append(tab.run(EYE))
-        assert tab.complaints() == []
-        tab.close()
-    assert away[0] == pytest.approx(np.linalg.norm([1.05, 1.55, 1.35]))
-    assert away[1] > 1.2 * away[0]
+def map_alone(stretch: float) -> ViewContent:
+    """A map and receivers at its height, ``stretch`` times as long as the room."""
+    room = made_view()
+    low = room.receivers_m * [stretch, 1, 0] + [0, 0, 0.5]
+    long = replace(room.maps[0], x_m=stretch * room.maps[0].x_m)
+    return replace(room, receivers_m=low, scene=None, gaussians=None, paths=None, rows=None, maps=[long])
+
+
+@pytest.mark.parametrize("stretch", [1.0, 8.0])
+def test_whole_map_is_in_the_picture(browser, tmp_path, stretch):
+    view = opened(browser, tmp_path, map_alone(stretch), PHONE)
+    assert view.complaints == []
+    data = colourful(view.page.get_by_role("img", name="3D view").screenshot())
+    view.page.close()
+    across, along = np.flatnonzero(data.any(axis=0)), np.flatnonzero(data.any(axis=1))
+    assert 0 < across.min() < across.max() < data.shape[1] - 1
+    assert 0 < along.min() < along.max() < data.shape[0] - 1
+    assert np.ptp(across) > data.shape[1] / 2 or np.ptp(along) > data.shape[0] / 2  # not seen from far away

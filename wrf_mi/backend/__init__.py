@@ -16,7 +16,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.errors import BackendError, InputError
+from ..core.errors import BackendError, InputError, LibraryVariableError
 from .libraries import CUDA_VARIABLE, GOOD_FROM, LLVM_VARIABLE, LlvmLibrary, find_cuda, find_llvm, install_line
 from .probe import VARIANTS, try_cuda, try_llvm
 
@@ -183,12 +183,11 @@ def _choose_llvm(fresh: bool) -> Backend:
         if verdict.usable:
             return _llvm(library.path, verdict.version)
         refused.append(f"{library} {verdict.reason}")
-    asked = os.environ.get(LLVM_VARIABLE)
-    if asked:
+    if asked := os.environ.get(LLVM_VARIABLE):
         what = refused[0] if refused else f"{asked} is not a file"
         other = _good_llvm()
         remedy = f"unset it, {other} works" if other else f"unset it and install a newer one: {install_line()}"
-        raise BackendError(f"{LLVM_VARIABLE} is set, but {what}: {remedy}")
+        raise LibraryVariableError(f"{LLVM_VARIABLE} is set, but {what}: {remedy}")
     what = "; ".join(refused) or "none was found"
     raise BackendError(f"no usable LLVM ({what}): {install_line()}")
 
@@ -208,7 +207,7 @@ def _judge_loaded(backend: str) -> Backend:
         remedy = f"call wrf_mi.backend.init() first, or set {CUDA_VARIABLE}={find_cuda()} before Python starts"
         raise BackendError(f"{_TOO_EARLY} did not find the NVIDIA driver: {remedy}")
     if not dr.has_backend(dr.JitBackend.LLVM):
-        raise BackendError(f"{_TOO_EARLY} found no LLVM that it can use: {_other_llvm()}")
+        raise _too_early("found no LLVM that it can use")
     version: tuple[int, ...] = dr.detail.llvm_version()
     path = _loaded_llvm()
     if path is None:
@@ -219,8 +218,7 @@ def _judge_loaded(backend: str) -> Backend:
         usable, reason = verdict.usable, f"which {verdict.reason}"
     text = ".".join(map(str, version))
     if not usable:
-        library = f"LLVM {text} ({path or 'its file is not known'})"
-        raise BackendError(f"{_TOO_EARLY} loaded {library}, {reason}: {_other_llvm()}")
+        raise _too_early(f"loaded LLVM {text} ({path or 'its file is not known'}), {reason}")
     return _llvm(path, text)
 
 
@@ -236,11 +234,18 @@ def _loaded_llvm() -> Path | None:
     return Path(name) if name and Path(name).is_file() else None
 
 
-def _other_llvm() -> str:
+def _too_early(text: str) -> BackendError:
+    """Error of the LLVM that Dr.Jit loaded at its import, by the environment variable or by itself."""
+    if os.environ.get(LLVM_VARIABLE):
+        try:
+            _choose_llvm(fresh=False)
+        except LibraryVariableError as error:
+            return error
     other = _good_llvm()
-    if other is None:
-        return install_line()
-    return f"call wrf_mi.backend.init() first, or set {LLVM_VARIABLE}={other.path} before Python starts"
+    remedy = (
+        f"call wrf_mi.backend.init() first, or set {LLVM_VARIABLE}={other.path} before Python starts" if other else ""
+    )
+    return BackendError(f"{_TOO_EARLY} {text}: {remedy or install_line()}")
 
 
 def _llvm(path: Path | None, version: str) -> Backend:

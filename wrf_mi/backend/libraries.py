@@ -47,7 +47,8 @@ class LlvmLibrary:
 
     def __str__(self) -> str:
         """``LLVM 19.1 (/usr/lib/libLLVM.so.19.1)``."""
-        return f"LLVM {'.'.join(map(str, self.version)) or 'of unknown version'} ({self.path})"
+        name = f"LLVM {'.'.join(map(str, self.version))}" if self.version else "library of unknown version"
+        return f"{name} ({self.path})"
 
 
 def version_from_name(name: str) -> tuple[int, ...] | None:

@@ -82,7 +82,7 @@ def main(variant: str) -> None:
 
     backend = dr.JitBackend.CUDA if cuda else dr.JitBackend.LLVM
     if not dr.has_backend(backend):
-        raise RuntimeError("Dr.Jit refuses it")
+        raise RuntimeError("Dr.Jit finds no LLVM in it that it can use")
     import mitsuba as mi
 
     mi.set_variant(variant)

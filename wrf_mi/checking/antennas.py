@@ -9,8 +9,7 @@ import numpy as np
 from ..core import Antenna, Record
 from ..core.angles import FloatArray, unit_vectors
 from ..core.carriers import carriers_text
-from ..core.files import write_figure
-from ..datasets.unknown import listed
+from ..core.files import listed, write_figure
 
 OTHER_BAND = 0.1  # relative difference of frequencies beyond which a pattern is that of another band
 FLOOR_DB = 30.0  # range of gains that is drawn

@@ -13,6 +13,7 @@ import trimesh
 
 from ..core import InputError, Record
 from ..core.angles import FloatArray
+from ..core.files import listed
 from ..scene.folder import FACTS_FILE, XML_FILE
 from ..scene.make import has_faces
 from ..scene.mesh.facets import planes_of_mesh
@@ -125,7 +126,7 @@ def inside_solids(record: Record, building: Building) -> Found:
         rows = known[within]
         if len(rows) <= (TOLERATED_SHARE * len(places) if what == "transmitters" else 0):
             continue
-        names = named_rows(rows) if what == "transmitters" else ", ".join(record.receivers[k].name for k in rows)
+        names = named_rows(rows) if what == "transmitters" else listed(record.receivers[k].name for k in rows)
         text = f"{len(rows)} of {len(places)} {what} lie inside walls or solids of {building.source.name}: {names}"
         yield "inside-solids", f"{text}; correct their positions, or the frame of the building"
 
@@ -140,7 +141,7 @@ def at_vertices(record: Record, building: Building) -> Found:
     named = [f"{name} at ({x:g}, {y:g})" for (name, x, y), m in zip(places, away, strict=True) if m <= AT_VERTEX_M]
     if named:
         text = f"{len(named)} of {len(record.receivers)} receivers are at vertices of walls in {building.source.name}"
-        yield "wall-vertices", f"{text}: {', '.join(named)}; give the antenna's position, in front of the wall"
+        yield "wall-vertices", f"{text}: {listed(named)}; give the antenna's position, in front of the wall"
 
 
 def in_wall(places_m: FloatArray, walls_m: FloatArray) -> Mask:

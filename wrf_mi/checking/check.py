@@ -15,7 +15,7 @@ from ..models.checks import check_parts
 from ..synthetic import load_record
 from .antennas import antenna_notes
 from .directions import spectrum_axes
-from .plans import distance_law
+from .plans import distance_law, unlike_units
 from .rows import constant_observations, few_rows, not_heard, repeated_observations, repeated_rows, single_position
 from .units import Found, channel_phase, degrees, far_from_origin, heading_unit, position_unit, strength_scale
 
@@ -32,6 +32,7 @@ SUSPICIONS = {
     "spectrum-axes": "image rows or columns in another order or with another origin",
     "orientation": "quaternions in the order w, x, y, z, or of the inverse rotation",
     "plan": "transmitters in a plan that is mirrored or turned against that of the receivers",
+    "unlike-units": "receivers and transmitters in different units, or rows in steps of a grid",
     "walls": "transmitters outside the building of the folder or across its walls",
     "inside-solids": "receivers or transmitters inside walls or solid bodies",
     "wall-vertices": "receivers at the vertices of a plan's walls",
@@ -51,7 +52,7 @@ OF_VALUES: tuple[Check, ...] = (
 """Suspicions about the values of a record."""
 WARNED: tuple[Check, ...] = (not_heard, degrees)
 """Suspicions that a fit warns of: without a warning the scores alone would show them, as errors of some 10 dB."""
-OF_PLACES: tuple[Check, ...] = (spectrum_axes, distance_law)
+OF_PLACES: tuple[Check, ...] = (spectrum_axes, distance_law, unlike_units)
 """Suspicions about directions and distances, which need the unit of positions."""
 MOST_LINES = 10  # faults of one kind in one file that are printed; the others are counted
 

@@ -11,6 +11,8 @@ from xml.etree.ElementTree import Element, SubElement
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from ..scene.folder import plain_name
+from ..scene.scattering import SCATTERING
+from ..scene.xml_file import overruled
 from ..tracing.sionna.materials import BELOW_1_GHZ, in_itu_range
 from .scene_geometry import ShapePart
 from .scene_xml_faults import BOUNDS, ITU, RADIO, SceneXml, bsdf_findings, is_itu, itu_type, short_name
@@ -25,7 +27,6 @@ WORDS: Mapping[str, str] = {
 """Words in names of materials and shapes, without separators, and the material of ITU-R P.2040 that they mean."""
 SIONNA_THICKNESS_M = 0.1  # that of Sionna RT where a scene file states none: repair does not change it
 COLOURS = ("color", "reflectance", "base_color")
-SCATTERING = ("scattering_coefficient", "xpd_coefficient")
 
 
 @dataclass
@@ -79,6 +80,8 @@ class MaterialRepair:
         for inner in bsdf.iter("bsdf"):
             candidate = Element("bsdf", {**inner.attrib, "id": inner.get("id") or bsdf.get("id") or "mat-material"})
             candidate.extend(inner)
+            if overruled(candidate):
+                candidate.set("id", f"mat-my_{short_name(candidate.get('id', ''))}")
             material = itu_type(candidate)
             if material is not None:
                 return self._slab(candidate, material)
@@ -97,8 +100,7 @@ class MaterialRepair:
         slab = itu_bsdf(material, self.thickness_m.get(short_name(bsdf.get("id", "")), of_kind), self.frequency_hz)
         for colour in [each for each in bsdf.iter("rgb") if each.get("name") in COLOURS][:1]:
             SubElement(slab, "rgb", name="color", value=colour.get("value", ""))
-        if bsdf.get("type") in RADIO:
-            slab.extend([each for each in bsdf.findall("float") if each.get("name") in SCATTERING])
+        slab.extend([each for each in bsdf if each.get("name") in SCATTERING])
         return slab
 
     def _add(self, identifier: str, bsdf: Element) -> Element:

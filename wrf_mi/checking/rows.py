@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
 from ..core.digest import content_digest
+from ..core.files import listed
 from ..core.types import IntArray
 from ..datasets.observations import FEW_ROWS, LEAST_ROWS, fitted_receivers
 from ..datasets.sentinels import suspicious_values
@@ -20,7 +21,7 @@ from .units import Found, is_above_0_dbm
 FEWEST_STRENGTHS = 4
 """Least number of receivers that received a repeated row: strengths in whole dB of fewer receivers repeat by chance
 where a transmitter stands still."""
-SHOWN = 10  # number of rows that a text names
+SHOWN = 6  # receivers with their rows that a text names
 BESIDE_OTHERS = (
     "far more often than the strengths next to it: clipped at the sensitivity, or a number for 'not heard'",
     "where nothing was heard, leave the field empty; clipped strengths are learned as measured",
@@ -100,17 +101,15 @@ def few_rows(record: Record) -> Found:
         yield "few-rows", str(error)
         return
     if scarce:
-        named = ", ".join(f"{name} ({rows})" for name, rows in scarce.items())
+        named = listed(f"{name} ({rows})" for name, rows in scarce.items())
         what = f"fewer than {least} training rows were received by {named}"
         fits = "predict these receivers from the others" if strengths else "leave these receivers out"
         yield "few-rows", f"{what}: fits {fits}; give more rows of theirs, or remove them"
 
 
 def named_rows(rows: IntArray) -> str:
-    """Rows, counted from 1, in words: the first `SHOWN` and the number of the others."""
-    text = ", ".join(str(row + 1) for row in rows[:SHOWN])
-    more = f" and {len(rows) - SHOWN} more" if len(rows) > SHOWN else ""
-    return f"row{'s' if len(rows) > 1 else ''} {text}{more}"
+    """Rows, counted from 1, in words: the first and the number of the others."""
+    return f"row{'s' if len(rows) > 1 else ''} {listed(str(row + 1) for row in rows)}"
 
 
 def repeated_rows(record: Record) -> Found:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
+from xml.etree.ElementTree import ElementTree
 
 import numpy as np
 from wrf_mi_scenes import scenes
@@ -37,6 +39,8 @@ from ..scene.materials import read_materials, thicknesses
 from ..scene.mesh.surfaces import sampled
 from ..scene.scan.las_units import stated_units, units_remedy, units_text
 from ..scene.scan.points import read_points
+from ..scene.scattering import take_scattering
+from ..scene.xml_file import make_files_absolute, parsed_xml
 from ..synthetic import load_record
 from ..tracing.sionna.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ, in_itu_range
 from ..tracing.sionna.scenes import HIGHEST_M as HIGHEST_SCENE_M
@@ -241,16 +245,21 @@ def _of_file(scene: SceneXml, where: Source, carriers_hz: Sequence[float]) -> It
 
 
 def opened(path: Path) -> Iterator[Finding]:
-    """Sionna RT's reason to refuse a scene file in which no fault was found."""
+    """Sionna RT's reason to refuse a scene file in which no fault was found, but for patterns of scattering."""
     from sionna import rt
 
-    for merged in (True, False):
-        try:
-            rt.load_scene(str(path), merge_shapes=merged)
-        except (*REFUSALS, OSError) as error:
-            text = f"Sionna RT: {reason(error) if isinstance(error, REFUSALS) else one_line(error)}"
-            yield Finding("not-opened", path, "", text, "correct the scene")
-            return
+    root = parsed_xml(path)
+    make_files_absolute(root, path)
+    take_scattering(root, path)
+    with TemporaryDirectory() as folder:
+        ElementTree(root).write(file := Path(folder) / path.name)
+        for merged in (True, False):
+            try:
+                rt.load_scene(str(file), merge_shapes=merged)
+            except (*REFUSALS, OSError) as error:
+                text = f"Sionna RT: {reason(error) if isinstance(error, REFUSALS) else one_line(error)}"
+                yield Finding("not-opened", path, "", text, "correct the scene")
+                return
 
 
 def _carriers(record: Record | None) -> list[float]:

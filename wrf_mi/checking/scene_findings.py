@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from ..core.files import listed
+
 Level = Literal["fault", "warning", "note"]
 
 KINDS: Mapping[str, tuple[Level, str]] = {
@@ -171,13 +173,7 @@ def _shapes(group: Sequence[Finding]) -> str:
     names = list(dict.fromkeys(finding.shape for finding in group if finding.shape))
     if not names and len(group) > 1:
         return f"{len(group)} times: "
-    return f"{some_names(names)}: " if names else ""
-
-
-def some_names(names: Sequence[str]) -> str:
-    """The first names, and the number of the others."""
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return f"{', '.join(names[:NAMED])}{more}"
+    return f"{listed(names, NAMED)}: " if names else ""
 
 
 def _count(number: int, what: str) -> str:

@@ -15,13 +15,13 @@ import yaml
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import atomic_folder, write_atomically
+from ..core.files import atomic_folder, listed, write_atomically
 from ..scene.coordinates import FARTHEST_M, Up
 from ..scene.folder import FACTS_FILE, XML_FILE, plain_name
 from ..tracing.sionna.scenes import plain_ply
 from .material_repair import ODD, MaterialRepair, ascii_name
 from .scene_check import Checked, check_scene, checked, opened
-from .scene_findings import Finding, SceneReport, some_names
+from .scene_findings import NAMED, Finding, SceneReport
 from .scene_geometry import ShapePart
 from .scene_xml_faults import ITU, MERGED, short_name
 from .triangle_repair import label, repaired_triangles
@@ -71,7 +71,9 @@ class Repair:
         for line in self.done:
             shape, _, text = line.partition(": ")
             shapes.setdefault(text, []).append(shape)
-        changed = [f"repaired: {some_names(names)}: {text}" for text, names in shapes.items()] or ["nothing to repair"]
+        changed = [f"repaired: {listed(names, NAMED)}: {text}" for text, names in shapes.items()] or [
+            "nothing to repair"
+        ]
         left = [f"unrepaired {f.kind}: {f.shape or f.file}: {f.text}; {f.remedy}" for f in self.unrepaired]
         if self.after is None:
             return [*changed, *left, "nothing was written; correct the source, then repair it"]
@@ -128,7 +130,7 @@ def repair_scene(
         raise InputError(f"{source}: a scan; make a scene of it by wrf-mi mesh")
     parts, origin_m, done = repaired_triangles(before.parts)
     if unknown := sorted(set(of_shapes) - {part.name for part in parts}):
-        raise InputError(f"{source}: no shape {unknown[0]!r}; there are {', '.join(part.name for part in parts[:20])}")
+        raise InputError(f"{source}: no shape {unknown[0]!r}; there are {listed(part.name for part in parts)}")
     materials = MaterialRepair(before.scene, before.source.thickness_m, default, frequency_hz, of_shapes)
     bsdfs = [materials.of(part) for part in parts]
     names = _names(parts, bsdfs)

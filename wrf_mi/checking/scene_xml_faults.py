@@ -16,10 +16,20 @@ from defusedxml.common import DefusedXmlException
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from ..core import InputError
-from ..core.files import MOST_NAME, inside, one_line
+from ..core.files import MOST_NAME, inside, listed, one_line
 from ..core.memory import require_memory
 from ..scene.folder import FACTS_FILE
-from ..scene.xml_file import DEEPEST, FILES, PLUGINS, VALUES, named_shapes, parsed_xml
+from ..scene.scattering import SCATTERING, check_scattering, stated_scattering
+from ..scene.xml_file import (
+    DEEPEST,
+    FILES,
+    OVERRULED,
+    PLUGINS,
+    VALUES,
+    named_shapes,
+    overruled,
+    parsed_xml,
+)
 from .scene_findings import Finding
 
 ITU = tuple(name.removeprefix("itu_") for name in THICKNESS_M)  # materials of ITU-R P.2040 that Sionna RT knows
@@ -28,8 +38,6 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "relative_permittivity": (1, 1e30),
     "conductivity": (0, 1e30),
     "thickness": (0, 1e30),
-    "scattering_coefficient": (0, 1),
-    "xpd_coefficient": (0, 1),
 }
 """Least and largest values of the numbers of a radio material in Sionna RT."""
 PARAMETERS: Mapping[str, tuple[str, ...]] = {
@@ -158,7 +166,7 @@ def _elements(scene: SceneXml) -> Iterator[Finding]:
             what = f"plugin {plugin[:40]!r} of <{tag}>" if known else f"element <{tag[:40]}>"
             yield Finding("element", scene.path, name, f"{what} is unknown in scenes", "remove or replace it")
         if "$" in value:
-            text = f"the value {value[:40]} is left to the caller"
+            text = f"the value {value[:40]} is left to the caller and has no <default>"
             yield Finding("parameter", scene.path, name, text, "write the value in its place")
         elif tag == "string" and element.get("name") in FILES and not is_converted:
             yield from _file(scene, name, value)
@@ -261,6 +269,11 @@ def bsdf_findings(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Findin
         yield Finding("absorber", scene.path, where, "an absorber", "nothing to do in wrf-mi")
     elif plugin in RADIO and not is_itu(identifier):
         yield from _values(scene, where, bsdf)
+    try:
+        check_scattering("", stated_scattering(bsdf, scene.root))
+    except InputError as error:
+        text, _, remedy = str(error).removeprefix(": ").rpartition("; ")
+        yield Finding("material-values", scene.path, where, text, remedy)
 
 
 def stated_itu(bsdf: Element) -> str:
@@ -279,6 +292,9 @@ def itu_type(bsdf: Element) -> str | None:
 
 def _itu(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Finding]:
     """Findings about a BSDF that Sionna RT makes a material of ITU-R P.2040 of."""
+    if overruled(bsdf):
+        text, _, remedy = OVERRULED.partition("; ")
+        yield Finding("material-values", scene.path, where, text, remedy)
     if (material := stated_itu(bsdf)) not in ITU:
         remedy = f"known are {', '.join(ITU)}, and constants of your own"
         yield Finding("unknown-material", scene.path, where, f"ITU-R P.2040 has no {material!r}", remedy)
@@ -290,6 +306,7 @@ def _itu(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Finding]:
 def _values(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Finding]:
     """Numbers of a radio material that are out of bounds, and parameters that it does not have."""
     stated = {child.get("name", ""): child.get("value", "") for child in bsdf if child.tag in ("float", "string")}
+    stated = {name: text for name, text in stated.items() if name not in SCATTERING}
     if bsdf.get("type") == "itu-radio-material":
         stated.pop("type", None)
     elif "relative_permittivity" not in stated:
@@ -353,7 +370,7 @@ def _material(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
     if not materials:
         yield Finding("no-material", path, name, "has no material", GIVE)
     if len(materials) > 1:
-        text = f"has {len(materials)} materials: {', '.join(identifier for identifier, _ in materials)}"
+        text = f"has {len(materials)} materials: {listed(identifier for identifier, _ in materials)}"
         yield Finding("two-materials", path, name, text, "leave one of them")
     for identifier, bsdf in materials:
         if bsdf is None:

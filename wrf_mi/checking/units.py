@@ -11,6 +11,7 @@ from scipy.constants import speed_of_light
 
 from ..core import Record
 from ..core.angles import FloatArray
+from ..core.files import listed
 
 Found = Iterator[tuple[str, str]]  # name and text of suspicions
 
@@ -183,7 +184,7 @@ def strength_scale(record: Record) -> Found:
             scale = _scale(observed[np.concatenate([parts[part] for part in above])])
             wrong.setdefault((" and ".join(above), scale), []).append(receiver.name)
     for (part, scale), names in wrong.items():
-        yield "strengths", f"signal strengths in {part} of {', '.join(names)} are {scale}"
+        yield "strengths", f"signal strengths in {part} of {listed(names)} are {scale}"
 
 
 def is_above_0_dbm(observed: NDArray[Any]) -> bool:
@@ -198,6 +199,11 @@ def _scale(observed: NDArray[Any]) -> str:
     low, high = np.percentile(values[values > 0], [1, 99])  # zero is nothing on a linear scale
     if high < 1 or high > LINEAR_RANGE * low:
         return "powers on a linear scale; give dBm, 10 log10 of the milliwatts"
+    if high <= 100:
+        quality = "they are a quality in per cent (dBm = quality / 2 - 100 in Windows)"
+        return (
+            f"above 0 dBm everywhere: the minus sign is missing, {quality}, or they are dB above a microvolt; give dBm"
+        )
     return "above 0 dBm everywhere: the minus sign is missing, or they are dB above a microvolt; give dBm"
 
 

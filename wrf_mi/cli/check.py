@@ -24,7 +24,7 @@ def add_parser(commands: Any) -> None:
     text = "data set whose devices must not be inside solids, and whose carrier counts"
     add("--dataset", metavar="DATASET", help=text)
     add("--frequency", type=float, metavar="HZ", help="carrier at which materials and phases are checked")
-    add("--units", default="m", help="unit of the coordinates: m (default), cm, mm or ft")
+    add("--units", default="m", help="unit of the coordinates: m (default), dm, cm, mm, ft or in")
     add("--up", choices=("y", "z"), help="axis that is up (default: y in GLB, else z)")
     add("--repair", metavar="OUT", help="scene folder to make, which plain Sionna RT opens; the source is not changed")
     text = (

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Record
 from ..core.carriers import carriers_text
-from ..core.files import one_line
+from ..core.files import listed, one_line
 from ..datasets.tables.options import AVERAGES
 from .options import DATASET, Arguments, add_command
 from .output import exit_status, show
@@ -51,6 +51,7 @@ def _add_import(data: Any) -> None:
     add("--replace", action="store_true", help="replace the folder if it exists")
     text = "columns by meaning, such as x=X,y=Y,rssi=level,id=bssid,time=ts (default: guessed); '-': there is none"
     add("--columns", metavar="LIST", help=text)
+    add("--sheet", metavar="NAME", help="sheet of workbooks that have several")
     text = "columns of strengths of a wide table, such as 'AP* RSS(dBm)'; repeatable"
     add("--receivers", action="append", metavar="PATTERN", help=text)
     add("--test", nargs="+", metavar="FILE", help="tables with the test rows")
@@ -68,7 +69,8 @@ def _add_import(data: Any) -> None:
     add("--crs", metavar="CRS", help="coordinate reference system of positions, such as EPSG:3857")
     text = "unit of headings: rad, deg (from x towards y) or compass (degrees from north, clockwise)"
     add("--heading-unit", metavar="UNIT", dest="heading", help=text)
-    add("--height", dest="height_m", **metres, help="height of the moving end without z (default: 1.3)")
+    text = "height of the moving end without z, one for all tables or each (default: 1.3)"
+    add("--height", dest="height_m", nargs="+", **metres, help=text)
     add("--storey", dest="storey_m", **metres, help="height of a storey, for a column floor without z (default: 3)")
     add("--anchor-height", dest="anchor_height_m", **metres, help="height of receivers without z (default: 2.5)")
     text = "carrier of all rows (default: of the table, or 2.44e9)"
@@ -126,7 +128,7 @@ def import_command(a: Arguments) -> int:
     report = import_measurements(a.files, a.out, a.replace, **options)
     check = check_data(a.out)
     facts = summary(report.record)
-    next_command = f"wrf-mi train {a.out}"
+    next_command = f"wrf-mi train {a.out} [--scene SCENE] --out RUN"
     values: dict[str, Any] = {"folder": str(report.folder), "columns": report.columns, "notes": report.notes}
     values |= {"summary": facts, "check": check.as_dict(), "next": next_command}
     rows = f"{a.out}: {facts['rows']} rows, {len(facts['receivers'])} receivers; plan.png shows them"
@@ -247,7 +249,7 @@ def render(facts: dict[str, Any]) -> str:
         "extent": "{:.2f} x {:.2f} x {:.2f} m".format(*facts["extent_m"]) if facts["extent_m"] else "not stated",
         "nearest": _distances(facts["nearest_m"]),
         "carrier": _carrier(facts["receiver_carriers_hz"], facts["carriers_hz"], facts["frequencies_hz"]),
-        "antennas": ", ".join(facts["antennas"]),
+        "antennas": listed(facts["antennas"]),
         "runs": "not stated" if facts["runs"] is None else _named(facts["runs"]),
         "readings per row": _shown(facts["n_readings"], ""),
         "noise": _shown(facts["std_db"], " dB"),
@@ -263,7 +265,7 @@ def _distances(nearest_m: dict[str, list[float]]) -> str:
 
 
 def _named(counts: dict[str, int]) -> str:
-    return ", ".join(f"{name} {count}" for name, count in counts.items())
+    return listed(f"{name} {count}" for name, count in counts.items())
 
 
 def _carrier(
@@ -271,7 +273,7 @@ def _carrier(
 ) -> str:
     """Carriers in words: of the receivers, of the rows, or of the record with its subcarriers."""
     if of_receivers:
-        return ", ".join(f"{name} {hz:.10g} Hz" for name, hz in of_receivers.items())
+        return listed(f"{name} {hz:.10g} Hz" for name, hz in of_receivers.items())
     if of_rows is not None and len(of_rows) > SHOWN_CARRIERS:
         return carriers_text(np.array(list(of_rows)))
     if of_rows is not None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core import InputError
-from .options import Arguments, add_command
+from .options import Arguments, add_command, add_replace
 from .output import show
 
 POSITION = "X,Y,Z[,VX,VY,VZ]"
@@ -44,6 +44,7 @@ def add_parser(commands: Any) -> None:
     parser = add_command(commands, "import", import_command, text, json_output=False)
     parser.add_argument("file", metavar="FILE.npz", help="file of export --format field")
     parser.add_argument("--out", required=True, metavar="RUN", help="run folder to make")
+    add_replace(parser)
 
 
 def export_command(a: Arguments) -> int:
@@ -63,7 +64,7 @@ def import_command(a: Arguments) -> int:
     """Make a run folder of an exported field."""
     from ..exports.fields import import_field
 
-    run = import_field(a.file, a.out)
+    run = import_field(a.file, a.out, a.replace)
     print(f"{run.config.model} on {run.config.dataset}: {run.folder}")
     return 0
 

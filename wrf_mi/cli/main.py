@@ -28,6 +28,7 @@ MODULES = (
     "bench",
     "demo",
 )  # in the order of the help
+INTERRUPTED = 130  # exit status of a command that was stopped
 
 
 def build_parser() -> Parser:
@@ -44,9 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status."""
     try:
         return _run(arguments)
-    except KeyboardInterrupt:  # anywhere, also while another error is reported
-        print("wrf-mi: interrupted", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as error:  # anywhere, also while another error is reported
+        print(f"wrf-mi: {_noted('interrupted', error)}", file=sys.stderr)
+        return INTERRUPTED
 
 
 def _run(arguments: Sequence[str] | None) -> int:
@@ -61,15 +62,22 @@ def _run(arguments: Sequence[str] | None) -> int:
         return 141
     except Exception as error:
         if _is_interrupt(error):
-            raise KeyboardInterrupt from None
+            print(f"wrf-mi: {_noted('interrupted', error)}", file=sys.stderr)
+            return INTERRUPTED
         # Errors of this package have an exit status and a message of one line; any other keeps its traceback.
         known = {InputError: 2, OSError: 2, BackendError: 1}
         statuses = (status for kind, status in known.items() if isinstance(error, kind))
         exit_status = next(statuses, getattr(error, "exit_status", None))
         if exit_status is None:
             raise
-        print(f"wrf-mi: {os_failure(error) if isinstance(error, OSError) else error}", file=sys.stderr)
+        text = os_failure(error) if isinstance(error, OSError) else str(error)
+        print(f"wrf-mi: {_noted(text, error)}", file=sys.stderr)
         return int(exit_status)
+
+
+def _noted(text: str, error: BaseException) -> str:
+    """An error's text with its notes, such as how to go on, on one line."""
+    return "; ".join([text, *getattr(error, "__notes__", ())])
 
 
 def _is_interrupt(error: BaseException) -> bool:

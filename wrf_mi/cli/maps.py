@@ -136,8 +136,8 @@ def _add_locate(commands: Any) -> None:
     add = parser.add_argument
     add("run", metavar="RUN", help="run folder of a model of signal strengths that states standard deviations")
     text = "signal strengths: a column RECEIVER_dbm or rssi_RECEIVER for each receiver, empty where nothing was "
-    text += "received, and true positions x, y in metres if known (default: the test rows of the run)"
-    add("--observed", metavar="FILE.csv", help=text)
+    text += "received, and true positions x, y in metres if known; or a table as of data import (default: test rows)"
+    add("--observed", metavar="FILE", help=text)
     text = "file to write: estimate x, y, z, radius and area of the region, nearest neighbours; FILE.png beside it"
     add("--out", required=True, metavar="FILE.csv", help=text)
     text = "also write the probability of each position: arrays x_m, y_m, height_m, probability"
@@ -163,7 +163,9 @@ def locate_command(a: Arguments) -> int:
         raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
     run = located_run(a.run)
     if a.observed is not None:
-        strengths_dbm, true_m = files.read_observations(a.observed, run.receivers, run.config.left_out)
+        strengths_dbm, true_m = files.read_observations(
+            a.observed, run.receivers, run.config.left_out, run.problem.record.source
+        )
     else:
         strengths_dbm, true_m = files.test_observations(run)
     options = {"step_m": a.step, "height_m": a.height, "level": a.level, "offset_db": a.offset}
@@ -199,7 +201,9 @@ def _summary(figures: dict[str, Any]) -> str:
     text += "\n" + summary_table(f"{figures['n']} positions", known, 2)
     if "inside" in figures:
         text += f"\n{figures['inside']:.0%} of the true positions lie inside the {level} regions"
-    return text
+    text += f"\nat the border of the searched area: {figures['at_border']} of {figures['n']} estimates; outside of it: "
+    text += f"training rows {figures['training_rows_outside']}"
+    return text + (f", true positions {figures['outside']}" if "outside" in figures else "")
 
 
 def _add_view(commands: Any) -> None:

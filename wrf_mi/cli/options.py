@@ -26,6 +26,13 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*arguments, **options)
         self._negative_number_matcher = re.compile(r"^-\.?\d[\d.,eE+-]*$")
 
+    def parse_known_args(self, *arguments: Any, **options: Any) -> tuple[Any, list[str]]:
+        """Parse arguments; the command that an unknown one follows refuses it, and names its own help."""
+        namespace, unknown = super().parse_known_args(*arguments, **options)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return namespace, unknown
+
     def error(self, message: str) -> NoReturn:
         """End the process with status 2."""
         self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
@@ -134,6 +141,11 @@ def antenna_options(a: Arguments) -> AntennaOptions:
 def add_n_train(parser: argparse._ActionsContainer) -> None:
     """Add ``--n-train``."""
     parser.add_argument("--n-train", type=_number, metavar="N", help="number or fraction of the training rows to use")
+
+
+def add_replace(parser: argparse._ActionsContainer) -> None:
+    """Add ``--replace`` of commands that make a run folder."""
+    parser.add_argument("--replace", action="store_true", help="replace the run in --out")
 
 
 def add_scheduler(parser: argparse.ArgumentParser) -> None:

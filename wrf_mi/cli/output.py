@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 if TYPE_CHECKING:
     from ..training.loop import Progress as FitProgress
-
+from ..core.files import listed
 
 QUANTITIES = ("median", "mean", "p10", "p90")
 
@@ -98,7 +98,7 @@ def _show_receivers(metrics: dict[str, Any]) -> None:
         print(f"{metrics['n_not_scored']} observations of test rows are not finite and not scored")
     for key, what in (("receivers_with_few_rows", "few training rows"), ("receivers_left_out", "too few, left out")):
         if key in metrics:
-            named = ", ".join(f"{name} ({rows})" for name, rows in metrics[key].items())
+            named = listed(f"{name} ({rows})" for name, rows in metrics[key].items())
             print(f"receivers with {what} (number): {named}")
     for name, place in metrics.get("receiver_places", {}).items():
         axes = zip("xyz", place["position_m"], place["std_m"], strict=True)
@@ -125,14 +125,15 @@ def _show_stages(reports: list[dict[str, Any]], label: str, weighed: dict[str, f
         print("not kept: no clear gain on held-out rows, by itself or under the stages that follow")
 
 
+ENDING = signal.SIGINT, signal.SIGTERM  # signals of Ctrl-C, and of batch systems and ``kill``
 LOG_S = 5.0  # least time between lines of progress within a part of the work, where no bar is shown
 
 
 class Watch:
-    """Progress on standard error, a bar on a terminal, else plain lines, and a stop on Ctrl-C.
+    """Progress on standard error, a bar on a terminal, else plain lines, and a stop on Ctrl-C or SIGTERM.
 
-    The first Ctrl-C lets the current step of ``resumable`` work, which asks `stop` and can go on later, finish and
-    write a checkpoint; a second one ends at once. ``run`` is the folder that the work can go on with.
+    The first of these signals lets the current step of ``resumable`` work, which asks `stop` and can go on later,
+    finish and write a checkpoint; a second one ends at once. ``run`` is the folder that the work can go on with.
     """
 
     def __init__(self, resumable: bool = False, run: str | None = None) -> None:
@@ -147,17 +148,19 @@ class Watch:
         self._part, self._told = "", 0.0
 
     def __enter__(self) -> Watch:
-        """Handle Ctrl-C."""
-        self._before = signal.getsignal(signal.SIGINT)
+        """Handle the signals that end a process."""
+        self._before = {number: signal.getsignal(number) for number in ENDING}
         if self._resumable:
-            signal.signal(signal.SIGINT, self._interrupt)
+            for number in ENDING:
+                signal.signal(number, self._interrupt)
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Restore the handler of Ctrl-C and stop the bar."""
+        """Restore the handlers and stop the bar."""
         if self._console.is_terminal:
             self._bar.stop()
-        signal.signal(signal.SIGINT, self._before)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if self._stop:
@@ -167,7 +170,7 @@ class Watch:
         print(f"stopping after this step; Ctrl-C again ends at once{go_on}", file=sys.stderr)
 
     def stop(self) -> bool:
-        """Whether Ctrl-C was pressed."""
+        """Whether Ctrl-C was pressed, or the process was asked to end."""
         return self._stop
 
     def on_progress(self, stage: str, fraction: float, progress: FitProgress | None = None) -> None:
@@ -189,23 +192,37 @@ class Watch:
         elif progress is not None and progress.validation_score is not None:
             steps = round(progress.step / fraction)
             print(f"{stage} {progress.step}/{steps}  {text}", file=sys.stderr, flush=True)
-        elif progress is None and new and self._is_due(stage):
-            print(stage, file=sys.stderr, flush=True)
+        elif progress is None and self._is_due(stage, new):
+            print(stage if new else f"{stage}  {fraction:.0%}  {text}".rstrip(), file=sys.stderr, flush=True)
 
-    def _is_due(self, stage: str) -> bool:
-        """Whether a stage has a line of a log: the first of a part, and then the first of each few seconds."""
+    def _is_due(self, stage: str, new: bool) -> bool:
+        """Whether a stage has a line of a log: the first of a part, and then the first of each few seconds.
+
+        Within a stage lines are as far apart as the stage was long at the line before: hours have a dozen lines.
+        """
         part, now = stage.partition(":")[0], time.perf_counter()
-        if part == self._part and now - self._told < LOG_S:
+        if (part == self._part or not new) and now - self._told < max(LOG_S, 0 if new else self._told - self._begun):
             return False
         self._part, self._told = part, now
         return True
 
     def _text(self, p: FitProgress) -> str:
         if p.validation_score is not None and not math.isnan(p.validation_score):  # NaN without validation rows
-            rows = "validation rows" if p.held_out else "validation rows, now trained on"
-            self._score = f"{p.label} {p.validation_score:.3f} ({rows})"
+            self._score = f"{p.label} {p.validation_score:.3f} ({_validation_text(p)})"
         gaussians = f"{p.gaussians} Gaussians  " if p.gaussians else ""
         return f"loss {p.loss:.4f}  {self._score}  {gaussians}{_minutes(p.left_s)}"
+
+
+def _validation_text(p: FitProgress) -> str:
+    """The rows that are scored in training, and how far from training rows they and the test rows are."""
+    text = f"{p.validation_rows or ''} validation rows".strip()
+    if not p.held_out:
+        return f"{text}, now trained on"
+    if p.validation_m is not None:
+        text += f", median {p.validation_m:.2g} m from training rows"
+    if p.test_m is not None:
+        text += f", test rows {p.test_m:.2g} m"
+    return text if p.far_score is None else f"{text}; {p.far_score:.3f} of those as far as test rows"
 
 
 def _minutes(left_s: float) -> str:

@@ -6,7 +6,17 @@ from pathlib import Path
 from typing import Any
 
 from ..core import InputError
-from .options import Arguments, add_command, add_n_train, add_operator, add_scheduler, check_operator, refuse, stated
+from .options import (
+    Arguments,
+    add_command,
+    add_n_train,
+    add_operator,
+    add_replace,
+    add_scheduler,
+    check_operator,
+    refuse,
+    stated,
+)
 from .output import Watch, show, show_metrics
 
 
@@ -31,6 +41,7 @@ def _add_evaluate(commands: Any) -> None:
     other.add_argument("--dataset", metavar="DATASET", help="data set that they are of: a name or a folder")
     other.add_argument("--name", metavar="NAME", help="name of the model, for tables")
     other.add_argument("--out", metavar="DIR", help="run folder to make, for compare")
+    add_replace(other)
     add_n_train(other)
     other.add_argument("--seed", type=int, metavar="N", help="seed of the split, and of the other fit (default: 0)")
     text = "draw how reliable probabilities of coverage are on test rows, P(level > threshold) against observed share"
@@ -42,7 +53,7 @@ def evaluate_command(a: Arguments) -> int:
     """Score a run again."""
     if a.predictions is not None:
         return _score_predictions(a)
-    refuse(a, ("dataset", "name", "out", "n_train", "seed"), "belongs to --predictions")
+    refuse(a, ("dataset", "name", "out", "replace", "n_train", "seed"), "belongs to --predictions")
     if a.run is None:
         raise InputError("evaluate: nothing to score; give a run folder, or --predictions FILE and --dataset")
     from ..runs.api import evaluate_run
@@ -77,7 +88,7 @@ def _score_predictions(a: Arguments) -> int:
     refuse(a, ("reliability", "no_operator"), "belongs to RUN, not to --predictions")
     if lacking := [name for name in ("dataset", "name", "out") if not stated(a, (name,))]:
         raise InputError(f"evaluate: --predictions needs --{lacking[0]}")
-    options = {"n_train": a.n_train, "seed": a.seed or 0, "split": a.split or "official"}
+    options = {"n_train": a.n_train, "seed": a.seed or 0, "split": a.split or "official", "overwrite": a.replace}
     run = score_predictions(a.dataset, a.predictions, a.out, a.name, **options)
     return show_metrics(run.metrics, run.folder, a.json)
 

@@ -29,7 +29,7 @@ def _add_mesh(commands: Any) -> None:
     text += "a mesh (OBJ, STL, GLB, PLY, COLLADA, USD)"
     add("points", nargs="+", metavar="POINTS", help=text)
     add("--out", required=True, metavar="DIR", help="scene folder to make")
-    add("--units", help="unit of the coordinates: m, cm, mm or ft (default: that of COLLADA and USD, else m)")
+    add("--units", help="unit of the coordinates: m, dm, cm, mm, ft or in (default: that of COLLADA and USD, else m)")
     text = "axis that is up in a scan or mesh (default: that of COLLADA and USD, y in GLB, else z)"
     add("--up", choices=("y", "z"), help=text)
     text = "point of the source (of a picture, from its lower left corner), metres, z up, that becomes the origin, "
@@ -51,6 +51,7 @@ def _add_mesh(commands: Any) -> None:
 
 def mesh_command(a: Arguments) -> int:
     """Make a scene folder."""
+    from ..checking import check_scene
     from ..scene.make import make_scene
     from ..scene.mesh.files import mesh_parts
     from ..scene.register import read_pairs, register_pairs
@@ -64,14 +65,23 @@ def mesh_command(a: Arguments) -> int:
     counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
     floors = [name for name, kind in scene.materials.surfaces.items() if kind == "floor"]
     floor_m2 = sum(part.area for name in floors for part in mesh_parts(scene.folder / "meshes" / f"{name}.ply"))
-    facts = {"scene": str(scene.folder), "xml": str(scene.xml), "surfaces": counts, "counts": scene.counts}
+    facts: dict[str, Any] = {
+        "scene": str(scene.folder),
+        "xml": str(scene.xml),
+        "surfaces": counts,
+        "counts": scene.counts,
+    }
     lines = [", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}"]
     lines.append(f"floor: {floor_m2:.1f} m2")
     if scene.origin_m is not None:
         point = ", ".join(f"{value:.12g}" for value in scene.origin_m)
         lines.append(f"origin: {point} of the source; positions of measurements must be relative to it")
     lines.append(f"materials: {scene.folder / 'materials.yml'}\npicture: {scene.folder / 'preview.png'}")
-    return show(a.json, {**facts, "floor_m2": float(floor_m2), "origin_m": scene.origin_m}, "\n".join(lines))
+    check = check_scene(scene.folder)
+    if check.of_level("fault") or check.of_level("warning"):
+        lines += check.lines()
+    facts |= {"floor_m2": float(floor_m2), "origin_m": scene.origin_m, "check": check.as_dict()}
+    return show(a.json, facts, "\n".join(lines))
 
 
 def _point(text: str) -> tuple[float, ...]:

@@ -17,6 +17,7 @@ from .options import (
     Arguments,
     Parser,
     add_command,
+    add_replace,
     add_rows,
     add_run,
     add_scheduler,
@@ -47,6 +48,7 @@ def _add_train(commands: Any) -> None:
     parser = add_command(commands, "train", train_command, "fit a model to measurements and score it")
     add_training(parser)
     parser.add_argument("--out", metavar="RUN", help="run folder to make")
+    add_replace(parser)
     parser.add_argument("--help-settings", action="store_true", help="list all settings with their defaults, and exit")
     parser.add_argument("--resume", metavar="RUN", help="run folder of a stopped run to go on with")
 
@@ -73,7 +75,7 @@ def run_training(a: Arguments, **more: Any) -> int:
 
     with Watch(run=a.out) as watch:
         session: dict[str, Any] = {"on_progress": watch.on_progress, "stop": watch.stop, **more}
-        run = train(a.dataset, out=a.out, **vars(request), **session, progress=sys.stderr.isatty())
+        run = train(a.dataset, out=a.out, overwrite=a.replace, **vars(request), **session, progress=sys.stderr.isatty())
     return show_metrics(run.metrics, run.folder, a.json)
 
 
@@ -160,6 +162,7 @@ def _add_trace(commands: Any) -> None:
     add("dataset", metavar="DATASET", help=DATASET)
     add("--scene", required=True, metavar="SCENE", help=SCENE)
     add("--out", metavar="RUN", required=True, help="run folder to make")
+    add_replace(parser)
     add_tracing(parser)
     target = "choose depth, rays, diffraction and scattering until power and spectra are converged to DB decibels"
     add("--target-error", type=float, metavar="DB", help=target)
@@ -183,14 +186,14 @@ def trace_command(a: Arguments) -> int:
     if a.deepmimo is not None:
         from ..tracing.deepmimo import check_deepmimo_folder
 
-        check_deepmimo_folder(a.deepmimo)
+        check_deepmimo_folder(a.deepmimo, a.replace)
     with open_scheduler(a.scheduler) as scheduler:
         status = run_training(a, scheduler=scheduler if a.scheduler else None)
     if a.deepmimo is not None:
         from ..models.ray_tracing import PATHS
         from ..tracing import load_trace, write_deepmimo
 
-        write_deepmimo(a.deepmimo, load_trace(Path(a.out) / PATHS))
+        write_deepmimo(a.deepmimo, load_trace(Path(a.out) / PATHS), a.replace)
     return status
 
 

@@ -58,3 +58,7 @@ class BackendError(RuntimeError):
     ... except BackendError as error:
     ...     print(error)
     """
+
+
+class LibraryVariableError(BackendError, InputError):
+    """An environment variable that names no usable library: one line with the variable, its path and the remedy."""

@@ -26,6 +26,12 @@ def one_line(error: object) -> str:
     return text if len(text) <= MOST_MESSAGE else f"{text[:MOST_MESSAGE]} ..."
 
 
+def listed(names: Iterable[str], most: int = 6, mark: str = ", ") -> str:
+    """The first names, and the number of the others."""
+    names = list(names)
+    return mark.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another disk",
     errno.EDQUOT: "free some of the quota or choose another disk",

@@ -15,12 +15,12 @@ PICTURE_ERRORS = (MemoryError, OSError, SyntaxError, ValueError, struct.error, z
 
 
 @contextmanager
-def open_picture(path: Path, most_pixels: int) -> Iterator[Image.Image]:
-    """Open a PNG or PGM picture, whose pixels are decoded when they are first used; errors: `PICTURE_ERRORS`.
+def open_picture(path: Path, most_pixels: int, formats: tuple[str, ...] = ("PNG", "PPM")) -> Iterator[Image.Image]:
+    """Open a picture of given formats, whose pixels are decoded when they are first used; errors: `PICTURE_ERRORS`.
 
     `ValueError` for more pixels than ``most_pixels``, as a small file may state any size.
     """
-    with Image.open(path, formats=("PNG", "PPM")) as picture:
+    with Image.open(path, formats=formats) as picture:
         width, height = picture.size
         if width * height > most_pixels:
             raise ValueError(f"{width} x {height} pixels; at most {most_pixels:,} are read")

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from .antenna import Antenna
 from .errors import InputError
-from .files import one_line
+from .files import listed, one_line
 from .types import Receiver
 
-SHOWN = 20  # largest number of names in an error message
 UNKNOWN = -1  # stored number of elements of a receiver without a known array
 CARRIERS = "receiver_frequency_hz"
 STORED = operator.attrgetter("name", "position_m", "orientation_xyzw", "antenna", "frequency_hz", "array_m")
@@ -32,7 +31,7 @@ def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
     names = [known.name for known in receivers]
     if isinstance(receiver, str):
         if names.count(receiver) > 1:
-            numbers = ", ".join(str(index) for index, name in enumerate(names) if name == receiver)
+            numbers = listed(str(index) for index, name in enumerate(names) if name == receiver)
             raise InputError(f"receiver {receiver!r}: name of several; give a number, of {numbers}")
         index = names.index(receiver) if receiver in names else -1
     else:
@@ -41,8 +40,7 @@ def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
         except TypeError:
             index = -1
     if not 0 <= index < len(names):
-        listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
-        text = f"no receiver {one_line(repr(receiver))}; give one of {one_line(listed)}"
+        text = f"no receiver {one_line(repr(receiver))}; give one of {one_line(listed(names))}"
         raise InputError(f"{text}, or its number from 0 to {len(names) - 1}")
     return index
 

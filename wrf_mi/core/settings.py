@@ -158,6 +158,38 @@ def _mismatch(hint: Any, value: Any, error: ValidationError) -> str:
     return f"expected {first['type'].split('_')[0]}, got {first['input']!r}"
 
 
+def names_of(kind: Any) -> frozenset[str]:
+    """Names of the settings of a dataclass."""
+    return frozenset(setting.name for setting in dataclasses.fields(kind))
+
+
+def changed(settings: Any) -> frozenset[str]:
+    """Dotted names of the settings that differ from the defaults of their class."""
+    default = dict(flat(dataclasses.asdict(type(settings)())))
+    return frozenset(name for name, value in flat(dataclasses.asdict(settings)) if value != default[name])
+
+
+def stated_values(config: Any, settings: Iterable[str]) -> dict[str, str]:
+    """Values, as they are stated, of ``key=value`` by dotted name; `InputError`: a name with two different values.
+
+    >>> from wrf_mi.training.config import TrainConfig
+    >>> stated_values(TrainConfig(), ["steps=200", "traced.depth=3"])
+    {'steps': '200', 'traced.depth': '3'}
+    """
+    known = [name for name, _ in flat(dataclasses.asdict(config))]
+    values: dict[str, str] = {}
+    for setting in settings:
+        key, _, text = (part.strip() for part in setting.partition("="))
+        key = _present_name(key, known)
+        if values.setdefault(key, text) != text:
+            raise InputError(f"setting {key}: stated as {values[key]} and as {text}; give one of both")
+    return values
+
+
+def _present_name(key: str, known: Iterable[str]) -> str:
+    return key if key in known else FORMER_NAMES.get(key, key)
+
+
 def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
     """Settings with ``key=value`` applied in order; keys dotted, values YAML; `InputError`: any that does not fit.
 
@@ -172,8 +204,7 @@ def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
         key, equals, text = setting.partition("=")
         if not equals:
             raise InputError(f"--set {setting}: expected key=value, e.g. --set steps=2000")
-        key = key.strip()
-        key = key if key in known else FORMER_NAMES.get(key, key)
+        key = _present_name(key.strip(), known)
         if key not in known:
             close = get_close_matches(key, known, n=3)
             meant = f"did you mean {' or '.join(close)}? " if close else ""

@@ -19,6 +19,7 @@ from scipy.stats import rankdata
 from threadpoolctl import threadpool_limits
 
 from ..core import InputError, Record, Split
+from ..core.files import listed
 from ..core.types import FloatArray, IntArray
 from ..datasets.observations import check_observations, fitted_receivers, warn_of_left_out
 from ..scene.correction_data import CorrectionData
@@ -156,7 +157,7 @@ def _checked(
     record = record.seen(split)
     lacking = [receiver.name for receiver in record.receivers if not np.isfinite(receiver.position_m).all()]
     if lacking and task_of(record).in_decibel:
-        text = f"position of receiver {', '.join(lacking)} unknown; give x, y, z"
+        text = f"position of receiver {listed(lacking)} unknown; give x, y, z"
         raise InputError(f"{record.source or record.name}: {text}, or wrf-mi train --scene, which estimates them")
     numbers, left_out = fitted_receivers(record, [split])
     warn_of_left_out(record, left_out)

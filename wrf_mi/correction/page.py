@@ -25,7 +25,7 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..core.angles import FloatArray
-from ..core.files import atomic_folder, write_atomically, write_figure
+from ..core.files import atomic_folder, listed, write_atomically, write_figure
 from ..scene.correction_data import FILE
 from ..scene.correction_data import KEY as DATA
 from ..tasks import task_of
@@ -187,7 +187,7 @@ def _table(header: str, kinds: str, rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def _scores_text(correction: Correction, facts: dict[str, Any]) -> list[str]:
-    task, receivers = task_of(correction.misfit.record), ", ".join(facts["held_out_receivers"])
+    task, receivers = task_of(correction.misfit.record), listed(facts["held_out_receivers"])
     place = f"at the receivers {receivers}, which were held out" if receivers else "that were held out in clusters"
     scores = [
         (stage, *(f"{score[kind]:.{task.digits}f}" for kind in ("median", "mean")))
@@ -227,7 +227,7 @@ def _planes_text(planes: list[dict[str, Any]]) -> list[str]:
     rows = []
     for plane in sorted(planes, key=lambda plane: -plane["paths"]):
         if plane["shift_sd_mm"] is not None:
-            names = ", ".join(plane["objects"][:3]) + (" ..." if len(plane["objects"]) > 3 else "")
+            names = listed(plane["objects"], 3)
             tilts = ", ".join(map(_with_sd, plane["tilt_mrad"], plane["tilt_sd_mrad"]))
             shift, measured = _with_sd(plane["shift_mm"], plane["shift_sd_mm"]), "yes" if plane["measured"] else "no"
             rows.append((names, str(plane["paths"]), shift, tilts, measured))

@@ -16,7 +16,7 @@ from ..core import Antenna, DataFault, InputError, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
 from ..core.antenna import ANTENNA, pattern_path
 from ..core.carriers import FREQUENCY
-from ..core.files import one_line, text_lines, write_csv
+from ..core.files import listed, one_line, text_lines, write_csv
 from ..core.types import IntArray
 from .faults import Attempt, attempt, recoverable, refuse, stop_at_faults
 
@@ -58,7 +58,7 @@ def single_file(path: Path, suffixes: tuple[str, ...], what: str) -> Path:
         return path
     candidates = sorted(file for file in path.iterdir() if file.suffix in suffixes)
     if len(candidates) != 1:
-        names = ", ".join(file.name for file in candidates) or "none"
+        names = listed(file.name for file in candidates) or "none"
         raise DataFault(path, f"{what} is read at a time, found {names}; give the file itself")
     return candidates[0]
 

@@ -89,8 +89,8 @@ def _labels(names: Sequence[str], task: str, shape: tuple[int, ...]) -> dict[str
 
 def _variable(name: str, values: NDArray[Any], task: str) -> tuple[tuple[str, ...], NDArray[Any], dict[str, str]]:
     units = next((unit for end, unit in UNITS.items() if name.endswith(end)), None)
-    if name in OF_RECEIVERS or name == "prediction":
-        level = {"rssi": "dB" if name == "std" else "dBm"}.get(task)
+    if name in (*OF_RECEIVERS, "prediction", "std_mean"):
+        level = {"rssi": "dB" if name.startswith("std") else "dBm"}.get(task)
         unit = None if name == "n_readings" else level
         return (*PAIR, *_observed(task, values.ndim)), values.swapaxes(0, 1), {"units": unit} if unit else {}
     if name == "frequencies_hz":
@@ -163,11 +163,11 @@ class LabelledPrediction(Prediction):
     of_one: bool = False
 
     def to_xarray(self) -> xarray.Dataset:
-        """Dataset of ``prediction`` (row, receiver, ...), ``std`` and ``reception`` where stated, and ``tx_pos_m``.
+        """Dataset of ``prediction`` (row, receiver, ...), ``tx_pos_m`` and stated ``std``, ``std_mean``, ``reception``.
 
         `InputError`: xarray is not installed.
         """
-        arrays = {"prediction": self.mean, "std": self.std}
+        arrays = {"prediction": self.mean, "std": self.std, "std_mean": self.std_mean}
         stated = {
             name: values[None] if self.of_one else values for name, values in arrays.items() if values is not None
         }

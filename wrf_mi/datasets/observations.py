@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Record, Split
+from ..core.files import listed
 from ..core.types import IntArray
 
 logger = logging.getLogger(__name__)
@@ -55,7 +56,7 @@ def fitted_receivers(
         counts[trained] = np.minimum(counts[trained], rows_received(record, split.all_train)[trained])
     enough = np.flatnonzero(counts >= (least if counts.max() >= least else 1))
     if not counts.any():  # also where none is to be left out
-        named = ", ".join(receiver.name for receiver in record.receivers)
+        named = listed(receiver.name for receiver in record.receivers)
         place = f"in a fold of split {splits[0].name.partition(':')[0]}" if len(splits) > 1 else "in the training rows"
         text = f"{place_of(record)}: nothing was received {place} by any receiver ({named})"
         raise InputError(f"{text}; use another split or give more rows")
@@ -66,9 +67,18 @@ def fitted_receivers(
 def warn_of_left_out(record: Record, left_out: Mapping[str, int], least: int = LEAST_ROWS) -> None:
     """Log receivers that are left out for want of training rows."""
     if left_out:
-        named = ", ".join(f"{name} ({rows})" for name, rows in left_out.items())
+        named = listed(f"{name} ({rows})" for name, rows in left_out.items())
         text = "%s: receivers with fewer than %d training rows are left out, with their number of rows: %s"
         logger.warning(text, record.name, least, named)
+
+
+def warn_of_one_place(record: Record, splits: Sequence[Split]) -> None:
+    """Log a split whose training rows, two or more, are all at one place."""
+    for split in splits if record.has_positions else ():
+        rows = split.all_train
+        if len(rows) > 1 and (record.tx_pos_m[rows] == record.tx_pos_m[rows[0]]).all():
+            text = "%s, split %s: all of %d training rows are at one place, which tells nothing of others; %s"
+            logger.warning(text, record.name, split.name, len(rows), "measure at more places")
 
 
 def check_observations(record: Record, split: Split, complete: bool = False, may_be_silent: bool = False) -> None:

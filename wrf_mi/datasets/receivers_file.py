@@ -13,6 +13,7 @@ from ..core import Antenna, DataFault, Receiver, Record
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
 from ..core.antenna import ANTENNA, UPRIGHT, boresight_orientation
 from ..core.carriers import FREQUENCY
+from ..core.files import listed
 from .faults import attempt, recoverable, refuse, stop_at_faults
 from .folder_files import ANTENNA_WORDS, TX_ANTENNA_WORDS, CsvTable, antenna_words, read_antenna, shown
 
@@ -33,7 +34,7 @@ def read_ids(table: CsvTable) -> list[str]:
     """Ids of the anchors in normal form."""
     if unused := [column for column in table.header if column not in COLUMNS]:
         known = ", ".join(COLUMNS)
-        logger.warning("%s: columns that are not used: %s (known: %s)", table.path, ", ".join(unused), known)
+        logger.warning("%s: columns that are not used: %s (known: %s)", table.path, listed(unused), known)
     ids: list[str] = []
     for row, text in enumerate(table.texts("id"), start=1):
         anchor = plain_id(text)

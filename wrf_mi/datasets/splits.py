@@ -99,7 +99,7 @@ def _split(record: Record, rows: _Rows, seed: int, n_train: int | float | None, 
     what = f"{record.name}, split {rows.name}"
     for verb, part in (("trains", rows.train), ("scores", rows.test)):
         if len(part) == 0 and (rows.name != NONE or part is rows.train):
-            raise InputError(f"{what}: no row that was received {verb}; use another split")
+            raise InputError(f"{what}: no row that was received {verb}{_why(record)}")
     # A seeded order serves both draws, and whether its i-th row validates depends on i alone: so any prefix of it is
     # nested in a longer one, validation rows included.
     order = np.random.default_rng([seed, 1]).permutation(np.sort(rows.train))
@@ -207,6 +207,13 @@ def _check_rows(path: str | Path, lists: list[NDArray[np.generic]]) -> None:
         raise InputError(f"{path}: a row is in the split twice; make the split again")
 
 
+def _why(record: Record, otherwise: str = "; use another split") -> str:
+    """What is wrong with rows that a split cannot divide, and the remedy: no split divides those of a single place."""
+    if not record.has_positions or len(np.unique(record.tx_pos_m, axis=0)) > 1:
+        return otherwise
+    return f": all of {len(record)} rows are at one place; measure at more places"
+
+
 def position_folds(record: Record) -> IntArray:
     """The spatial fold 0, 1, ... of each row, shape [n]: those of the record, or seeded k-means clusters.
 
@@ -220,7 +227,7 @@ def position_folds(record: Record) -> IntArray:
         raise InputError(f"{record.name}: {text}; use the split random or trajectory")
     distinct = len(np.unique(record.tx_pos_m, axis=0))
     if distinct < FOLDS:
-        raise InputError(f"{record.name}: {distinct} distinct positions for {FOLDS} blocks; use another split")
+        raise InputError(f"{record.name}: {distinct} distinct positions for {FOLDS} blocks{_why(record)}")
     from scipy.cluster.vq import ClusterError, kmeans2
 
     # k-means ends in a local optimum that depends on its start, and may leave a cluster empty ("raise").
@@ -266,7 +273,8 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
         return _folds_held_out(record, name, seed, rows)
     first = round(TRAIN_FRACTION * len(rows))
     if not 0 < first < len(rows):
-        raise InputError(f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least")
+        text = f"{record.name}: {len(rows)} rows; a {name} split needs 3 at least"
+        raise InputError(f"{text}{_why(record, otherwise='')}")
     order = np.random.default_rng(seed).permutation(rows) if kind == "random" else rows
     return [_Rows(name, order[:first], order[first:])]
 

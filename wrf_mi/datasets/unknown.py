@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..core import DataFault, InputError
-from ..core.files import one_line, text_lines
+from ..core.files import listed, one_line, text_lines
 
 WANTED = (
     "a data set is a folder with receivers.csv, train.csv and test.csv (signal strengths), with "
@@ -23,14 +23,18 @@ TABLE = (
 )
 TABLES = (".csv", ".tsv", ".txt")
 SEPARATORS = ",;\t|"
-STRENGTH = frozenset({"rssi", "rss", "rsrp", "dbm", "level", "signal", "strength", "power"})
-"""Words in the names of columns that hold strengths."""
+STRENGTHS = ("rsrp", "rssi", "rss", "dbm", "signal", "strength", "level", "power")
+"""Words in the names of columns that hold strengths, in the order of preference where a reading has several."""
+STRENGTH = frozenset(STRENGTHS)
+SENT = frozenset({"tx", "txpower", "sent", "transmit", "transmitted", "eirp"})
+"""Words in the names of columns that hold the power that is sent."""
+BESIDE = frozenset({"db", "received", "rx", "mean", "average", "avg", "median", "value", "measured"})
+"""Words beside those of strengths in the name of a column that belongs to no particular receiver."""
 RECEIVER = (
     *("bssid", "mac", "address", "uuid", "receiver", "rx", "anchor", "gateway", "ap", "beacon", "cell", "station"),
     *("pci", "node", "device", "ssid", "id", "name"),
 )
 """Words in the names of columns that tell receivers apart, the most particular first."""
-SHOWN = 8  # columns or files that a message names
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,7 @@ def unknown_data(path: Path, inner: Sequence[Path] = ()) -> InputError:
     content = sorted(path.iterdir())
     if not content:
         return DataFault(path, f"an empty folder; {WANTED}")
-    names = one_line(listed([file.name for file in content], SHOWN, ","))
+    names = one_line(listed([file.name for file in content], mark=","))
     holding = f"holds {names} and is no data set itself"
     if inner:
         return DataFault(path, f"{holding}; give {one_line(inner[0])}")
@@ -64,7 +68,7 @@ def table_text(table: Table) -> str:
     """What a table lacks as signal strengths, and the command that makes a data set of it."""
     kind = "" if long_columns(table.header) is None else ", a row for each reading"
     remedy = f"make a data set of it by wrf-mi data import {one_line(table.name)} --out FOLDER"
-    columns = one_line(listed(table.header, SHOWN, ","))
+    columns = one_line(listed(table.header, mark=","))
     return f"{table.name} has the columns {columns}{kind}; {TABLE}: {remedy}"
 
 
@@ -76,9 +80,20 @@ def name_words(name: str) -> set[str]:
 def long_columns(header: Sequence[str]) -> tuple[str, str] | None:
     """Columns of receivers and of strengths in a table with a row for each reading, or None."""
     words = {column: name_words(column) for column in header}
-    strengths = [column for column, parts in words.items() if parts & STRENGTH]
+    strengths = [column for column, parts in words.items() if parts & STRENGTH and not parts & SENT]
     receivers = (name for word in RECEIVER for name in header if word in words[name] and name not in strengths)
+    # RSRP and RSSI of one reading are two quantities; columns with a number or a name are of a receiver each.
+    if len(strengths) > 1 and all(
+        words[name] <= STRENGTH | BESIDE and not re.search(r"\d", name) for name in strengths
+    ):
+        strengths = preferred(strengths)[:1]
     return next(zip(receivers, strengths, strict=False), None) if len(strengths) == 1 else None
+
+
+def preferred(names: Sequence[str]) -> list[str]:
+    """Columns of strengths by the preference of their quantities in `STRENGTHS`."""
+    words = {name: name_words(name) & STRENGTH for name in names}
+    return sorted(names, key=lambda name: min(map(STRENGTHS.index, words[name]), default=len(STRENGTHS)))
 
 
 def _read_header(file: Path) -> Table | None:
@@ -92,8 +107,3 @@ def _read_header(file: Path) -> Table | None:
     except (InputError, csv.Error):
         return None
     return Table(file.name, tuple(header)) if len(header) > 1 else None
-
-
-def listed(names: Sequence[str], most: int = 6, mark: str = ", ") -> str:
-    """The first names, and the number of the others."""
-    return mark.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

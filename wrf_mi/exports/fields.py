@@ -132,13 +132,14 @@ def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, 
     return facts | ({} if run.config.scene is None else {"scene (not included)": run.config.scene})
 
 
-def import_field(file: str | Path, out: str | Path) -> Run:
+def import_field(file: str | Path, out: str | Path, overwrite: bool = False) -> Run:
     """Make a run folder of a file of `write_field`; its predictions are bit-identical to those of the exported run.
 
-    `InputError`: a file that is missing, damaged or of another kind, or a folder that exists and is not empty.
+    `InputError`: a file that is missing, damaged or of another kind, or a folder that exists and is not empty, unless
+    it is of a run and ``overwrite`` is true.
     """
     path, folder = Path(file), Path(out)
-    check_new(folder)
+    check_new(folder, overwrite)
     with readable(path, f"{path}: missing; give a file of export --format field", "export it again"):
         arrays = stored_arrays(path)
         if VERSION not in arrays:
@@ -150,7 +151,10 @@ def import_field(file: str | Path, out: str | Path) -> Run:
         model = {key: values for key, values in arrays.items() if not key.startswith(SPLIT_ARRAYS)}
         if CONFIG not in texts or not split:
             raise InputError(f"{path}: incomplete; export it again")
-    with atomic_folder(folder, replace=True) as part:  # `check_new` leaves nothing that could be lost
+        for name, values in under(PARAM, model).items():
+            if not np.isfinite(values).all():
+                raise InputError(f"{path}: {PARAM}{name} has numbers that are not finite; export another run's field")
+    with atomic_folder(folder, replace=True) as part:  # `check_new` refuses others
         write_arrays(part / SPLIT, split)
         write_arrays(part / FITTED, model, compressed=True)
         for name, text in texts.items():

@@ -85,6 +85,8 @@ def _trace_options(options: ExportOptions) -> TraceOptions:
     chosen |= {} if options.depth is None else {"depth": options.depth}
     trace_options = TraceOptions(**chosen)
     for name, reason in without_effect(trace_options).items():
+        if name not in chosen:
+            continue
         option = "--depth" if name == "depth" else f"--paths {name}"
         logger.warning("%s has no effect: %s", option, reason)
     return trace_options

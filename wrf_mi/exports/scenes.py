@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,17 +13,21 @@ import trimesh
 from wrf_mi_scenes.mitsuba_xml import ABSORBER, COLOURS, OTHER_COLOUR, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
-from ..core.files import atomic_folder, one_line, write_atomically
+from ..core.files import atomic_folder, listed, one_line, write_atomically
 from ..core.types import IntArray
 from ..runs.scene_view import surfaces_of
 from ..scene.coordinates import Y_UP
 from ..scene.folder import plain_name
 from ..scene.mesh.surfaces import Surface
+from ..scene.scattering import PATTERN
 from ..tracing.paths.corrected_scene import ODD_IN_FILES, check_materials
 from ..tracing.sionna.materials import absorbs, conductivity_exponent, in_itu_range, set_frequency
+from ..tracing.sionna.scattering import scattering_of
 from ..tracing.sionna.scenes import load_scene
 from .format import ExportOptions
 from .source import Source
+
+logger = logging.getLogger(__name__)
 
 XML, LOOKS, FACTS = "scene.xml", "mitsuba.xml", "materials.json"
 GLTF_LOOKS: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "doubleSided": True}
@@ -48,7 +53,7 @@ class _Exported(NamedTuple):
 
     names: dict[str, str]
     constants: dict[str, dict[str, float]]
-    slabs: dict[str, tuple[str, float]]
+    slabs: dict[str, tuple[str, dict[str, Any]]]
     facts: dict[str, dict[str, Any]]
 
 
@@ -65,13 +70,19 @@ def _exported(scene: Any, used: Iterable[str], frequency_hz: float) -> _Exported
         itu: Any = getattr(material, "itu_type", None)
         follows = itu is not None and in_itu_range(itu, frequency_hz)
         new_name = name if follows or itu is None else f"{itu}_{frequency_hz / 1e6:.0f}mhz"
+        scattering = scattering_of(material)
+        if follows and scattering:
+            new_name = f"scattering_{itu}"  # of a name of ITU-R P.2040 Sionna RT drops what is stated of scattering
         names[name] = new_name = plain_name(new_name, ODD_IN_FILES, names.values())
         if follows:
-            slabs[new_name] = itu, values["thickness"]
+            slabs[new_name] = itu, {"thickness": values["thickness"], **scattering}
         else:
-            constants[new_name] = values
+            constants[new_name] = {**values, **scattering}
+        if PATTERN in scattering:
+            text = "%s: scene.xml cannot state the %s of %s; set it in Python as in %s"
+            logger.warning(text, name, PATTERN, new_name, FACTS)
         exponent = conductivity_exponent(material, frequency_hz)
-        facts[new_name] = {**values, "conductivity_exponent": exponent, "follows_frequency": follows}
+        facts[new_name] = {**values, **scattering, "conductivity_exponent": exponent, "follows_frequency": follows}
     return exported
 
 
@@ -104,7 +115,7 @@ def write_sionna(source: Source, out: Path, options: ExportOptions) -> dict[str,
         write_atomically(folder / LOOKS, scene_xml(materials, looks=True))
         text = json.dumps({"frequency_hz": frequency_hz, "materials": exported.facts}, indent=1)
         write_atomically(folder / FACTS, f"{text}\n")
-    fixed = ", ".join(exported.constants) or "none"
+    fixed = listed(exported.constants) or "none"
     return {"surfaces": len(parts), "materials": len(exported.facts), f"constants at {frequency_hz / 1e9:g} GHz": fixed}
 
 

@@ -48,7 +48,7 @@ from ..core import InputError, Prediction
 from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
 from ..core.receivers import receiver_index
-from ..models import Inputs
+from ..models import Fitted, Inputs
 from ..parallel import Scheduler, row_parts
 from ..receivers.spreads import PathStatistics
 from ..runs.results import RECEPTION
@@ -57,7 +57,7 @@ from ..tasks import Task, task_of
 from ..training.session import OnProgress, quiet
 from . import grid
 from .coverage import coverage_probability
-from .dataset import COVERAGE, POWER, STD, map_dataset, maps_package
+from .dataset import COVERAGE, POWER, STD, STD_OF_MEAN, map_dataset, maps_package
 
 if TYPE_CHECKING:
     import xarray
@@ -234,6 +234,8 @@ def map_values(
         if scheduler is None:  # one with workers has a bar of its own
             on_progress("mapping", (part + 1) / len(rows))
 
+    if scheduler is None:
+        on_progress("mapping", 0.0)
     opener: Any = (lambda: run) if scheduler is None else partial(open_run, run.folder, operator=run.operator)
     chosen, sizes = [positions_m[part] for part in rows], list(map(len, rows))
     function = partial(_mapped_part, receivers, conditions)
@@ -245,14 +247,18 @@ def map_values(
 def _mapped_part(
     receivers: Sequence[int], conditions: Conditions, run: Run, positions_m: FloatArray
 ) -> list[dict[str, Any]]:
-    return [_of_chunk(run, positions_m, receiver, conditions) for receiver in receivers]
+    # A chunk is traced to all receivers together, unless these are more than the mapped ones.
+    fitted = run.fitted.tracing_once() if len(receivers) == len(run.receivers) else run.fitted
+    return [_of_chunk(run, fitted, positions_m, receiver, conditions) for receiver in receivers]
 
 
-def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Conditions) -> dict[str, Any]:
+def _of_chunk(
+    run: Run, fitted: Fitted, positions_m: FloatArray, receiver: int, conditions: Conditions
+) -> dict[str, Any]:
     task, count = task_of(run.problem.record), len(positions_m)
     inputs = conditions.inputs(positions_m)
     run.check_inputs(inputs)
-    parts = run.fitted.decompose(inputs, receiver)
+    parts = fitted.decompose(inputs, receiver)
     added = conditions.transmit_dbm if task.level_kind == "gain" else 0.0
 
     def of_headings(values: Any) -> FloatArray:
@@ -263,8 +269,12 @@ def _of_chunk(run: Run, positions_m: FloatArray, receiver: int, conditions: Cond
     variables: dict[str, Any] = {POWER: means.mean(axis=1) + added}
     if level.std is not None:
         # The law of total variance: within a heading, and between headings.
-        std_db = np.sqrt(np.square(of_headings(level.std)).mean(axis=1) + means.var(axis=1))
-        variables[STD] = std_db
+        def over_headings(std: Any) -> FloatArray:
+            return np.sqrt(np.square(of_headings(std)).mean(axis=1) + means.var(axis=1))
+
+        variables[STD] = std_db = over_headings(level.std)
+        if level.std_mean is not None:
+            variables[STD_OF_MEAN] = over_headings(level.std_mean)
         reception = parts.prediction.reception
         received = None if reception is None else of_headings(reception).mean(axis=1)
         if received is not None:

@@ -19,9 +19,11 @@ if TYPE_CHECKING:
     import xarray
 
 POWER, STD, COVERAGE, BEST = "power_dbm", "power_std_db", "coverage_probability", "best_receiver"
+STD_OF_MEAN = "power_std_mean_db"
 VARIABLES = {
     POWER: ("dBm", "expected received power"),
-    STD: ("dB", "standard deviation of the received power"),
+    STD: ("dB", "standard deviation of a reading of the received power, its noise included"),
+    STD_OF_MEAN: ("dB", "standard deviation of the mean received power, without noise of readings"),
     RECEPTION: ("1", "probability that a transmission is received"),
     COVERAGE: ("1", "probability that the received power exceeds the threshold"),
     "path_gain_db": ("dB", "path gain, gains of both antennas included"),
@@ -80,7 +82,8 @@ def map_dataset(
     """Dataset of arrays [receivers, m] by the names of `VARIABLES`; levels in ``dBm``, or ``dB`` without calibration.
 
     Variables have dimensions (receiver, y, x) over a grid or (receiver, point) over a surface, ``best_receiver`` is
-    without the first. Coordinates: ``receiver`` (names), ``receiver_x``, ``receiver_y``, ``receiver_z``; ``x``, ``y``,
+    without the first. Coordinates: ``receiver`` (names), ``receiver_x``, ``receiver_y``, ``receiver_z``, with
+    ``receiver_x_std`` and so on where places are estimated; ``x``, ``y``,
     ``height`` of a grid; ``x``, ``y``, ``z`` of points, whose triangles are ``triangle`` (point, corner, axis). Metres,
     in the frame of the data.
     """
@@ -88,6 +91,12 @@ def map_dataset(
     coordinates: dict[str, Any] = {"receiver": ("receiver", names, {"long_name": "name of the receiver"})}
     for axis, values_m in zip("xyz", np.stack([receiver.position_m for receiver in receivers], axis=1), strict=True):
         coordinates[f"receiver_{axis}"] = "receiver", values_m, _metres(f"{axis} of the receiver")
+    if any(receiver.position_std_m is not None for receiver in receivers):
+        stated = np.zeros(3)
+        stds_m = [stated if receiver.position_std_m is None else receiver.position_std_m for receiver in receivers]
+        for axis, values_m in zip("xyz", np.stack(stds_m, axis=1), strict=True):
+            words = f"standard deviation of {axis} of the receiver, 0: stated"
+            coordinates[f"receiver_{axis}_std"] = "receiver", values_m, _metres(words)
     data: dict[str, Any] = {}
     if isinstance(places, Grid):
         dims: tuple[str, ...] = ("y", "x")

@@ -11,6 +11,10 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.ndimage import binary_erosion
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from ..backend.device import to_vectors
@@ -194,6 +198,7 @@ class Candidates:
 
     grid: Grid  # grid over the area's rectangle
     inside: NDArray[np.bool_]  # positions of the grid that are candidates [ny * nx]
+    area: NDArray[np.bool_] | None = None  # positions over floors, those in solids too [ny * nx]; None: all
 
     @cached_property
     def positions_m(self) -> FloatArray:
@@ -211,9 +216,24 @@ class Candidates:
         steps = [axis[1] - axis[0] for axis in (self.grid.x_m, self.grid.y_m) if len(axis) > 1]
         return float(steps[0] ** 2) if steps else 0.0
 
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.positions_m[:, :2])
+
     def nearest(self, positions_m: FloatArray) -> NDArray[np.intp]:
         """Index of the candidate that is nearest in the plan to each position [m, 2 or more]."""
-        return np.argmin(cdist(positions_m[:, :2], self.positions_m[:, :2]), axis=1)
+        return np.asarray(self._tree.query(positions_m[:, :2])[1])
+
+    def outside(self, positions_m: FloatArray) -> NDArray[np.bool_]:
+        """Whether each position [m, 2 or more] is farther in the plan than a cell's diagonal from all candidates."""
+        return np.asarray(self._tree.query(positions_m[:, :2])[0] > np.sqrt(2 * self.cell_m2))
+
+    @cached_property
+    def at_border(self) -> NDArray[np.bool_]:
+        """Whether each candidate [p] is beside a position that is over no floor, or at the edge of the grid."""
+        area = np.ones(len(self.inside), bool) if self.area is None else self.area
+        shape = len(self.grid.y_m), len(self.grid.x_m)
+        return np.asarray(~binary_erosion(area.reshape(shape), np.ones((3, 3))).ravel()[self.inside])
 
 
 def candidates_of(
@@ -224,36 +244,42 @@ def candidates_of(
 ) -> Candidates:
     """Candidates of a run: over a floor of its scene and outside of solids, else in the rectangle of its training rows.
 
-    ``area_m`` are lower and upper corners [2 or more] in place of those of the scene or the rows, metres.
+    Plans leave out floors where people were: up to `MARGIN_M` from training rows no floor is needed. ``area_m`` are
+    lower and upper corners [2 or more] in place of those of the scene or the rows, metres.
 
     By default their step is `CANDIDATE_STEP_M`, more for large areas, and their height the training rows' median.
     `InputError`: a step that is not positive or too small, no candidate, or neither scene nor known positions.
     """
     scene, record = run.problem.opened_scene, run.problem.record
     known = record.tx_pos_m[load_rows(run.folder, record).all_train]
+    known = known[np.isfinite(known).all(axis=1)]
     low, high = area_of(run, known) if area_m is None else area_m
     if step_m is None:
         step_m = max(CANDIDATE_STEP_M, float(np.sqrt(np.prod(high[:2] - low[:2]) / USUAL_CANDIDATES)))
     height = usual_height(run, known) if height_m is None else height_m
     check_height(run, height, known)
     grid = grid_over(low, high, step_m, height)
-    inside = np.ones(len(grid.x_m) * len(grid.y_m), bool) if scene is None else inside_scene(scene, grid.positions_m)
+    area = inside = np.ones(len(grid.x_m) * len(grid.y_m), bool)
+    if scene is not None:
+        area = over_floor(scene, grid.positions_m)
+        if len(known):
+            area |= cKDTree(known[:, :2]).query(grid.positions_m[:, :2])[0] <= MARGIN_M
+        inside = area & outside_solids(scene, grid.positions_m)
     if not inside.any():
         remedy = "give another --height" if height_m is not None else "give --height"
         raise InputError(f"{run.folder}: no position {grid.height_m:g} m high is over a floor of the scene; {remedy}")
     if inside.sum() > MOST_CANDIDATES:
         text = f"{inside.sum()} candidate positions, the limit is {MOST_CANDIDATES}"
         raise InputError(f"step {step_m:g} m: {text}; give a larger step")
-    return Candidates(grid, inside)
+    return Candidates(grid, inside, area)
 
 
-def inside_scene(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
-    """Mask of positions [n, 3] with a surface below them, and not in a solid (``sionna.rt.Scene``)."""
+def over_floor(scene: Any, positions_m: FloatArray) -> NDArray[np.bool_]:
+    """Mask of positions [n, 3] with a surface below them (``sionna.rt.Scene``)."""
     import mitsuba as mi
 
-    origin = to_vectors(positions_m, mi.Point3f)
-    below = np.array(scene.mi_scene.ray_test(mi.Ray3f(origin, mi.Vector3f(0, 0, -1))), bool)
-    return below & outside_solids(scene, positions_m)
+    ray = mi.Ray3f(to_vectors(positions_m, mi.Point3f), mi.Vector3f(0, 0, -1))
+    return np.array(scene.mi_scene.ray_test(ray), bool)
 
 
 def with_standing_room(scene: Any, positions_m: FloatArray) -> FloatArray:
@@ -271,3 +297,33 @@ def with_standing_room(scene: Any, positions_m: FloatArray) -> FloatArray:
     distance_m = np.array(scene.mi_scene.ray_intersect_preliminary(ray).t, float).reshape(-1, DIRECTIONS)
     free = (distance_m >= STANDING_M).all(axis=1)  # infinite where nothing is hit
     return positions_m[free] if free.any() else positions_m
+
+
+def reachable(scene: Any, positions_m: FloatArray, starts_m: FloatArray) -> NDArray[np.bool_]:
+    """Mask of positions [n, 3] at one height that are reached from places [k, 3] without passing a surface.
+
+    One walks at that height over the floors of a ``sionna.rt.Scene``, in steps shorter than a door is wide.
+    """
+    starts = starts_m[np.isfinite(starts_m[:, :2]).all(axis=1)]
+    if scene is None or not len(positions_m) or not len(starts):
+        return np.ones(len(positions_m), bool)
+    import mitsuba as mi
+
+    starts = np.column_stack([starts[:, :2], np.full(len(starts), positions_m[0, 2])])
+    ends = np.concatenate([positions_m, starts])
+    low, high = ends.min(axis=0) - MARGIN_M, ends.max(axis=0) + MARGIN_M
+    step_m = max(CANDIDATE_STEP_M, usual_step(low, high))
+    ways = grid_over(low, high, step_m, ends[0, 2]).positions_m
+    nodes = np.concatenate([ends, ways[over_floor(scene, ways) & outside_solids(scene, ways)]])
+    # Half a step more, so that places between the nodes of the grid meet several of them.
+    pairs = cKDTree(nodes).query_pairs(1.5 * step_m, output_type="ndarray")
+    away = nodes[pairs[:, 1]] - nodes[pairs[:, 0]]
+    length_m = np.linalg.norm(away, axis=-1)
+    directions = away / np.maximum(length_m, np.finfo(float).tiny)[:, None]
+    directions[length_m == 0] = (0, 0, 1)
+    ray = mi.Ray3f(to_vectors(nodes[pairs[:, 0]], mi.Point3f), to_vectors(directions, mi.Vector3f))
+    clear = np.array(scene.mi_scene.ray_intersect_preliminary(ray).t, float) >= length_m
+    first, second = pairs[clear].T.astype(np.int32)
+    graph = sparse.csr_array((np.ones(len(first), bool), (first, second)), shape=(len(nodes), len(nodes)))
+    _, part = connected_components(graph, directed=False)
+    return np.isin(part[: len(positions_m)], part[len(positions_m) : len(ends)])

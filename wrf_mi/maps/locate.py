@@ -42,6 +42,8 @@ class LocatedPositions:
         level: probability that regions hold.
         candidates: candidate positions.
         calibration: form of the likelihood, with held-out error and coverage.
+        at_border: whether each estimate lies at the border of the candidates' area [m]: it may lie beyond.
+        rows_outside: number of training rows that were measured outside of that area.
     """
 
     tx_pos_m: FloatArray
@@ -53,6 +55,8 @@ class LocatedPositions:
     level: float
     candidates: Candidates
     calibration: Calibration
+    at_border: NDArray[np.bool_]
+    rows_outside: int
 
     def __len__(self) -> int:
         """Number of transmitters."""
@@ -155,8 +159,9 @@ def locate(
     session = Session(run.folder, run.folder, on_progress, stop)
     try:
         report = partial(session.report, "predicting candidates")
-        predicted = predict_candidates(run.fitted, len(observed), headings_of(run), candidates, report)
-        calibration = calibration_of(run, candidates, session)
+        fitted = run.fitted.tracing_once()
+        predicted = predict_candidates(fitted, np.arange(len(observed)), headings_of(run), candidates, report)
+        calibration = calibration_of(run, fitted, candidates, session)
     except InputError as error:
         raise InputError(f"{run.folder}: {error}") from None
     except Interrupted:
@@ -166,6 +171,7 @@ def locate(
         likelihood = replace(likelihood, offset_db=offset_db)
     m, p = observed.shape[1], len(candidates.positions_m)
     estimate, radius = np.full((m, 3), candidates.grid.height_m), np.empty(m)
+    at_border = np.empty(m, bool)
     probability, inside = np.empty((m, p), np.float32), np.empty((m, p), bool)
     for number, strengths in enumerate(observed.T):
         if stop():
@@ -173,11 +179,13 @@ def locate(
         probabilities = softmax(likelihood.log(strengths, *predicted))
         best, radius[number], inside[number] = region_of(probabilities, candidates.distance_m, level)
         probability[number] = probabilities
-        estimate[number, :2] = candidates.positions_m[best, :2]
+        estimate[number, :2], at_border[number] = candidates.positions_m[best, :2], candidates.at_border[best]
         session.report("locating", (number + 1) / m)
     area, near = inside.sum(axis=1) * candidates.cell_m2, calibration.neighbours
-    near_m = None if near is None else near.locate(record, load_rows(run.folder, record).all_train, observed)
-    return LocatedPositions(estimate, radius, area, probability, inside, near_m, level, candidates, calibration)
+    rows = load_rows(run.folder, record).all_train
+    near_m = None if near is None else near.locate(record, rows, observed)
+    of_regions = estimate, radius, area, probability, inside, near_m, level, candidates, calibration
+    return LocatedPositions(*of_regions, at_border, int(candidates.outside(record.tx_pos_m[rows]).sum()))
 
 
 def _check(run: Run, observed_dbm: FloatArray, level: float, offset_db: float | None) -> None:

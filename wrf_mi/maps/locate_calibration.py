@@ -13,7 +13,6 @@ import logging
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +27,10 @@ from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import readable, write_atomically
 from ..core.types import IntArray
+from ..datasets.observations import fitted_receivers
 from ..models import Fitted, Session
 from ..models.held_out import fit_fold
-from ..models.model import Inputs
+from ..models.model import Inputs, slices
 from ..runs.folder import load_rows
 from ..runs.run import Run
 from ..training.selection import hold_out
@@ -44,6 +44,7 @@ DEGREES, SCALES, OFFSETS_DB = (4.0, 8.0, None), (0.35, 0.5, 0.7, 0.85, 1.0, 1.2,
 WIDE = 0.95  # probability of the quantile by which the widths of distributions are compared
 MOST_ROWS = 300  # most held-out rows that are located
 LEVEL = 0.9  # probability of a region by default, and of those whose held-out coverage is stated
+TOGETHER = 512  # candidates that are predicted together
 FOLDS = 3  # hold-outs with other seeds: one alone has few positions, near each other
 FOLDER, FILE = "locate", "locate.json"  # folder of finished folds in the run folder, and file of the choice
 
@@ -63,22 +64,26 @@ class Calibration:
 
 
 def predict_candidates(
-    fitted: Fitted, count: int, headings: int, candidates: Candidates, report: Callable[[float], None]
+    fitted: Fitted, receivers: IntArray, headings: int, candidates: Candidates, report: Callable[[float], None]
 ) -> NDArray[np.float32]:
     """Means in dBm and standard deviations in dB [2, headings, n_rx, p] of a fitted model at the candidates.
 
-    Headings are equally spaced where the model uses them. `InputError` where it states no standard deviation.
+    Receivers are those of the given numbers [n_rx]; headings are equally spaced where the model uses them.
+    `InputError` where it states no standard deviation.
     """
     positions = candidates.positions_m
-    predicted = np.empty((2, headings, count, len(positions)), np.float32)
-    for number in range(headings):
-        turned = np.full(len(positions), 2 * np.pi * number / headings) if headings > 1 else None
-        for receiver in range(count):
-            prediction = fitted.predict(Inputs(positions, turned), receiver)
-            if prediction.std is None:
-                raise InputError("its model states no standard deviation; train it with --intervals")
-            predicted[:, number, receiver] = prediction.mean, prediction.std
-            report((number * count + receiver + 1) / (headings * count))
+    predicted = np.empty((2, headings, len(receivers), len(positions)), np.float32)
+    report(0.0)
+    # Positions in the outer loop: a chunk's paths to all receivers are traced together and bound the memory.
+    for part in slices(len(positions), TOGETHER):
+        for number in range(headings):
+            turned = np.full(part.stop - part.start, 2 * np.pi * number / headings) if headings > 1 else None
+            for place, receiver in enumerate(receivers):
+                prediction = fitted.predict(Inputs(positions[part], turned), int(receiver))
+                if prediction.std is None:
+                    raise InputError("its model states no standard deviation; train it with --intervals")
+                predicted[:, number, place, part] = prediction.mean, prediction.std
+        report(part.stop / len(positions))
     return predicted
 
 
@@ -99,11 +104,12 @@ class Located:
     truth: IntArray
 
 
-def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibration:
+def calibration_of(run: Run, fitted: Fitted, candidates: Candidates, session: Session) -> Calibration:
     """The stored choice of a run for these candidates, else a new one, which is stored in the run folder.
 
-    Finished folds are kept until all are, so that a stopped choice (`Interrupted`) goes on. `InputError` of a fold
-    that the model cannot be fitted to.
+    ``fitted`` is the run's model, which shares what it has traced at the candidates (`Fitted.tracing_once`). Finished
+    folds are kept until all are, so that a stopped choice (`Interrupted`) goes on. `InputError` of a fold that the
+    model cannot be fitted to.
     """
     grid, file = candidates.grid, run.folder / FILE
     key = {"candidates": int(candidates.inside.sum()), "low_m": [float(grid.x_m[0]), float(grid.y_m[0])]}
@@ -121,11 +127,13 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
         return Calibration(Likelihood())
     parts, most = [], max(1, MOST_ROWS // len(folds))
     for number, fold in enumerate(folds):
-        # One line for all folds: a hybrid has some twenty stages in each.
-        show = partial(session.on_progress, f"calibrating by {len(folds)} folds", number / len(folds))
-        of_fold = replace(session, on_progress=lambda *_, show=show: show())
+
+        def report(share: float, number: int = number) -> None:
+            session.report(f"calibrating by {len(folds)} folds", (number + share) / len(folds))
+
+        report(0.0)
         folder = run.folder / FOLDER / f"fold{number}"
-        receivers, predicted = _predicted_fold(run, fold, folder, candidates, of_fold)
+        receivers, predicted = _predicted_fold(run, fitted, fold, folder, candidates, session, report)
         test = fold.test[np.isfinite(record.observation[receivers][:, fold.test]).any(axis=0)]
         test = np.sort(np.random.default_rng([run.problem.seed, 11]).permutation(test)[:most])
         parts.append(Located(predicted, receivers, test, candidates.nearest(record.tx_pos_m[test])))
@@ -133,28 +141,40 @@ def calibration_of(run: Run, candidates: Candidates, session: Session) -> Calibr
     chosen = choose(record, parts, candidates, lambda share: session.report("choosing the likelihood", share))
     chosen = replace(chosen, neighbours=neighbours, neighbours_error_m=error_m)
     write_atomically(file, json.dumps({"key": key, **asdict(chosen)}, indent=1) + "\n")
-    shutil.rmtree(run.folder / FOLDER)
+    shutil.rmtree(run.folder / FOLDER, ignore_errors=True)
     return chosen
 
 
 def _predicted_fold(
-    run: Run, fold: Split, folder: Path, candidates: Candidates, session: Session
+    run: Run,
+    fitted: Fitted,
+    fold: Split,
+    folder: Path,
+    candidates: Candidates,
+    session: Session,
+    report: Callable[[float], None],
 ) -> tuple[IntArray, NDArray[np.float32]]:
-    """Receivers of a fold and predictions at the candidates by a model fitted to it; a finished fold is read."""
+    """Receivers of a fold and predictions at the candidates by a model fitted to it; a finished fit is read.
+
+    A model whose parameters are not the fit is given the fold's rows: fitting a hybrid to each fold takes minutes.
+    """
+    record = run.problem.record
+    if (refit := fitted.refit(record, fold.all_train)) is not None:
+        numbers, _ = fitted_receivers(record, [fold])
+        return numbers, predict_candidates(refit, numbers, headings_of(run), candidates, report)
     file = folder.with_suffix(".npz")
     arrays = stored_arrays(file) if file.exists() else {}
     if "predicted" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        inner = replace(session, folder=folder, run=folder)
+        folder.mkdir(parents=True, exist_ok=True)  # with the files of a stopped fit, if any
+        # One line for all folds: a fit may have twenty stages.
+        inner = replace(session, folder=folder, run=folder, on_progress=lambda *_: report(0.0))
         with threadpool_limits(1, "blas"):
-            fitted, numbers = fit_fold(run.model, run.problem, fold, inner)
-            predicted = predict_candidates(
-                fitted, len(numbers), headings_of(run), candidates, partial(inner.report, "map")
-            )
-        shutil.rmtree(folder)
+            of_fold, numbers = fit_fold(run.model, run.problem, fold, inner)
+            places = np.arange(len(numbers))
+            predicted = predict_candidates(of_fold.tracing_once(), places, headings_of(run), candidates, report)
         arrays = {"predicted": predicted, "positions_m": candidates.positions_m, "receivers": numbers}
         write_arrays(file, arrays)
+        shutil.rmtree(folder)
     return arrays["receivers"], arrays["predicted"]
 
 

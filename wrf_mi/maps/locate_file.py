@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -16,74 +17,140 @@ from matplotlib.patches import Circle, Patch
 
 from ..core import DataFault, InputError, Receiver
 from ..core.angles import FloatArray
-from ..core.files import one_line, write_csv
-from ..core.receivers import SHOWN as SHOWN_NAMES
+from ..core.files import listed, one_line, text_lines, write_csv
+from ..core.types import IntArray
+from ..core.yaml_files import read_yaml
 from ..datasets.folder_files import CsvTable, read_csv
+from ..datasets.tables.importing import FACTS
+from ..datasets.tables.observed import ObservedTable, read_observed
+from ..datasets.tables.readings import id_key
 from ..runs.folder import load_rows
 from ..runs.run import Run
 from ..tasks.scores import summary
 from .locate import LocatedPositions
 from .picture import scene_cuts
 
+logger = logging.getLogger(__name__)
+
 DBM, RSSI, ANCHOR = "_dbm", "rssi_", "anchor"
 """Columns are ``<receiver>_dbm``, or ``rssi_<receiver>``, where the name of ``anchor<number>`` is its number."""
+SILENT = "no receiver of the run received anything, so there is no position; remove the row"
 SHOWN, COLUMNS = 6, 3  # number of rows that are drawn, and panels side by side
 MARGIN_M = 0.5  # margin of a panel around the candidates
 REGION, ESTIMATE, NEIGHBOURS, TRUTH = "tab:orange", "tab:red", "tab:purple", "black"
 
 
 def read_observations(
-    path: str | Path, receivers: Sequence[Receiver], left_out: Collection[str] = ()
+    path: str | Path, receivers: Sequence[Receiver], left_out: Collection[str] = (), data: str | Path | None = None
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Read the signal strengths [n_rx, m] of each receiver, and true positions [m, 2] or None, from a CSV file.
+    """Read the signal strengths [n_rx, m] of each receiver, and true positions [m, 2] or None, from a table.
 
     A column ``<receiver>_dbm``, as ``wrf-mi predict`` writes it, or ``rssi_<receiver>``, as data sets have it, is
     needed for each receiver; a field is empty where nothing was received (NaN). Columns ``x`` and ``y``, if any, are
-    true positions in metres. Other columns are ignored, also those of receivers that the run left out of its data.
-    `InputError`: missing or unreadable, a receiver without a column or with several, a column of an unknown receiver, a
-    field that is no number, or a row without any strength.
+    true positions in metres. Other columns are ignored, also those of receivers that the run left out of its data. A
+    table without such columns, or from which the run's data were imported, is read as `wrf_mi.import_measurements`
+    reads it (`read_observed`).
+
+    Args:
+        path: the table.
+        receivers: receivers of the run.
+        left_out: names of receivers that the run left out of its data.
+        data: folder of the run's data, whose ``import.yml``, if any, states the frame of positions.
+
+    Raises:
+        InputError: missing or unreadable, receivers without a column or with several, columns of unknown receivers, a
+            field that is no number, or a row without any strength.
     """
-    table = read_csv(Path(path), skip_blank=True)
-    columns = _columns(table, [receiver.name for receiver in receivers], left_out)
+    path, names = Path(path), [receiver.name for receiver in receivers]
+    facts_file = None if data is None else Path(data) / FACTS
+    facts = {} if facts_file is None or not facts_file.is_file() else read_yaml(facts_file)
+    # A table that was imported may have columns named as in data sets, and positions in another frame.
+    was_imported = path.name in facts.get("files", ()) and path.resolve().parent != Path(data or "").resolve()
+    if was_imported or not _has_layout(path, names):
+        return _imported(read_observed(path, facts), names, left_out)
+    table = read_csv(path, skip_blank=True)
+    columns = _columns(table, names, left_out, imported=bool(facts))
     values = np.stack([table.numbers(column, may_be_empty=True) for column in columns])
-    silent = np.flatnonzero(~np.isfinite(values).any(axis=0))
-    if len(silent):
-        text = "no receiver of the run received anything, so there is no position; remove the row"
-        raise DataFault(table.path, text, row=int(silent[0]) + 1)
+    if len(silent := _silent(values)):
+        raise DataFault(table.path, SILENT, row=int(silent[0]) + 1)
     stated = [axis for axis in "xy" if axis in table.header]
     if len(stated) == 1:
         raise DataFault(table.path, f"column {stated[0]} alone is no position; give x and y, or neither", line=1)
     return values, np.stack([table.numbers(axis) for axis in "xy"], axis=1) if stated else None
 
 
-def _columns(table: CsvTable, names: Sequence[str], left_out: Collection[str]) -> list[str]:
-    """Columns of the receivers; `DataFault`: there is one of an unknown receiver."""
-    columns = [_column(table, name) for name in names]
-    ignored = [column for name in left_out for column in _able(name)]
+def _has_layout(path: Path, names: Sequence[str]) -> bool:
+    """Whether a file is CSV with a column of a receiver that is named as in data sets and predictions."""
+    try:
+        header = [name.strip() for name in next(iter(text_lines(path)), "").split(",")]
+    except InputError:  # no text in UTF-8
+        return False
+    return not {column for name in names for column in _able(name)}.isdisjoint(header)
+
+
+def _imported(
+    observed: ObservedTable, names: Sequence[str], left_out: Collection[str]
+) -> tuple[FloatArray, FloatArray | None]:
+    """Strengths [n_rx, m] of the receivers of a run from a table, and true positions [m, 2] or None."""
+    numbers = {key: number for number, name in enumerate(names) for key in _keys(name)}
+    number_of = [numbers.get(id_key(name), -1) for name in observed.ids]
+    file, heard = observed.table.files[0][0], np.array(number_of) >= 0
+    lacking = [name for number, name in enumerate(names) if number not in number_of]
+    if not heard.any() or (lacking and not observed.is_long):
+        text = f"no strengths of {_receivers(lacking)} among {one_line(listed(observed.ids))}"
+        raise DataFault(file, f"{text}; name each as in the data of the run")
+    known = {key for name in left_out for key in _keys(name)} | numbers.keys()
+    if unknown := [name for name in observed.ids if id_key(name) not in known]:
+        logger.warning("%s: %d receivers unknown to the run are not used: %s", file, len(unknown), listed(unknown))
+    values = np.full((len(names), len(observed.first_row)), np.nan)
+    values[np.array(number_of)[heard]] = observed.dbm[heard]
+    if len(silent := _silent(values)):
+        raise observed.table.fault(SILENT, int(observed.first_row[silent[0]]))
+    return values, observed.xy_m
+
+
+def _silent(values: FloatArray) -> IntArray:
+    """Columns of strengths [n_rx, m] without any."""
+    return np.flatnonzero(~np.isfinite(values).any(axis=0))
+
+
+def _keys(name: str) -> set[str]:
+    """Ids of a table, as `id_key` compares them, that are a receiver's."""
+    return {id_key(name), id_key(name.removeprefix(ANCHOR))}
+
+
+def _receivers(names: Sequence[str]) -> str:
+    return f"receiver{'s' if len(names) > 1 else ''} {one_line(listed(names))}"
+
+
+def _columns(table: CsvTable, names: Sequence[str], left_out: Collection[str], imported: bool) -> list[str]:
+    """Columns of the receivers; `DataFault` with all receivers that lack one or have two, and all unknown columns.
+
+    Unknown columns of data that were imported are of receivers that the import left out, and ignored.
+    """
+    stated = {name: [column for column in _able(name) if column in table.header] for name in names}
+    faults: dict[str, str] = {}  # what is wrong by its remedy
+    if lacking := [name for name in names if not stated[name]]:
+        able = " or ".join(map(one_line, _able(lacking[0])))
+        remedy = f"name one {able}" + ", and so on" * (len(lacking) > 1)
+        faults[f"{remedy}, and leave it empty where nothing was received"] = f"no column of {_receivers(lacking)}"
+    if doubled := [f"{columns[0]} and {columns[1]}" for columns in stated.values() if len(columns) > 1]:
+        faults["remove one of them"] = f"{one_line(listed(doubled))} are of one receiver"
+    known = {column for name in (*names, *left_out) for column in _able(name)}
     strengths = [column for column in table.header if column.endswith(DBM) or column.startswith(RSSI)]
-    for column in [column for column in strengths if column not in (*columns, *ignored)]:
-        listed = ", ".join(names[:SHOWN_NAMES]) + (", ..." if len(names) > SHOWN_NAMES else "")
-        text = f"column {one_line(column)} names no receiver of the run ({one_line(listed)})"
-        raise DataFault(table.path, f"{text}; rename or remove it", line=1)
-    return columns
+    if (unknown := [column for column in strengths if column not in known]) and not imported:
+        verb = "columns {} name" if len(unknown) > 1 else "column {} names"
+        text = f"{verb.format(one_line(listed(unknown)))} no receiver of the run ({one_line(listed(names))})"
+        faults[f"rename or remove {'them' if len(unknown) > 1 else 'it'}"] = text
+    if faults:
+        raise DataFault(table.path, f"{', and '.join(faults.values())}; {', and '.join(faults)}", line=1)
+    return [columns[0] for columns in stated.values()]
 
 
 def _able(name: str) -> list[str]:
     """Names that the column of a receiver may have."""
     number = name.removeprefix(ANCHOR)
     return [f"{name}{DBM}", f"{RSSI}{name}", *([f"{RSSI}{number}"] if number.isdecimal() else [])]
-
-
-def _column(table: CsvTable, name: str) -> str:
-    able = _able(name)
-    stated = [column for column in able if column in table.header]
-    if not stated:
-        text = f"no column of receiver {one_line(name)}"
-        remedy = f"name one {' or '.join(map(one_line, able))}, and leave it empty where nothing was received"
-        raise DataFault(table.path, f"{text}; {remedy}", line=1)
-    if len(stated) > 1:
-        raise DataFault(table.path, f"{stated[0]} and {stated[1]} are of one receiver; remove one of them", line=1)
-    return stated[0]
 
 
 def test_observations(run: Run) -> tuple[FloatArray, FloatArray]:
@@ -129,12 +196,14 @@ def figures_of(located: LocatedPositions, true_m: FloatArray | None = None) -> d
     chosen = located.calibration
     figures: dict[str, Any] = {"n": len(located), "level": located.level, "likelihood": asdict(chosen.likelihood)}
     figures |= {"area_m2": summary(located.area_m2), "radius_m": summary(located.radius_m)}
+    figures |= {"at_border": int(located.at_border.sum()), "training_rows_outside": located.rows_outside}
     if chosen.neighbours is not None:
         figures["neighbours"] = asdict(chosen.neighbours)
         names = ("rows", "error_m", "inside", "neighbours_error_m")
         figures["held_out"] = {name: getattr(chosen, name) for name in names}
     if true_m is not None:
         figures |= {"error_m": summary(located.error_m(true_m)), "inside": float(located.covers(true_m).mean())}
+        figures["outside"] = int(located.candidates.outside(true_m).sum())
         if (near := located.neighbours_error_m(true_m)) is not None:
             figures["neighbours_error_m"] = summary(near)
     return figures

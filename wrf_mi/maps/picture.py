@@ -28,7 +28,7 @@ from ..runs.scene_view import surfaces_of
 from ..scene.mesh.surfaces import cut_lines
 from ..scene.preview import AZIMUTH_DEG, ELEVATION_DEG, MOST_FACES
 from ..tasks import task_of
-from .dataset import COVERAGE, POWER, STD
+from .dataset import COVERAGE, POWER, STD, STD_OF_MEAN
 
 if TYPE_CHECKING:
     import xarray
@@ -41,6 +41,8 @@ MEASURED_TAIL = 10.0  # likewise for measured levels, among which are single dee
 STRONGEST = "strongest receiver"
 TRAINED = {"marker": "o", "s": 13, "edgecolors": "white", "linewidths": 0.4}
 OTHER = {"marker": "s", "s": 11, "edgecolors": "black", "linewidths": 0.4}
+EDGE = 0.02  # margin around all that is drawn, a share of its size
+NEARBY = 0.25  # distance from the rest of a map up to which estimated receivers are drawn, a share of its size
 ESTIMATED: dict[str, Any] = {"marker": "X", "s": 26, "facecolors": "none"}  # receiver at an estimated place
 RED = "#c1121f"  # of receivers
 MOST_DEVIATIONS = 3  # number of receivers up to which the standard deviation of each is drawn
@@ -85,12 +87,16 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     lines = -(-len(panels) // COLUMNS)
     columns = min(COLUMNS, len(panels))
     width = (PANEL_IN + BAR_IN) * columns
-    heading = _heading(dataset, measured, estimated, int(width * LETTERS_PER_INCH))
+    walls = scene_cuts(run, float(dataset["height"])) if flat else []
+    area_m = _area(dataset, measured, estimated, walls)
+    at_m, around_m = _receivers(dataset)[:, : area_m.shape[1]], NEARBY * np.ptp(area_m, axis=0).max()
+    is_drawn = ((at_m >= area_m[0] - around_m) & (at_m <= area_m[1] + around_m)).all(axis=1)
+    area_m = _with_margin(np.concatenate([area_m, at_m[is_drawn]]))
+    heading = _heading(dataset, measured, estimated, is_drawn, int(width * LETTERS_PER_INCH))
     height = (PANEL_IN * _aspect(dataset) + 0.5) * lines + 0.3 + LINE_IN * heading.count("\n")
     figure = Figure(figsize=(width, height), layout="constrained")
     kind: dict[str, Any] = {} if flat else {"projection": "3d", "computed_zorder": False}
     grid = figure.subplots(lines, columns, squeeze=False, subplot_kw=kind)
-    walls = scene_cuts(run, float(dataset["height"])) if flat else []
     for axes, panel in zip(grid.flat, panels, strict=False):
         if panel is None:
             axes.set_axis_off()
@@ -101,7 +107,9 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
             axes.set_ylabel("y (m)", fontsize=7)
         else:
             _draw_mesh(axes, dataset, panel.values, panel.colours)
-        _draw_points(axes, dataset, panel, estimated)
+        _draw_points(axes, dataset, panel, estimated, is_drawn)
+        if flat:  # of which ellipses may reach beyond
+            axes.set(xlim=area_m[:, 0], ylim=area_m[:, 1])
         axes.set_title(textwrap.fill(panel.title, int(PANEL_IN * LETTERS_PER_INCH)), fontsize=8)
         axes.tick_params(labelsize=6)
         bar = figure.colorbar(panel.colours, ax=axes, shrink=0.8, pad=0.02 if flat else 0.12, extend=panel.beyond)
@@ -133,11 +141,13 @@ def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Pan
     rows = None if several else measured[0]
     panels: list[_Panel | None] = []
     panels.append(_Panel(f"{who}: expected power", of_best(POWER), colours, unit, "both", number, rows))
-    each = STD in dataset and 1 < len(names) <= MOST_DEVIATIONS
-    if STD in dataset:
-        drawn = dataset[STD].values if each else of_best(STD)
+    # The map is of the mean power: its deviation where the model states it, else that of a reading.
+    deviation, of = (STD_OF_MEAN, "the mean") if STD_OF_MEAN in dataset else (STD, "a reading")
+    title, each = "{}: standard deviation of " + of, deviation in dataset and 1 < len(names) <= MOST_DEVIATIONS
+    if deviation in dataset:
+        drawn = dataset[deviation].values if each else of_best(deviation)
         shades = ScalarMappable(Normalize(0, max(float(np.nanmax(drawn)), 1e-3)), "magma")
-        panels.append(_Panel(f"{who}: standard deviation", of_best(STD), shades, "dB", "neither", number, None))
+        panels.append(_Panel(title.format(who), of_best(deviation), shades, "dB", "neither", number, None))
     if COVERAGE in dataset:
         probable = ScalarMappable(Normalize(0, 1), "cividis")
         values = of_best(COVERAGE)
@@ -146,7 +156,7 @@ def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Pan
     powers = [_Panel(f"{names[k]}: expected power", power[k], colours, unit, "both", k, measured[k]) for k in numbers]
     if not each:
         return panels + powers
-    title, std = "{}: standard deviation", dataset[STD].values
+    std = dataset[deviation].values
     spreads = [_Panel(title.format(names[k]), std[k], shades, "dB", "neither", k, None) for k in numbers]
     return [panel for line in (panels, powers, spreads) for panel in (*line, *[None] * (COLUMNS - len(line)))]
 
@@ -162,7 +172,42 @@ def _covered(dataset: xarray.Dataset, who: str, values: FloatArray) -> str:
     return f"{title}: {low:.2f} to {high:.2f} here" + (", as readings are lost at any power" if received else "")
 
 
-def _heading(dataset: xarray.Dataset, measured: Sequence[_Measured], estimated: Mapping[str, Any], width: int) -> str:
+def _receivers(dataset: xarray.Dataset) -> FloatArray:
+    """Positions of receivers [n, 3], metres; NaN where unknown."""
+    return np.stack([dataset[f"receiver_{axis}"].values for axis in "xyz"], axis=-1)
+
+
+def _area(
+    dataset: xarray.Dataset, measured: Sequence[_Measured], estimated: Mapping[str, Any], walls: Sequence[FloatArray]
+) -> FloatArray:
+    """Least and largest coordinates [2, 2], of a mesh [2, 3], of all that is drawn but receivers at estimated places.
+
+    Those far outside, whose places are often uncertain, would shrink the map.
+    """
+    axes, names = "xy" if "point" not in dataset.sizes else "xyz", map(str, dataset["receiver"].values)
+    stated = _receivers(dataset)[[name not in estimated for name in names]]
+    points = [rows.points_m for rows in measured] + [stated]
+    shown = [np.concatenate([dataset[axis].values, *(part[:, k] for part in points)]) for k, axis in enumerate(axes)]
+    ends = np.array([[np.nanmin(values), np.nanmax(values)] for values in shown]).T
+    for lines in walls:
+        ends = np.stack([np.minimum(ends[0], lines.min(axis=(0, 1))), np.maximum(ends[1], lines.max(axis=(0, 1)))])
+    return ends
+
+
+def _with_margin(points_m: FloatArray) -> FloatArray:
+    """Least and largest coordinates [2, k] of points [n, k], with a margin for marks at the edge."""
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    margin_m = EDGE * (high - low).max()
+    return np.stack([low - margin_m, high + margin_m])
+
+
+def _heading(
+    dataset: xarray.Dataset,
+    measured: Sequence[_Measured],
+    estimated: Mapping[str, Any],
+    is_drawn: NDArray[np.bool_],
+    width: int,
+) -> str:
     """Title, heights of the transmitter, carrier and marks, in lines of at most ``width`` letters."""
     heights = np.concatenate([rows.points_m[:, 2] for rows in measured])
     words = [] if "point" in dataset.sizes else [f"transmitter at z = {float(dataset['height']):.2f} m"]
@@ -175,12 +220,15 @@ def _heading(dataset: xarray.Dataset, measured: Sequence[_Measured], estimated: 
     else:
         words.append(f"measured at z = {heights.min():.2f} to {heights.max():.2f} m")
     trained = np.concatenate([rows.trained for rows in measured])
-    receivers = {str(name) in estimated for name in dataset["receiver"].values}
+    names = map(str, dataset["receiver"].values)
+    receivers = {name in estimated for name, drawn in zip(names, is_drawn, strict=True) if drawn}
+    outside = np.count_nonzero(np.isfinite(_receivers(dataset)).all(axis=1) & ~is_drawn)
     marks = {
         "circles: training rows": trained.any(),
         "squares: other measured rows": not trained.all(),
         "crosses: receivers": False in receivers,
         "open crosses: receivers at estimated places, with one standard deviation": True in receivers,
+        f"{outside} estimated outside of the map, not drawn": outside,
     }
     parts = [dataset.attrs["title"], ", ".join(words), ", ".join(mark for mark, drawn in marks.items() if drawn)]
     if not dataset.attrs["level_is_absolute"]:
@@ -251,12 +299,12 @@ def _measured(dataset: xarray.Dataset, run: Run, number: int) -> _Measured:
     return _Measured(record.tx_pos_m[rows], level[rows], trained[rows])
 
 
-def _draw_points(axes: Any, dataset: xarray.Dataset, panel: _Panel, estimated: Mapping[str, Any]) -> None:
+def _draw_points(
+    axes: Any, dataset: xarray.Dataset, panel: _Panel, estimated: Mapping[str, Any], is_drawn: NDArray[np.bool_]
+) -> None:
     """Measured levels of a receiver, and the receivers as crosses, open with an ellipse where estimated."""
-    dims = 3 if "point" in dataset.sizes else 2
-    at = np.stack([dataset[f"receiver_{axis}"].values for axis in "xyz"], axis=-1)
-    chosen = range(len(at)) if panel.number is None else [panel.number]
-    for k in chosen:
+    dims, at = 3 if "point" in dataset.sizes else 2, _receivers(dataset)
+    for k in np.flatnonzero(is_drawn) if panel.number is None else [panel.number] * bool(is_drawn[panel.number]):
         place = estimated.get(str(dataset["receiver"].values[k]))
         mark = {"marker": "x", "color": RED, "s": 22} if place is None else ESTIMATED | {"edgecolors": RED}
         axes.scatter(*at[k, :dims, None], **mark, linewidths=1.4, zorder=5)

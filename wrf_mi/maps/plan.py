@@ -22,6 +22,7 @@ of experiments for accurate approximation of a target region" (2010) (weights ab
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import compress
@@ -45,8 +46,10 @@ from ..scene.correction_data import read_correction_data
 from ..tasks import task_of
 from ..training.session import OnProgress, quiet
 from .coverage import coverage_probability
-from .grid import area_of, candidates_of, with_standing_room
+from .grid import area_of, candidates_of, reachable, with_standing_room
 from .plan_losses import Losses, Told, Worth, greedy_losses, losses_of, take_best
+
+logger = logging.getLogger(__name__)
 
 Criterion = Literal["error", "coverage", "material"]
 Lowered = tuple[list[int], FloatArray, FloatArray, Mapping[str, tuple[float, float]]]
@@ -109,7 +112,8 @@ def plan(
     Args:
         run: run of any model, or its folder, with one fitted model.
         count: number of positions.
-        candidates_m: positions that can be measured [n, 3], metres; None: the map's, half a metre from walls.
+        candidates_m: positions that can be measured [n, 3], metres; None: the map's, half a metre from walls, that are
+            reached from training rows without passing a wall.
         area_m: lower and upper corner [2] of the area whose errors count, metres; None: the scene, or all rows of the
             data.
         criterion: ``"error"``: the expected error over the map; ``"coverage"``: that about a threshold of received
@@ -131,7 +135,7 @@ def plan(
     known = opened.receivers
     numbers = range(len(known)) if receivers is None else [receiver_index(known, name) for name in receivers]
     map_m = candidates_of(opened, step_m, height_m, _area(opened, area_m)).positions_m
-    free_m = with_standing_room(opened.problem.opened_scene, map_m) if candidates_m is None else map_m
+    free_m = _walkable(opened, map_m) if candidates_m is None else map_m
     targets_m, choices_m = _thinned(map_m, MOST_TARGETS), _candidates(candidates_m, free_m)
     _check(count, len(choices_m), criterion, threshold_dbm, walk_m)
     positions_m = np.concatenate([targets_m, choices_m])
@@ -364,6 +368,20 @@ def _area(run: Run, area_m: tuple[FloatArray, FloatArray] | None) -> tuple[Float
     if not (low < high).all():
         raise InputError(f"area {low.tolist()} to {high.tolist()}: give lower and then upper x, y in metres")
     return low, high
+
+
+def _walkable(run: Run, map_m: FloatArray) -> FloatArray:
+    """Positions of the map with room to stand, reached from the training rows; how many are not is logged."""
+    scene, record = run.problem.opened_scene, run.problem.record
+    room_m = with_standing_room(scene, map_m)
+    reached = reachable(scene, room_m, record.tx_pos_m[load_rows(run.folder, record).all_train])
+    if not reached.any():
+        remedy = "check the frame of the scene, or give candidates"
+        raise InputError(f"{run.folder}: walls are between all training rows and every position of the map; {remedy}")
+    if unreached := np.count_nonzero(~reached):
+        text = "%d of %d positions are behind walls as seen from all training rows, and are not proposed; "
+        logger.warning(text + "give candidates if one can walk there", unreached, len(room_m))
+    return room_m[reached]
 
 
 def _candidates(candidates_m: FloatArray | None, map_m: FloatArray) -> FloatArray:

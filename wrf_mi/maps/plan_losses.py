@@ -143,7 +143,7 @@ def _powers(logarithm: FloatArray, frequency_hz: float) -> FloatArray:
     import mitsuba as mi
 
     from ..backend.device import columns_on_device
-    from ..tracing.paths.field_calculator import slab
+    from ..tracing.slabs import slab
 
     if not len(logarithm):
         return np.zeros((2, 0))

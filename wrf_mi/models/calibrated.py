@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,6 +52,9 @@ class FittedWithIntervals(Fitted):
     def _stated(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
         distance_m = self._distance(tx_pos_m, receiver)
         stated = self._intervals(prediction.mean, expected_size(task_of(self._record), prediction), distance_m)
+        if prediction.std_mean is not None:  # deviations of the mean are as wrong as those of readings
+            factor = stated.stated_std / prediction.stated_std
+            stated = replace(stated, std_mean=prediction.std_mean * factor)
         return stated if self._reception is None else self._reception(stated, tx_pos_m, receiver)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
@@ -69,14 +71,25 @@ class FittedWithIntervals(Fitted):
         decomposed = self.fitted.decompose(inputs, receiver, std)
         return replace(decomposed, prediction=self._stated(decomposed.prediction, inputs.tx_pos_m, receiver))
 
+    def _about(self, fitted: Fitted, rows: IntArray) -> FittedWithIntervals:
+        return FittedWithIntervals(fitted, self._record, rows, self._intervals, self._reception)
+
+    def tracing_once(self) -> FittedWithIntervals:
+        """The model that traces once, with the intervals."""
+        return self._about(self.fitted.tracing_once(), self._rows)
+
+    def refit(self, record: Record, rows: IntArray) -> FittedWithIntervals | None:
+        """The model given some rows, see `Fitted`, with the intervals at the distances to these."""
+        refit = self.fitted.refit(record, rows)
+        return None if refit is None else self._about(refit, rows)
+
     def error_prior(self, receiver: int) -> ErrorPrior | None:
         """As of the model: intervals change the size of errors, not where they are large."""
         return self.fitted.error_prior(receiver)
 
     def in_scene(self, scene: str) -> FittedWithIntervals:
         """The model in an edited scene, with the intervals of the scene that it was fitted in."""
-        other = self.fitted.in_scene(scene)
-        return FittedWithIntervals(other, self._record, self._rows, self._intervals, self._reception)
+        return self._about(self.fitted.in_scene(scene), self._rows)
 
     @property
     def depends_on_heading(self) -> bool:
@@ -108,7 +121,7 @@ class WithIntervals(Model):
         held_out = HeldOut.of(record, fold, problem.seed)
         place = replace(session, folder=session.folder / "held_out")
         predicted = held_out_predictions(self.model, problem, fold, held_out, place, self.name)
-        shutil.rmtree(place.folder)
+        session.discarded.append(place.folder)
         size = expected_size(task_of(record), predicted)
         intervals = fit_intervals(predicted.mean, held_out.observed(record), size, held_out.distance_m, held_out.row)
         reception, every, rows = None, predicted.every, problem.rows(split)
@@ -126,11 +139,19 @@ class WithIntervals(Model):
         reception = Reception.from_arrays(under(INTERVALS, arrays), problem.record)
         return FittedWithIntervals(fitted, problem.record, arrays[ROWS], intervals, reception)
 
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """As the model."""
+        return self.model.uses_places(problem, splits)
+
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse rows that are too few to hold some out, and what the model refuses."""
         for split in splits:
             _fold(self.model, problem, split)
         self.model.check(problem, splits)
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """As of the model."""
+        return self.model.unused_settings(problem, splits)
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> Any:
         """Settings of the model without open choices."""

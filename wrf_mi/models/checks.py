@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,9 +11,11 @@ import numpy as np
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.carriers import carriers_text
+from ..core.files import listed
+from ..core.settings import flat
 from ..datasets.observations import count_not_finite, place_of
 from ..tasks import task_of
-from .model import Inputs
+from .model import Inputs, Problem
 
 if TYPE_CHECKING:
     from .model import Model
@@ -39,12 +42,26 @@ def _names(models: Sequence[Model], form: str) -> str:
     return form.format(", ".join(model.name for model in models)) if models else ""
 
 
+def check_stated(method: Model, problem: Problem, splits: Sequence[Split]) -> None:
+    """Refuse settings that are stated and have no effect on a fit; raises InputError."""
+    unused, values = method.unused_settings(problem, splits), dict(flat(asdict(problem.settings)))
+
+    def reason(name: str) -> str | None:
+        parts = name.split(".")
+        return next((unused[key] for n in range(len(parts)) if (key := ".".join(parts[: n + 1])) in unused), None)
+
+    place = f"{method.name} of {place_of(problem.record)}"
+    for name in values:
+        if name in problem.stated_settings and (why := reason(name)):
+            raise InputError(f"setting {name}={values[name]}: no effect on {place}: {why}; omit it")
+
+
 def check_held_receivers(record: Record, split: Split, method: Model, others: Iterable[Model]) -> None:
     """Refuse a split that holds out receivers, for a model or data that do not serve it; raises InputError."""
     if not split.held_receivers:
         return
     if not {*split.held_receivers} < {*range(len(record.receivers))}:
-        numbers = ", ".join(map(str, split.held_receivers))
+        numbers = listed(map(str, split.held_receivers))
         text = f"split {split.name} holds out receivers {numbers} of {len(record.receivers)}"
         raise InputError(f"{place_of(record)}: {text}; leave some to train on")
     if not task_of(record).in_decibel:

@@ -10,7 +10,7 @@ Source: Robinson, "That BLUP is a good thing: the estimation of random effects" 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -134,7 +134,7 @@ class FittedWithFew(Fitted):
     """A fitted model of the receivers of some numbers, and a law for the others."""
 
     def __init__(self, fitted: Fitted, numbers: IntArray, law: SharedLaw) -> None:
-        self.fitted, self.law = fitted, law
+        self.fitted, self.law, self._numbers = fitted, law, numbers
         self._place = {int(number): place for place, number in enumerate(numbers)}
         self.train_seconds, self.uses_heading = fitted.train_seconds, fitted.uses_heading
         self.carriers_hz = fitted.carriers_hz
@@ -164,6 +164,17 @@ class FittedWithFew(Fitted):
         if receiver in self._place:
             return self.fitted.decompose(inputs, self._place[receiver], std)
         return super().decompose(inputs, receiver, std)
+
+    def tracing_once(self) -> FittedWithFew:
+        """The model that traces once, and the law."""
+        return FittedWithFew(self.fitted.tracing_once(), self._numbers, self.law)
+
+    def refit(self, record: Record, rows: IntArray) -> FittedWithFew | None:
+        """The model given some rows, see `Fitted`, and the law fitted to these."""
+        refit = self.fitted.refit(record.at_receivers(self._numbers), rows)
+        if refit is None:
+            return None
+        return FittedWithFew(refit, self._numbers, SharedLaw.fit(record, rows, self.law.number))
 
     def error_prior(self, receiver: int) -> ErrorPrior | None:
         """That of the model; none of receivers with few rows."""
@@ -224,10 +235,20 @@ class WithFewRows(Model):
         of_model = {key: values for key, values in arrays.items() if not key.startswith(FEW)}
         return FittedWithFew(self.model.load(of_model, self._part(problem, numbers), folder), numbers, law)
 
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Whether the model does, or receivers have few rows, of which the law of distance needs the places of all."""
+        return self.model.uses_places(problem, splits) or bool(len(few_rows(problem.record, splits)))
+
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse what the model refuses of the receivers with enough rows."""
         numbers, _ = self._numbers(problem, splits)
         self.model.check(self._part(problem, numbers), [split.at_receivers(numbers) for split in splits])
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """As of the model with the receivers with enough rows."""
+        numbers, _ = self._numbers(problem, splits)
+        parts = [split.at_receivers(numbers) for split in splits]
+        return self.model.unused_settings(self._part(problem, numbers), parts)
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> Any:
         """Settings of the model without open choices."""

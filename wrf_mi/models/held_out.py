@@ -51,7 +51,7 @@ def fit_fold(entry: Model, problem: Problem, fold: Split, session: Session) -> t
     if left_out:
         problem = replace(problem, dataset=problem.record.at_receivers(numbers), antennas=AS_STATED)
         fold = fold.at_receivers(numbers)
-    problem = placed_problem(problem.seen(fold), fold.all_train)
+    problem = placed_problem(problem.seen(fold), fold, entry, session.report)
     return fit_model(entry, problem, fold, session)[0], numbers
 
 

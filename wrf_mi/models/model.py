@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..core import AntennaOptions, InputError, Prediction, Receiver, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
-from ..core.settings import settings_from, with_settings
+from ..core.settings import changed, settings_from, with_settings
 from ..core.types import Inputs as Inputs
 from ..core.types import IntArray
 from ..parallel import Scheduler
@@ -48,6 +48,8 @@ class Problem:
     antennas: AntennaOptions = AS_STATED  #: patterns and polarisations in place of those of the data
     operator: bool = True  #: learned fields predict by operator where they can, see `wrf_mi.training.predictor`
     left_out: tuple[str, ...] = ()  #: names of receivers that are left out of the data, as if they had not been there
+    #: dotted names of the settings that the user stated; None: those that differ from the defaults of their class
+    stated: frozenset[str] | None = None
     #: what `Model.check` computed that the fit after it takes
     checked: list[Any] = field(default_factory=list, repr=False, compare=False)
 
@@ -65,6 +67,11 @@ class Problem:
             names = [receiver.name for receiver in record.receivers]
             record = record.at_receivers([k for k, name in enumerate(names) if name not in self.left_out])
         return record.with_antennas(self.antennas)
+
+    @property
+    def stated_settings(self) -> frozenset[str]:
+        """Dotted names of the settings that hold as they are: no search or likelihood may change them."""
+        return changed(self.settings) if self.stated is None else self.stated
 
     @cached_property
     def opened_scene(self) -> Any | None:
@@ -171,6 +178,20 @@ class Fitted(ABC):
         """
         raise InputError("its predictions use no scene, and do not change with one; trace the edited scene")
 
+    def tracing_once(self) -> Fitted:
+        """The model as a copy that traces each position once, for all receivers, and keeps it as long as the copy.
+
+        For predictions of all receivers in turn, and for refits, which share what the copy traces.
+        """
+        return self
+
+    def refit(self, record: Record, rows: IntArray) -> Fitted | None:
+        """The model given some of its training rows, with scene, hyperparameters and weights as fitted to all of them.
+
+        None: its parameters are the fit, which has to be made anew.
+        """
+        return None
+
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions by the stages up to each but the last, for a fit in stages (entry ``stages`` of `facts`)."""
         return {}
@@ -254,6 +275,14 @@ class Model(ABC):
             InputError: settings, data or scene that it cannot be fitted to.
         """
 
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings that change nothing in a fit to these data with the problem's other settings, and why.
+
+        `wrf_mi.train` refuses them where they are stated (`check_stated`). A name stands for all settings below it:
+        ``traced`` for ``traced.depth``, too.
+        """
+        return {}
+
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> Any:
         """Settings without open choices; called before the first fit, and again when an interrupted fit is resumed."""
         return problem.settings
@@ -269,6 +298,10 @@ class Model(ABC):
     def pools_receivers(self, problem: Problem) -> bool:
         """Whether it predicts signal strengths of receivers with few training rows, or none, from the others."""
         return False
+
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Whether its fits use positions of receivers; else those that nobody surveyed are not estimated."""
+        return True
 
     def serves(self, task: str) -> bool:
         """Whether it serves a task."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -50,6 +50,7 @@ logger = logging.getLogger(__name__)
 
 NAME = "ray-tracing"
 PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"
+LOST = "paths_without_gain"  # key of the number of paths that are left out
 WITHOUT_PATH = 0.05  # share of measured values without a path from which on walls that nothing passes are suspected
 TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
 """Fewest positions of a scheduler's part: candidates of fewer are not made faster. Where rays start at the receivers
@@ -143,8 +144,9 @@ class FittedTracing(Fitted):
         return self._arrays
 
     def facts(self) -> dict[str, Any]:
-        """Duration of tracing, numbers of paths and rays."""
-        return {name: self._arrays[name].item() for name in ("trace_seconds", "paths", "rays")}
+        """Duration of tracing, numbers of paths, of those left out without a gain if there are any, and of rays."""
+        names = ("trace_seconds", "paths", LOST, "rays")
+        return {name: self._arrays[name].item() for name in names if name in self._arrays}
 
 
 def _instrument(record: Record) -> Instrument:
@@ -254,32 +256,6 @@ def _trace_of_fit(tracer: RayTracer, problem: Problem, session: Session) -> Trac
     return traced
 
 
-def _idle_by_target(settings: TracingSettings) -> dict[str, str]:
-    """Changed settings that a target error replaces, or that need one, with the reason."""
-    reasons = dict.fromkeys(("depth", "rays"), "target_error_db chooses it")
-    if settings.target_error_db is None:
-        reasons = {"target_kinds": "target_error_db is not set"}
-    default = TracingSettings()
-    return {name: why for name, why in reasons.items() if getattr(settings, name) != getattr(default, name)}
-
-
-def _check_effects(problem: Problem, splits: Sequence[Split]) -> None:
-    """Refuse a phase error that has no effect, and warn of other settings that have none."""
-    settings, record = problem.settings, problem.record
-    idle = without_effect(settings.options)
-    if settings.phase_error and not task_of(record).image:
-        idle["phase_error"] = f"spectra alone are expectations, and {record.name} holds {record.task}"
-    if "phase_error" in idle:
-        raise InputError(f"phase_error {settings.phase_error:g}: without effect, as {idle['phase_error']}; omit it")
-    # The seed is also that of the split, which draws rows unless all official ones are used.
-    if record.official is None or any(set(split.all_train) != set(record.official[0]) for split in splits):
-        idle.pop("seed", None)
-    if settings.target_error_db is not None:
-        idle.pop("scattering_coefficient", None)
-    for name, reason in (idle | _idle_by_target(settings)).items():
-        logger.warning("%s=%s has no effect: %s", name, getattr(settings, name), reason)
-
-
 class RayTracing(Model):
     """Paths of a scene, optionally calibrated on the training rows."""
 
@@ -307,6 +283,7 @@ class RayTracing(Model):
         traced = _trace_of_fit(tracer, problem, session)
         seconds = time.perf_counter() - start
         facts = {"rays": traced.rays, "paths": len(traced.paths), "trace_seconds": seconds}
+        facts |= {LOST: traced.lost} if traced.lost else {}
         arrays = {name: np.asarray(value) for name, value in facts.items()}
         if task_of(record).in_decibel:
             known = split.all_train
@@ -329,7 +306,6 @@ class RayTracing(Model):
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse a scene that cannot be opened at every carrier, and settings that cannot be calibrated or chosen."""
         settings, carriers = problem.settings, problem.record.carriers_hz
-        _check_effects(problem, splits)
         if carriers is not None:
             if settings.target_error_db is not None:
                 text = "target_error_db serves one carrier; omit it"
@@ -344,6 +320,26 @@ class RayTracing(Model):
             if _changes_scene(problem):
                 check_materials(problem.opened_scene)
         assert problem.opened_scene is not None
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of paths that are not traced, of convergence without a target, and of a trace beside calibration."""
+        s, record = problem.settings, problem.record
+        unused = without_effect(s.options)
+        if not task_of(record).image:
+            unused["phase_error"] = f"spectra alone are expectations, and {record.name} holds {record.task}"
+        # The seed is also that of the split, which draws rows unless all official ones are used.
+        if record.official is None or any(set(split.all_train) != set(record.official[0]) for split in splits):
+            unused.pop("seed", None)
+        if s.target_error_db is None:
+            unused["target_kinds"] = "target_error_db is not set"
+        else:
+            unused.pop("scattering_coefficient", None)
+            unused |= dict.fromkeys(("depth", "rays"), "target_error_db chooses it")
+        if s.calibration is not None:
+            unused["phase_error"] = "it belongs to a trace, and calibration trains paths"
+            if s.rays == "auto":
+                unused["rays"] = "calibration has a fixed number of rays; give it"
+        return unused
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> TracingSettings:
         """Settings, with those that are chosen by convergence; ``convergence.json`` lists all tried settings."""

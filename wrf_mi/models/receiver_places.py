@@ -1,36 +1,50 @@
 """Places of receivers that nobody mapped, estimated from the signal strengths that they received.
 
-The law of distance P = T - 10 gamma log10 |x - p| is fitted to the training rows of each such receiver, rows at one
-place averaged and shadowing correlated between places: its place p, power at one metre T and exponent gamma together,
-by nonlinear least squares from several starts. A priori the exponent is that of indoor and urban measurements, the
-place somewhere about the rows, and its height, which rows at one height hardly tell, `MOUNTED_M` above them. The
-covariance is that of the linearised problem.
+The law of distance P = T - 10 gamma log10 |x - p| + e, with T the power at one metre, gamma the exponent and p the
+place, is that of the training rows of each such receiver. The error e is shadowing by walls, with an exponential
+covariance in the distance between rows, and noise of each row. T, gamma and the variance of e are integrated out in
+closed form; the covariance's length and share are summed over. What remains is the posterior density of p, on cells
+that are halved where probability is. It may have several modes, as beside a corridor, or be a ring. The estimate is the
+highest mode, since models predict by the law of distance, which fits the rows there and not between modes. The standard
+deviation of a coordinate is a 1.645th of the distance from the estimate within which 90 % of the probability lies, as
+of a normal density: it contains a second mode.
 
-Source: Rappaport, "Wireless Communications" (2002), section 4.9 (law and exponents); Nocedal and Wright, "Numerical
-Optimization" (2006), chapter 10.
+A priori the place is normal about the rows, and its height, which rows at one height hardly tell, `MOUNTED_M` above
+them, between floor and ceiling of a scene that encloses the rows.
+
+Source: Rappaport, "Wireless Communications" (2002), section 4.9 (law and exponents); Gudmundson, "Correlation model for
+shadow fading in mobile radio systems" (1991), Electronics Letters 27(23) (covariance); Rasmussen and Williams,
+"Gaussian Processes for Machine Learning" (2006), section 2.7 (marginal likelihood with a mean of basis functions).
 """
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.optimize import least_squares
+from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
+from scipy.special import ndtr, ndtri
+from threadpoolctl import threadpool_limits
 
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
-from ..core.files import readable, write_atomically
+from ..core.files import listed, readable, write_atomically
 from ..core.types import IntArray
 from ..tasks import task_of
-from .model import Problem
+from ..tasks.scores import REAL_90
+from ..training.session import OnProgress, quiet
+from .model import Model, Problem
+
+if TYPE_CHECKING:
+    from ..tracing.search.surfaces import Surfaces
 
 logger = logging.getLogger(__name__)
 
@@ -38,20 +52,27 @@ PLACES = "receiver_places.json"  # file of a run with estimated positions
 
 EXPONENT = (3.0, 0.7)  # mean and standard deviation of the exponent a priori
 MOUNTED_M = (1.0, 1.0)  # mean height above the transmitters a priori, as of receivers on walls and ceilings, and its sd
+AROUND, LEAST_AROUND_M = 0.5, 5.0  # sd of the place a priori, a share of the rows' extent but no less than some rooms
 LEAST_M = 0.3  # least distance in the law: a receiver is not in the hand that holds the transmitter
-NOISE_DB = 6.0  # standard deviation of the rows about the law, until their residuals tell
-SHADOW_M, SHADOW_SHARE = 2.0, 0.05  # correlation length of shadowing, and its least share of the rows' extent
-CORRELATED = 0.7  # share of the rows' deviation from the law that shadowing has
-MOST_PLACES = 400  # places in the fit at most, evenly spaced
-STARTS = 4  # places at the strongest rows, from which the search starts beside the middle of all
-STATED_M = 0.01  # standard deviation of a coordinate that is stated
-MARGIN_M = 0.1  # distance from the scene's box to which estimated coordinates beyond it are moved
+NOISE_DB, NOISE_ROWS = 6.0, 4.0  # standard deviation of rows about the law a priori, which weighs as so many rows do
+SHADOW, LEAST_SHADOW_M = (0.05, 0.15), 1.0  # correlation lengths of shadowing as shares of the rows' extent
+CORRELATED = (0.3, 0.6, 0.85)  # shares of the variance that shadowing has
+MOST_PLACES, GROWTH = 100, 1.2  # places in the fit at most, for which rows are averaged in cubes that grow by a factor
+CELLS = (24, 24, 2)  # cells along x, y and z, of equal prior probability, with which the search begins
+HALVED, MOST_HALVINGS = 48, 24  # cells that are halved together, those of most probability, and how often at most
+FINE, REST = 0.5, 0.05  # cells in standard deviations of the place, and the probability in coarser ones that is left
+COVERED = 0.9  # share of the probability within `REAL_90` standard deviations of the estimate
+ZOOMS = 8  # halvings of a cell around the mode
+MARGIN_M = 0.1  # least distance from floor and ceiling of a scene
 AWAY_M = np.arange(0.05, 2.0, 0.05)  # distances at which a place outside of solids is searched for
-LOUD_DB = 100.0  # standard deviation of the power at one metre, about the strongest row: any unit of decibels
 
 
 def place_of_receiver(
-    tx_pos_m: FloatArray, power_dbm: FloatArray, extent_m: float, stated_m: FloatArray
+    tx_pos_m: FloatArray,
+    power_dbm: FloatArray,
+    extent_m: float,
+    stated_m: FloatArray,
+    height_m: tuple[float, float] = (-np.inf, np.inf),
 ) -> tuple[FloatArray, FloatArray]:
     """Position [3] of a receiver and its standard deviations [3], metres.
 
@@ -60,65 +81,151 @@ def place_of_receiver(
         power_dbm: their signal strengths [n].
         extent_m: size of the area of all rows, metres, by which the place is uncertain a priori.
         stated_m: coordinates [3] that are known, such as a height; NaN for the others.
+        height_m: heights that it is between, metres.
     """
-    places, number = np.unique(tx_pos_m, axis=0, return_inverse=True)
-    power = np.bincount(number.ravel(), power_dbm) / np.bincount(number.ravel())  # rows at one place share its shadow
-    if len(places) > MOST_PLACES:
-        spread = np.linspace(0, len(places) - 1, MOST_PLACES).round().astype(np.int64)
-        places, power = places[spread], power[spread]
-    # Neighbouring places share shadows: as if independent, they would promise decimetres.
-    length_m = max(SHADOW_M, extent_m * SHADOW_SHARE)
-    shared = CORRELATED * np.exp(-cdist(places, places) / length_m) + (1 - CORRELATED) * np.eye(len(places))
-    lower = np.linalg.cholesky(shared)
-    middle = places.mean(axis=0)
-    middle[2] += MOUNTED_M[0]
-    mean = np.array([*middle, np.max(power), EXPONENT[0]])
-    deviation = np.array([extent_m, extent_m, MOUNTED_M[1], LOUD_DB, EXPONENT[1]])
-    known = np.flatnonzero(np.isfinite(stated_m))
-    middle[known] = mean[known] = stated_m[known]
-    deviation[known] = STATED_M
+    places, power, count = _averaged(tx_pos_m, power_dbm)
+    likelihood = _Likelihood(places, power, count, extent_m)
+    around_m, known = max(AROUND * extent_m, LEAST_AROUND_M), np.isfinite(stated_m)
+    middle = np.where(known, stated_m, places.mean(axis=0) + np.array([0, 0, MOUNTED_M[0]]))
+    deviation = np.array([around_m, around_m, np.hypot(MOUNTED_M[1], places[:, 2].std())]) * ~known
+    bounds = np.array([[0.0, 1.0]] * 3)
+    if not known[2]:
+        bounds[2] = ndtr((np.array(height_m) - middle[2]) / deviation[2])
 
-    def distance(parameters: FloatArray) -> FloatArray:
-        return np.asarray(np.sqrt(np.square(places - parameters[:3]).sum(axis=1) + LEAST_M**2))
+    def positions(quantile: FloatArray) -> FloatArray:
+        return np.asarray(middle + deviation * ndtri(quantile))
 
-    def residual(parameters: FloatArray, noise_db: float) -> FloatArray:
-        law = parameters[3] - 10 * parameters[4] * np.log10(distance(parameters)) - power
-        whitened = solve_triangular(lower, law, lower=True)
-        return np.concatenate([whitened / noise_db, (parameters - mean) / deviation])
+    low, width, density = _cells(lambda quantile: likelihood(positions(quantile)), positions, bounds, known)
+    at_m, mass = positions(low + width / 2), density + np.log(width).sum(axis=1)
+    share = np.exp(mass - np.logaddexp.reduce(mass))
 
-    def derivative(parameters: FloatArray, noise_db: float) -> FloatArray:
-        away = distance(parameters)[:, None]
-        slope = -10 * parameters[4] / np.log(10) * (parameters[:3] - places) / away**2
-        law = np.column_stack([slope, np.ones(len(places)), -10 * np.log10(away)])
-        return np.concatenate([solve_triangular(lower, law, lower=True) / noise_db, np.diag(1 / deviation)])
+    def posterior(at_m: FloatArray, likelihood: FloatArray) -> FloatArray:
+        # Over metres, while cells are of quantiles: with the density of the prior.
+        return np.asarray(likelihood - np.square((at_m - middle) / np.where(known, 1.0, deviation)).sum(axis=1) / 2)
 
-    strongest = np.argsort(-power, kind="stable")[:STARTS]
-    # Beside the row, not at it, where the law has no slope.
-    starts = [middle, *np.where(np.isfinite(stated_m), stated_m, places[strongest] + [0.1, 0.1, MOUNTED_M[0]])]
-    noise_db, fits = NOISE_DB, []
-    for place in starts:
-        level = float(np.mean(power + 10 * EXPONENT[0] * np.log10(distance(place))))
-        fits.append(least_squares(residual, np.array([*place, level, EXPONENT[0]]), derivative, args=(noise_db,)))
-    best = min(fits, key=lambda fit: float(fit.cost))
-    if len(places) > len(mean):
-        # Once the law fits, its residuals state their deviation: few of them, no less than a third of the usual one.
-        errors = residual(best.x, 1.0)[: len(places)]
-        noise_db = max(float(np.sqrt(np.square(errors).sum() / (len(places) - len(mean)))), NOISE_DB / 3)
-        best = least_squares(residual, best.x, derivative, args=(noise_db,))
-    jacobian = derivative(best.x, noise_db)
-    std_m = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))[:3])
-    std_m[known] = 0.0
-    return np.where(np.isfinite(stated_m), stated_m, best.x[:3]), std_m
+    best = int(np.argmax(posterior(at_m, density)))
+    mode_m, step_m = at_m[best], _sides(positions, low[best], width[best]) / 2
+    offsets = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    for _ in range(ZOOMS):
+        tried_m = mode_m + offsets * step_m
+        if not known[2]:
+            tried_m[:, 2] = np.clip(tried_m[:, 2], *height_m)
+        mode_m, step_m = tried_m[np.argmax(posterior(tried_m, likelihood(tried_m)))], step_m / 2
+
+    away_m = np.abs(at_m - mode_m)
+    order = np.argsort(away_m, axis=0)
+    last = np.argmax(np.cumsum(share[order], axis=0) > COVERED, axis=0)
+    return mode_m, away_m[order[last, np.arange(3)], np.arange(3)] / REAL_90
 
 
-def placed(record: Record, rows: IntArray) -> Record:
+Positions = Callable[[FloatArray], FloatArray]
+"""Positions [n, 3], metres, at quantiles of the prior [n, 3]: space as a cube, equally probable everywhere."""
+
+
+def _cells(
+    likelihood: Positions, positions: Positions, bounds: FloatArray, known: NDArray[np.bool_]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Cells of the cube ``bounds`` [3, 2], fine where the posterior is: least corners, widths [n, 3] and densities [n].
+
+    ``likelihood`` is the logarithm at quantiles [n, 3]; coordinates that are ``known`` [3] are not divided.
+    """
+    number = np.where(known, 1, CELLS)
+    width = np.tile(np.ptp(bounds, axis=1) / number, (int(np.prod(number)), 1))
+    low = bounds[:, 0] + width * np.stack(np.unravel_index(np.arange(len(width)), number), axis=1)
+    density = likelihood(low + width / 2)
+    for _ in range(MOST_HALVINGS):
+        at_m, mass = positions(low + width / 2), density + np.log(width).sum(axis=1)
+        share = np.exp(mass - np.logaddexp.reduce(mass))
+        std_m = np.sqrt(share @ np.square(at_m - share @ at_m))
+        most = np.argsort(-mass, kind="stable")[:HALVED]
+        relative = _sides(positions, low[most], width[most]) / np.maximum(std_m, np.finfo(float).tiny)
+        if share[most][relative.max(axis=1) > FINE].sum() < REST:
+            break
+        half = width[most] / (1 + (np.arange(3) == relative.argmax(axis=1)[:, None]))
+        halves, others = (
+            np.concatenate([low[most], low[most] + width[most] - half]),
+            np.delete(np.arange(len(low)), most),
+        )
+        half = np.tile(half, (2, 1))
+        density = np.concatenate([density[others], likelihood(halves + half / 2)])
+        low, width = np.concatenate([low[others], halves]), np.concatenate([width[others], half])
+    return low, width, density
+
+
+def _sides(positions: Positions, low: FloatArray, width: FloatArray) -> FloatArray:
+    """Lengths of cells, metres: twice those between their quarters, as cells at the border of the cube have no end."""
+    return 2 * (positions(low + 0.75 * width) - positions(low + 0.25 * width))
+
+
+def _averaged(tx_pos_m: FloatArray, power_dbm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Positions [k, 3], metres, mean powers [k], and the number of distinct places in each mean [k].
+
+    Rows at one place share its shadow: together they are one. Places are averaged in cubes, the smallest with which at
+    most `MOST_PLACES` remain.
+    """
+
+    def means(group: IntArray, *values: FloatArray) -> list[FloatArray]:
+        count = np.bincount(group)
+        return [np.stack([np.bincount(group, part) / count for part in value.T], axis=-1) for value in values]
+
+    places, group = np.unique(tx_pos_m, axis=0, return_inverse=True)
+    (power,) = means(group.ravel(), power_dbm[:, None])
+    count, side_m, first = np.ones(len(places)), 0.0, places
+    extent_m = float(np.ptp(places, axis=0).max())
+    while len(first) > MOST_PLACES:
+        side_m = side_m * GROWTH if side_m else extent_m / MOST_PLACES
+        first, group = np.unique(np.floor((places - places.min(axis=0)) / side_m), axis=0, return_inverse=True)
+    if side_m:
+        count = np.bincount(group.ravel()).astype(float)
+        places, power = means(group.ravel(), places, power)
+    return places, power[:, 0], count
+
+
+class _Likelihood:
+    """Logarithm of the marginal likelihood of powers at places, as a function of the receiver's position."""
+
+    def __init__(self, places_m: FloatArray, power: FloatArray, count: FloatArray, extent_m: float) -> None:
+        self._places_m, apart_m, ones = places_m, cdist(places_m, places_m), np.ones(len(places_m))
+        lengths_m = {max(share * extent_m, LEAST_SHADOW_M) for share in SHADOW}
+        weights, constants = [], []
+        for length_m, shadow in product(sorted(lengths_m), CORRELATED):
+            covariance = shadow * np.exp(-apart_m / length_m) + (1 - shadow) * np.diag(1 / count)
+            inverse = np.linalg.inv(covariance)
+            total, of_ones = float(ones @ inverse @ ones), inverse @ ones
+            # Without knowledge of the power at one metre, a common level of the rows says nothing.
+            weights.append(inverse - np.outer(of_ones, of_ones) / total)
+            constants.append(-(np.linalg.slogdet(covariance)[1] + np.log(total)) / 2)
+        self._weights, self._constants = np.stack(weights), np.array(constants)[:, None]
+        self._of_power = self._weights @ power  # [covariances, n]
+        self._power = (self._of_power @ power)[:, None]
+        self._exponent = -(NOISE_ROWS + len(power) - 1) / 2
+
+    def __call__(self, at_m: FloatArray) -> FloatArray:
+        """At positions [m, 3], metres: [m]."""
+        law = -5 * np.log10(cdist(at_m, self._places_m, "sqeuclidean") + LEAST_M**2)  # of exponent 1
+        square = np.einsum("cmn,mn->cm", law @ self._weights, law)
+        product = self._of_power @ law.T
+        mean, trust = EXPONENT[0], (NOISE_DB / EXPONENT[1]) ** 2
+        # y - mean law = (exponent - mean) law + e: the exponent is integrated out, then the variance (Student's t).
+        explained = (product - mean * square) ** 2 / (square + trust)
+        residual = self._power - 2 * mean * product + mean**2 * square - explained
+        fits = self._exponent * np.log1p(np.maximum(residual, 0) / (NOISE_ROWS * NOISE_DB**2))
+        return np.asarray(np.logaddexp.reduce(fits - np.log1p(square / trust) / 2 + self._constants, axis=0))
+
+
+def _lacking(record: Record) -> list[int]:
+    """Numbers of the receivers of signal strengths whose places are to be estimated."""
+    return [k for k, each in enumerate(record.receivers) if not each.is_surveyed] if task_of(record).in_decibel else []
+
+
+def placed(
+    record: Record, rows: IntArray, height_m: tuple[float, float] = (-np.inf, np.inf), report: OnProgress = quiet
+) -> Record:
     """The record with estimated positions of receivers that have none, by some rows; NaN remains without any row."""
-    lacking = [number for number, receiver in enumerate(record.receivers) if not receiver.is_surveyed]
-    if not lacking or not task_of(record).in_decibel:
-        return record
+    lacking = _lacking(record)
     receivers, tx_pos_m = list(record.receivers), record.tx_pos_m[rows]
-    extent_m = max(float(np.linalg.norm(np.ptp(tx_pos_m[:, :2], axis=0))), 1.0) if len(rows) else 1.0
-    for number in lacking:
+    extent_m = float(np.linalg.norm(np.ptp(tx_pos_m[:, :2], axis=0))) if len(rows) else 0.0
+    for done, number in enumerate(lacking, start=1):
         observed = np.asarray(record.observation[number, rows], float)
         received = np.isfinite(observed)
         if received.any():
@@ -126,40 +233,57 @@ def placed(record: Record, rows: IntArray) -> Record:
             stated_m = np.asarray(receiver.position_m, float)
             if receiver.position_std_m is not None:  # estimated from more rows, from which nothing may remain
                 stated_m = np.where(receiver.position_std_m > 0, np.nan, stated_m)
-            place_m, std_m = place_of_receiver(tx_pos_m[received], observed[received], extent_m, stated_m)
+            of_rows = tx_pos_m[received], observed[received]
+            with threadpool_limits(1, "blas"):  # of matrices of a hundred rows threads would mostly wait for each other
+                place_m, std_m = place_of_receiver(*of_rows, extent_m, stated_m, height_m)
             receivers[number] = replace(receiver, position_m=place_m, position_std_m=std_m)
-    return replace(record, receivers=tuple(receivers))
+        report("places of receivers", done / len(lacking))
+    return replace(record, receivers=tuple(receivers)) if lacking else record
 
 
-def placed_problem(problem: Problem, rows: IntArray) -> Problem:
-    """The problem of `placed` receivers, in a scene where antennas can be; the problem itself where all are known."""
-    located = _with_record(problem, placed(problem.record, rows))
-    if located is problem or problem.scene is None:
-        return located
-    return _with_record(located, _in_scene(located.record, located.opened_scene))
+def placed_problem(problem: Problem, split: Split, model: Model, report: OnProgress = quiet) -> Problem:
+    """The problem of `placed` receivers by a split's training rows, in a scene outside of its solids.
 
-
-def _in_scene(record: Record, scene: Any) -> Record:
-    """The record with estimated positions inside the scene's box, by two deviations at most, and outside of solids."""
+    The problem itself where all are surveyed, and for a model that does not use their places.
+    """
+    if not _lacking(problem.record) or not model.uses_places(problem, [split]):
+        return problem
+    if problem.scene is None:
+        return _with_record(problem, placed(problem.record, split.all_train, report=report))
     from ..scene.mesh.surfaces import bounds  # imported where there is a scene
     from ..tracing.paths.solve import Prepared
-    from ..tracing.search.devices import solid_around
 
-    surfaces, receivers = Prepared(scene).surfaces, list(record.receivers)
-    box = bounds(surfaces.triangles)
-    low, high = box[0] + MARGIN_M, box[1] - MARGIN_M
+    # A record without positions is not opened in a scene: until they are estimated, receivers are amid the rows.
+    middle_m = np.nanmean(problem.record.tx_pos_m, axis=0)
+    amid = tuple(
+        receiver if receiver.is_surveyed else replace(receiver, position_m=middle_m)
+        for receiver in problem.record.receivers
+    )
+    opened = _with_record(problem, replace(problem.record, receivers=amid))
+    surfaces, height_m = Prepared(opened.opened_scene).surfaces, (-np.inf, np.inf)
+    low, high = bounds(surfaces.triangles)[:, 2] + np.array([MARGIN_M, -MARGIN_M])
+    tx_m = problem.record.tx_pos_m[:, 2]
     # A ceiling above all rows is above their receivers, too; the height of the ground bounds nothing.
-    encloses = (low <= np.nanmin(record.tx_pos_m, axis=0)) & (np.nanmax(record.tx_pos_m, axis=0) <= high)
+    if low <= np.nanmin(tx_m) and np.nanmax(tx_m) < high:
+        height_m = float(low), float(high)
+    located = placed(problem.record, split.all_train, height_m, report)
+    return _with_record(opened, _outside_solids(located, surfaces))
+
+
+def _outside_solids(record: Record, surfaces: Surfaces) -> Record:
+    """The record with estimated positions that are not inside solids, in the plan the nearest ones."""
+    from ..tracing.search.devices import solid_around  # imported where there is a scene
+
+    receivers = list(record.receivers)
     angle = np.arange(0, 2 * np.pi, np.pi / 8)
     around = AWAY_M[:, None, None] * np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=1)
     around = np.concatenate([np.zeros((1, 3)), around.reshape(-1, 3)])
     for number, receiver in enumerate(receivers):
-        if (std_m := receiver.position_std_m) is not None and np.isfinite(receiver.position_m).all():
-            inside_m = np.clip(receiver.position_m, low, high)
-            near = encloses & (np.abs(inside_m - receiver.position_m) <= 2 * std_m)
-            tried_m = np.where(near, inside_m, receiver.position_m) + around * (std_m > 0)
-            outside = int(np.argmax(solid_around(surfaces, tried_m) < 0))  # the first: the nearest
-            receivers[number] = replace(receiver, position_m=tried_m[outside])
+        if (std_m := receiver.position_std_m) is not None:
+            tried_m = receiver.position_m + around * (std_m > 0)
+            place_m = tried_m[np.argmax(solid_around(surfaces, tried_m) < 0)]  # the first: the nearest
+            std_m = np.hypot(std_m, place_m - receiver.position_m)
+            receivers[number] = replace(receiver, position_m=place_m, position_std_m=std_m)
     return replace(record, receivers=tuple(receivers))
 
 
@@ -214,7 +338,7 @@ def check_placeable(problem: Problem, splits: Sequence[Split]) -> None:
         received = np.isfinite(record.seen(split).observation[:, split.all_train])
         lacking = [k for k, receiver in enumerate(record.receivers) if not (receiver.is_surveyed or received[k].any())]
         if lacking:
-            names = ", ".join(record.receivers[number].name for number in lacking)
+            names = listed(record.receivers[number].name for number in lacking)
             text = f"position of receiver {names} unknown, without a training row in split {split.name}"
             raise InputError(f"{record.source or record.name}: {text}; give x, y, z, or omit --scene")
 

@@ -28,12 +28,14 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
+from ..backend.vectors import Complex  # chooses the backend before Dr.Jit is imported
+
+# isort: split
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..backend.vectors import Complex
 from ..core import Paths, Receiver
 from ..core.angles import FloatArray, pixel_directions
 from ..core.types import IntArray

@@ -7,7 +7,8 @@ import shutil
 import tempfile
 import time
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,12 +21,19 @@ from ..checking import warn_of_suspicions
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
-from ..core.settings import setting_texts
+from ..core.settings import setting_texts, stated_values
 from ..datasets import make_splits
-from ..datasets.observations import LEAST_ROWS, check_observations, fitted_receivers, place_of, warn_of_left_out
+from ..datasets.observations import (
+    LEAST_ROWS,
+    check_observations,
+    fitted_receivers,
+    place_of,
+    warn_of_left_out,
+    warn_of_one_place,
+)
 from ..datasets.splits import NONE, default_split, splits_below
 from ..models import MODELS, Model, Problem, Session, known_model
-from ..models.checks import check_held_receivers, check_record
+from ..models.checks import check_held_receivers, check_record, check_stated
 from ..models.model import default_settings
 from ..models.receiver_places import check_placeable, placed_problem, tell_places, write_places
 from ..parallel import Scheduler
@@ -43,8 +51,9 @@ from .folder import (
     RunRequest,
     Settings,
     check_new,
-    clear_begun,
+    has_progress,
     load_rows,
+    new_run_folder,
     run_parts,
     start_run,
     write_configs,
@@ -60,14 +69,15 @@ logger = logging.getLogger(__name__)
 
 
 def plan_run(
-    dataset: str | Path | Record, request: RunRequest, progress: bool = False
+    dataset: str | Path | Record, request: RunRequest, progress: bool = False, on_progress: OnProgress = quiet
 ) -> tuple[Problem, RunConfig, list[Split]]:
     """Problem, configuration and splits of a run; errors as those of `train`. Nothing is written."""
     scene = None if request.scene is None else str(request.scene)
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset), progress=progress)
     model = _serving_model(record, request)
     _check_scene(model, record, scene, request)
-    settings, seed, deterministic = _settings_of(model, request), request.seed, request.deterministic
+    settings, stated = _settings_of(model, request)
+    seed, deterministic = request.seed, request.deterministic
     if "seed" in model.train_arguments:
         seed, deterministic = settings.seed, settings.deterministic
     split = _split_of(record, request)
@@ -75,14 +85,16 @@ def plan_run(
     for rows in splits:
         check_held_receivers(record, rows, model, MODELS.values())
         check_observations(record, rows, model.complete, may_be_silent=TASKS[record.task].in_decibel)
-    problem = Problem(record, settings, seed, scene, request.material, request.antennas)
+    problem = Problem(record, settings, seed, scene, request.material, request.antennas, stated=stated)
     check_placeable(problem, splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = split.name if isinstance(split, Split) else split
     options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
-    config = RunConfig(request.model, source, record.task, name, request.n_train, *options)
-    placed = placed_problem(problem.seen(splits[-1]), splits[-1].all_train)
+    names = None if stated is None else tuple(sorted(stated))
+    config = RunConfig(request.model, source, record.task, name, request.n_train, *options, names)
+    placed = placed_problem(problem.seen(splits[-1]), splits[-1], config.entry, on_progress)
     config.entry.check(placed, splits)
+    check_stated(config.entry, placed, splits)
     tell_places(placed)
     return problem, config, splits
 
@@ -110,9 +122,10 @@ def _split_of(record: Record, request: RunRequest) -> str | Split:
     return split
 
 
-def _settings_of(model: Model, request: RunRequest) -> Any:
+def _settings_of(model: Model, request: RunRequest) -> tuple[Any, frozenset[str] | None]:
+    """Settings, and the names of those that are stated; None: those of a dataclass that differ from its defaults."""
     kind: Any = model.settings
-    stated = request.settings
+    stated, names = request.settings, None
     if is_dataclass(stated) and not isinstance(stated, type):
         if request.preset is not None:
             raise InputError(f"preset {request.preset}: the settings state all values; give one of both")
@@ -122,13 +135,18 @@ def _settings_of(model: Model, request: RunRequest) -> Any:
     else:
         assert isinstance(stated, Iterable)
         texts = [*(setting_texts(stated) if isinstance(stated, Mapping) else stated)]
-        preset, named = _preset(model, request.preset), {text.partition("=")[0].strip() for text in texts}
-        if preset and {text.partition("=")[0] for text in preset} <= named:
+        preset, given = _preset(model, request.preset), {name: getattr(request, name) for name in GIVEN}
+        settings = default_settings(model, [*preset, *texts], given)
+        names = frozenset(stated_values(settings, texts))
+        if preset and stated_values(settings, preset).keys() <= names:
             raise InputError(f"preset {request.preset}: the settings state all that it does; omit one of them")
-        settings = default_settings(model, [*preset, *texts], {name: getattr(request, name) for name in GIVEN})
+        for name in names.intersection(model.train_arguments) - {"model"}:
+            value = getattr(settings, name)
+            if given[name] not in (None, type(value)(), value):
+                raise InputError(f"setting {name}: {value}, where the argument is {given[name]}; give one of both")
     if "model" in model.train_arguments and settings.model != model.name:
         raise InputError(f"setting model: {settings.model}, where the model is {model.name}; choose it with --model")
-    return settings
+    return settings, names
 
 
 def _preset(model: Model, name: str | None) -> tuple[str, ...]:
@@ -189,6 +207,7 @@ def train(
     scene: str | Path | Scene | None = None,
     *,
     out: str | Path | None = None,
+    overwrite: bool = False,
     preset: str | None = None,
     material: str | None = None,
     antennas: AntennaOptions = AS_STATED,
@@ -213,6 +232,7 @@ def train(
         model: name of the model, a key of `wrf_mi.models.MODELS`.
         scene: scene, or name, scene folder, Mitsuba XML or mesh to trace, for models that take one.
         out: run folder to make; must not exist or be empty. None: a temporary one, removed with the run.
+        overwrite: ``out`` may be that of a run, which is replaced.
         preset: settings by a name of `wrf_mi.models.Model.presets`, such as ``"fast"``; ``settings`` are beside them.
         material: radio material of a bare mesh.
         antennas: patterns and polarisations that override the data set; with a scene.
@@ -239,7 +259,8 @@ def train(
         The run, with its scores in ``metrics``.
 
     Raises:
-        InputError: data, scene, settings or folder that cannot be used; nothing is left on the disk.
+        InputError: data, scene, settings or folder that cannot be used; what a fit has stored before it stays, and a
+            note says how to go on; without it nothing is left on the disk.
         Interrupted: ``stop`` ended the run; continue with `resume`.
         BackendError: a deterministic fit in a process that computes on a GPU already.
 
@@ -248,34 +269,43 @@ def train(
     20
     """
     if out is not None:
-        check_new(Path(out))
+        check_new(Path(out), overwrite)
     if deterministic:  # before anything is read: reading a data set may choose the GPU
         init("llvm", threads=1)
     place = scene.folder if isinstance(scene, Scene) else scene
     what = RunRequest(model, place, material, antennas, receiver, evaluation, split, n_train, seed, settings)
     request = replace(what, deterministic=deterministic, intervals=intervals, min_rows=min_rows, preset=preset)
     data = data if isinstance(data, str | Path | Record) else load_record(data)
-    problem, config, splits = plan_run(data, request, progress)
+    problem, config, splits = plan_run(data, request, progress, on_progress)
     warn_of_suspicions(problem.record)
     warn_of_left_out(problem.record, config.left_out, _least_rows(problem.record, request))
+    warn_of_one_place(problem.record, splits)
     _warn_of_known_rows(problem, splits)
     if config.deterministic:
         init("llvm", threads=1)
     folder = Path(tempfile.mkdtemp(prefix="wrf-mi-") if out is None else out)
-    folder.mkdir(parents=True, exist_ok=True)
-    with locked_folder(folder):
-        clear_begun(folder)
+    with new_run_folder(folder, overwrite):
         start_run(folder, config, splits)
-        try:
-            _complete(folder, config, problem, Session(folder, folder, on_progress, stop, scheduler, progress))
-        except InputError:
-            if not any(any(folder.rglob(name)) for name in (FITTED, CHECKPOINT)):
-                shutil.rmtree(folder)
-            raise
+        session = Session(folder, folder, on_progress, stop, scheduler, progress)
+        with _noting_resumption(folder):
+            _complete(folder, config, problem, session)
     run = Run(folder, problem.record, kept=scene)
     if out is None:
         weakref.finalize(run, shutil.rmtree, folder, ignore_errors=True)
     return run
+
+
+@contextmanager
+def _noting_resumption(folder: Path) -> Iterator[None]:
+    """Note at an error of the block, whatever it is, how to go on from what a fit has stored in its run folder."""
+    try:
+        yield
+    except Interrupted:  # it says so
+        raise
+    except BaseException as error:
+        if has_progress(folder):
+            error.add_note(f"what was fitted is kept; go on with: wrf-mi train --resume {folder}")
+        raise
 
 
 def _warn_of_known_rows(problem: Problem, splits: Sequence[Split]) -> None:
@@ -315,7 +345,7 @@ def resume(
     if run.config.deterministic:
         init("llvm", threads=1)
     session = Session(run.folder, run.folder, on_progress, stop, progress=progress)
-    with locked_folder(run.folder):
+    with locked_folder(run.folder), _noting_resumption(run.folder):
         _complete(run.folder, run.config, run.problem, session)
     return open_run(folder, record)
 
@@ -325,7 +355,8 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
     folders = run_parts(folder)
     splits = [load_rows(part, problem.record) for part in folders]
     if not all((part / FITTED).exists() for part in folders):
-        problem.settings = config.entry.prepare(placed_problem(problem, splits[0].all_train), splits, session)
+        placed = placed_problem(problem, splits[0], config.entry, session.report)
+        problem.settings = config.entry.prepare(placed, splits, session)
         if problem.settings != config.settings:
             config = replace(config, settings=problem.settings)
             write_configs(folder, config, splits)
@@ -335,11 +366,15 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             before, start = checkpoint_seconds(part), time.perf_counter()
             # Matrices of a few hundred rows: threads of BLAS would mostly wait for each other.
             with threadpool_limits(1, "blas"):
-                placed = placed_problem(problem.seen(rows), rows.all_train)
-                fitted = config.entry.fit(placed, rows, session.of_part(part, folders))
+                of_part = session.of_part(part, folders)
+                placed = placed_problem(problem.seen(rows), rows, config.entry, of_part.report)
+                fitted = config.entry.fit(placed, rows, of_part)
             write_places(part, placed.record)
             spent = fitted.train_seconds
             write_fitted(part, fitted.arrays(), before + time.perf_counter() - start if spent is None else spent)
+            for done in session.discarded:
+                shutil.rmtree(done, ignore_errors=True)
+            session.discarded.clear()
             del fitted  # what is scored is the stored one, beside which this would be in memory a second time
         (part / CHECKPOINT).unlink(missing_ok=True)  # also of a process that was killed before
         parts.append(FittedPart(part, rows, *load_fitted(config, problem, part)))

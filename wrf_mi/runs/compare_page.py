@@ -28,6 +28,7 @@ from .compare_tables import (
     COLUMNS,
     DIFFERENCES,
     METHODS,
+    NO_GAIN,
     OTHER_ROWS,
     WORSE,
     Difference,
@@ -37,7 +38,7 @@ from .compare_tables import (
     first_differences,
 )
 from .folder import CONFIG, RunConfig, known_config, stored_versions
-from .results import PREDICTED, Results
+from .results import PREDICTED, Results, warnings_of
 
 NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
 CONSTANT = ("dataset", "metric")  # columns that are equal in a section, whose heading states them
@@ -111,17 +112,24 @@ def _section(section: Section) -> str:
 <p class="note">{_text(TASKS[section.runs[0].task].label)}, {_better(section.runs[0])}. Click a heading to sort.
 The median comes first here, the verdicts below are of differences of means: they may rank runs differently.</p>
 {_table(shown, section.scores, NUMERIC)}
-{_methods(section.methods)}<h3>Paired differences</h3>
+{_unbeaten(section.runs)}{_methods(section.methods)}<h3>Paired differences</h3>
 <p class="note">Each run against its reference{_text(others)}, on the test rows that both have: mean difference per row,
 positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of blocks of rows: clusters of their
 positions, since near rows resemble each other, or else stretches of consecutive rows. {BETTER} and {WORSE}: the
-interval excludes zero, in all seeds; else a tie. {OTHER_ROWS}: differences would be those of the training
+interval excludes zero, in all seeds; else a tie. {NO_GAIN}: the run would be {BETTER}, but is not better than the
+constant prediction. {OTHER_ROWS}: differences would be those of the training
 rows.{words}</p>
 {gains}
 {images}
 <h3>Commands</h3>
 <pre>{_text(chr(10).join(lines))}</pre>
 """
+
+
+def _unbeaten(runs: Sequence[Results]) -> str:
+    """What the command says of runs that are no better than the constant prediction."""
+    lines = [f"{run.name}: {line}" for run in runs for line in warnings_of(run.metrics)]
+    return "".join(f'<p class="note">{_text(line)}</p>\n' for line in lines)
 
 
 def _methods(rows: Sequence[Mapping[str, Any]]) -> str:

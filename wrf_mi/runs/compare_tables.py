@@ -17,7 +17,7 @@ from ..tasks import TASKS
 from ..tasks.scores import block_bootstrap
 from ..training.selection import clusters
 from .folder import known_config
-from .results import CONSTANT, PREDICTED, Results, constant_of
+from .results import CONSTANT, PREDICTED, Results, constant_of, warnings_of
 
 COLUMNS = {"run": "run", "model": "model", "dataset": "data set", "split": "split", "seed": "seed"}
 COLUMNS |= {"n_train": "training rows (mean of folds)", "n_test": "test rows", "metric": "score"}
@@ -33,6 +33,7 @@ METHODS |= {"mean": "mean, mean of seeds", "mean_sd": "its standard deviation"}
 METHODS |= {"difference": "difference from the best", "low": "95 % from", "high": "to"}
 """Columns of ``methods.csv`` and their headings on the page."""
 BETTER, TIE, WORSE, SAME, FEW = "better", "tie", "worse", "another seed", "too few rows"
+NO_GAIN = "no better than a constant"
 OTHER_ROWS, UNKNOWN_ROWS = "not comparable: trained on other rows", "not comparable: training rows are not stored"
 FEWEST = 2  # least number of common rows of a difference with an interval
 MOST_BLOCKS, ROWS_OF_BLOCK, LEAST_BLOCKS = 20, 5, 10
@@ -47,7 +48,8 @@ class Difference:
     run: str  # name of the run
     against: str  # name of the other run or of the reference
     rows: int  # number of common rows
-    verdict: str  # `BETTER`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`, `OTHER_ROWS`, `UNKNOWN_ROWS`
+    # `BETTER`, `NO_GAIN`, `TIE` or `WORSE`, of all seeds of the two; or `SAME`, `FEW`, `OTHER_ROWS`, `UNKNOWN_ROWS`
+    verdict: str
     # difference, low, high: mean difference of the score per row with its 95 % interval; None: too few rows, or not
     # comparable
     difference: float | None = None
@@ -80,8 +82,9 @@ def differences(runs: Sequence[Results]) -> list[Difference]:
     """Each run against the best one, of several runs, and against its reference; then all other pairs of runs.
 
     "Better" and "worse": the 95 % interval of the difference, of resampled blocks of test rows, excludes zero in all
-    seeds; all else is a tie. Runs that differ in their seed alone are seeds of one method; methods are compared by runs
-    of the same seed. Runs that predict the common rows from other training rows are not comparable.
+    seeds; all else is a tie. `NO_GAIN`: better, but some seed is no better than the constant prediction
+    (`wrf_mi.runs.results.warnings_of`). Runs that differ in their seed alone are seeds of one method; methods are
+    compared by runs of the same seed. Runs that predict the common rows from other training rows are not comparable.
     """
     best, of_name, by_name = best_run(runs), methods(runs), {run.name: run for run in runs}
 
@@ -128,7 +131,11 @@ def _of_seeds(run: Results, seeds: Sequence[Results], against: Callable[[Results
     if gain.difference is None:
         return gain
     compared = sum(each.difference is not None for each in by_run.values())
-    return replace(gain, verdict=words.pop() if len(words) == 1 else TIE, seeds=compared)
+    verdict = words.pop() if len(words) == 1 else TIE
+    # Of such a run the commands say that it is no better than a constant: no praise here.
+    if verdict == BETTER and any(warnings_of(seed.metrics) for seed in seeds):
+        verdict = NO_GAIN
+    return replace(gain, verdict=verdict, seeds=compared)
 
 
 def _of_pair(run: Results, other: Results, is_method: bool) -> Difference:

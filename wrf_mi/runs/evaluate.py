@@ -33,6 +33,7 @@ from .reception import reception_arrays, reception_block
 from .results import (
     NOT_STORED,
     RECEPTION,
+    STD_MEAN,
     Observations,
     against_constants,
     constant_scores,
@@ -57,7 +58,15 @@ LEFT_OUT = "receivers_left_out"
 """Key of the receivers that have too few training rows to be fitted, each with its number of them."""
 CROSS_VALIDATED = "cross_validated"
 """Key of the folds that the scores are of, where the model of the run was fitted to all rows."""
-SHARED = ("row", "tx_pos", FREQUENCY, "receiver_name")  # arrays of ``predictions.npz`` without an axis of receivers
+NOISE_FREE = "truth_without_noise"  # array of ``predictions.npz``: true for rows [m] whose truth has no noise
+INTERVALS_OF = "intervals_of"  # key of what ``inside_90`` and ``crps`` are of: ``reading``, or the ``mean``
+SHARED = (
+    "row",
+    "tx_pos",
+    FREQUENCY,
+    "receiver_name",
+    NOISE_FREE,
+)  # arrays of ``predictions.npz`` without an axis of receivers
 REPEATS = 20  # largest number of single predictions that are timed
 MOST_OF_STAGES = 400  # test rows by which the stages of a fit are scored
 TIMED_S = 2.0  # time after which no further single prediction is begun: some models optimise for each sample
@@ -120,6 +129,12 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     if stated[0].std is not None:
         arrays["std"] = np.full(prediction.shape, np.nan, np.float32)
         arrays["std"][scored] = [p.stated_std for p in stated]
+    of_mean = [p.std_mean for p in stated if p.std_mean is not None]
+    if len(of_mean) == len(stated):
+        arrays[STD_MEAN] = np.full(prediction.shape, np.nan, np.float32)
+        arrays[STD_MEAN][scored] = of_mean
+    if record.truth is not None:
+        arrays[NOISE_FREE] = np.ones(len(rows), bool)
     if stated[0].reception is not None:
         arrays |= reception_arrays(record, split, truth, dict(zip(scored, stated, strict=True)))
     metrics = score(arrays, record.task) | {
@@ -178,8 +193,11 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
         }
     metrics |= against_constants(scorer, scores, arrays)
     if "std" in arrays:
-        stated = arrays["prediction"], arrays["std"], arrays["truth"]
+        # Truth without noise lies in intervals of the mean, readings in their own.
+        std = STD_MEAN if NOISE_FREE in arrays and STD_MEAN in arrays else "std"
+        stated = arrays["prediction"], arrays[std], arrays["truth"]
         metrics["inside_90"], metrics["crps"] = inside_interval(*stated), crps(*stated)
+        metrics[INTERVALS_OF] = "reading" if std == "std" else "mean"
     if RECEPTION in arrays:
         metrics["reception"] = reception_block(arrays)
     return metrics
@@ -313,10 +331,11 @@ def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
     ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``frequency_hz`` [m] the carriers of rows that have several,
     ``receiver_name`` [n_rx]. ``prediction`` and, if known, ``truth`` and ``reference_<name>`` are grey values in 0..1
     [n_rx, m, H, W] float32, power in dBm [n_rx, m] float32 (NaN: not received), or channel coefficients
-    [n_rx, m, subcarriers] or [n_rx, m, antennas, subcarriers] complex64. ``std``, if stated, is the predicted standard
-    deviation of the same shape, real. ``probability_of_reception`` [n_rx, m], if stated, is the probability that
-    anything is received, with the references ``reception_rate``, the receiver's share of received training rows, and
-    ``reception_neighbours``, that of the nearest ones.
+    [n_rx, m, subcarriers] or [n_rx, m, antennas, subcarriers] complex64. ``std`` and ``std_mean``, if stated, are
+    predicted standard deviations of the same shape, real: of a reading, its noise included, and of the mean.
+    ``truth_without_noise`` [m], if present, is true for rows whose truth has no noise. ``probability_of_reception``
+    [n_rx, m], if stated, is the probability that anything is received, with the references ``reception_rate``, the
+    receiver's share of received training rows, and ``reception_neighbours``, that of the nearest ones.
     """
     written = without_single_axis(arrays)
     write_arrays(path, written, compressed=True)

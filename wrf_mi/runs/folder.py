@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import os
 import platform
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -94,6 +95,8 @@ class RunConfig:
     settings: Any  # all settings of the model
     # training rows of the receivers that are left out for having too few, by name
     left_out: Mapping[str, int] = field(default_factory=dict)
+    # names of the settings that were stated; None: a run of an earlier version, or settings as a dataclass
+    stated: tuple[str, ...] | None = None
 
     @cached_property
     def entry(self) -> Model:
@@ -130,7 +133,7 @@ def read_config(folder: Path) -> RunConfig:
         needed = ("model", "dataset", "task", "split", "n_train", "seed", "scene", "material", "antennas")
         stated = {name: content[name] for name in needed}
         stated |= {name: content.get(name) or False for name in ("deterministic", "intervals")}
-        stated["left_out"] = content.get("left_out") or {}
+        stated |= {"left_out": content.get("left_out") or {}, "stated": content.get("stated")}
         stated |= {name: _from_here(stated[name], content.get(PLACE)) for name in ("dataset", "scene")}
         config = settings_from(RunConfig, {**stated, "settings": None}, str(path))
         if config.task not in TASKS or config.seed < 0:
@@ -174,23 +177,75 @@ def check_format(folder: Path) -> None:
         raise InputError(f"{folder / CONFIG}: {text}; train it anew, or use the version that wrote it")
 
 
-def check_new(folder: Path) -> None:
-    """Refuse a file, or a folder that is neither empty nor of a run killed before its configuration was written."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())) and not _is_begun(folder):
-        stopped = (folder / CONFIG).exists() and not (folder / METRICS).exists()
-        remedy = f", or go on with train --resume {folder}" if stopped else ", or remove it"
-        raise InputError(f"{folder}: exists and is not empty; choose another --out{remedy}")
+def check_new(folder: Path, replace: bool = False) -> None:
+    """Refuse (`InputError`) a file, or a folder with files that a new run may not take the place of.
+
+    It may take that of a run which was killed before its configuration was written, and with ``replace`` of any run.
+    """
+    if not folder.exists() or (folder.is_dir() and (not any(folder.iterdir()) or _is_begun(folder))):
+        return
+    if not _is_run(folder):
+        only = " and is no run, which --replace would replace" if replace else " and is not empty"
+        raise InputError(f"{folder}: exists{only}; choose another --out, or remove it")
+    if not replace:
+        remedies = "choose another --out, give --replace"
+        if not (folder / METRICS).exists():
+            remedies += f", or go on with train --resume {folder}"
+        raise InputError(f"{folder}: exists and is not empty; {remedies}")
+
+
+def _is_run(folder: Path) -> bool:
+    """Whether a folder has the configuration of a run, of this or another version."""
+    with suppress(InputError):
+        return {"format", "model", "dataset"} <= read_yaml(folder / CONFIG).keys()
+    return False
+
+
+@contextmanager
+def new_run_folder(folder: Path, replace: bool = False) -> Iterator[None]:
+    """A block that alone writes a new run into a folder, which `InputError` removes where nothing was fitted.
+
+    The run that it replaces is set aside until the block ends, and comes back where nothing is left of the new one.
+
+    Raises:
+        InputError: as of `check_new`, or another process writes into the folder.
+    """
+    check_new(folder, replace)
+    before = folder.with_name(f".{folder.name}.{os.getpid()}.old")
+    if _is_run(folder):
+        with locked_folder(folder):  # refused while another process writes
+            pass
+        os.replace(folder, before)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with locked_folder(folder):
+            _clear_begun(folder)
+            try:
+                yield
+            except InputError:
+                if not has_progress(folder):
+                    shutil.rmtree(folder)
+                raise
+    finally:
+        if before.exists() and not folder.exists():
+            os.replace(before, folder)
+        shutil.rmtree(before, ignore_errors=True)
 
 
 def _is_begun(folder: Path) -> bool:
     """Whether a run was killed here before it could be resumed: a lock and splits, but no configuration."""
     if not (folder / LOCK).is_file() or (folder / CONFIG).exists():
         return False
+    return not has_progress(folder)
+
+
+def has_progress(folder: Path) -> bool:
+    """Whether a run folder has files that a fit has written, beyond those of its beginning."""
     files = (path.name for path in folder.rglob("*") if not path.is_dir())
-    return all(name in (LOCK, SPLIT, CONFIG) or LEFTOVER.fullmatch(name) for name in files)
+    return not all(name in (LOCK, SPLIT, CONFIG) or LEFTOVER.fullmatch(name) for name in files)
 
 
-def clear_begun(folder: Path) -> None:
+def _clear_begun(folder: Path) -> None:
     """Remove what a killed run left in a folder that is locked now; `InputError` as of `check_new`."""
     check_new(folder)
     for path in [path for path in folder.iterdir() if path.name != LOCK]:

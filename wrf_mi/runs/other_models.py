@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from ..core import AntennaOptions, InputError, Prediction, Record
 from ..core.array_files import stored_arrays
-from ..core.files import readable
-from ..core.locks import locked_folder
+from ..core.files import listed, readable
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.folder_files import read_csv
@@ -21,8 +20,9 @@ from ..models import MODELS
 from ..synthetic import load_record
 from ..tasks import TASKS
 from .evaluate import Scores, evaluate, pool, write_results
-from .folder import RunConfig, check_new, clear_begun, start_run
+from .folder import RunConfig, check_new, new_run_folder, start_run
 from .released_outputs import read_released
+from .results import STD_MEAN
 from .run import Run
 
 REMEDY = "store row [m] and prediction [n_rx, m, ...] as predictions.npz of a run has them"
@@ -39,6 +39,7 @@ def score_predictions(
     split: str = "official",
     n_train: int | float | None = None,
     seed: int = 0,
+    overwrite: bool = False,
 ) -> Run:
     """Score predictions that another program made, in a run folder that `wrf_mi.compare` takes like its own.
 
@@ -56,6 +57,7 @@ def score_predictions(
         split: split on whose test rows the predictions are scored; they must not have been trained on.
         n_train: number or fraction of the training rows that the model had, as of `wrf_mi.train`.
         seed: seed of the split.
+        overwrite: ``out`` may be that of a run, which is replaced.
 
     Returns:
         The run, with its scores in ``metrics``; it cannot predict.
@@ -73,13 +75,14 @@ def score_predictions(
     record = data if isinstance(data, Record) else load_record(str(data))
     splits = make_splits(record, split, seed, n_train)
     path, folder = Path(predictions), Path(out)
-    check_new(folder)
+    check_new(folder, overwrite)
     arrays = _read(path, record)
     place = _places(path, arrays, record, np.unique(np.concatenate([part.test for part in splits])))
 
     def predict(rows: IntArray, receiver: int) -> Prediction:
         at = place[rows]
-        return Prediction(arrays["prediction"][receiver, at], arrays["std"][receiver, at] if "std" in arrays else None)
+        stated = {name: arrays[name][receiver, at] for name in ("std", STD_MEAN) if name in arrays}
+        return Prediction(arrays["prediction"][receiver, at], **stated)
 
     scores: list[Scores] = [evaluate(record, part, predict) for part in splits]
     metrics, scored = scores[0] if len(scores) == 1 else pool(scores)
@@ -88,9 +91,7 @@ def score_predictions(
     stated: tuple[Any, ...] = (None, None, AntennaOptions(), False, False, {})
     config = RunConfig(name, source, record.task, split, n_train, seed, *stated)
     header = {"model": name, "dataset": source, "split": split, "seed": seed, "predictions": str(path)}
-    folder.mkdir(parents=True, exist_ok=True)
-    with locked_folder(folder):
-        clear_begun(folder)
+    with new_run_folder(folder, overwrite):
         start_run(folder, config, splits)
         write_results(folder, header | metrics | costs, scored)
     return Run(folder, record)
@@ -110,7 +111,7 @@ def _read_npz(path: Path, record: Record) -> dict[str, NDArray[Any]]:
         raise InputError(f"{path}: no array prediction; {REMEDY}")
     task, number = TASKS[record.task], len(record.receivers)
     expected = record.observation.shape[2:]
-    for key in {"prediction", "std"} & arrays.keys():
+    for key in {"prediction", "std", STD_MEAN} & arrays.keys():
         values = arrays[key]
         if number == 1 and values.shape[1:] == expected:
             values = values[None]
@@ -130,9 +131,11 @@ def _in_order(path: Path, arrays: dict[str, NDArray[Any]], record: Record) -> di
     names = [str(name) for name in arrays["receiver_name"]]
     asked = [receiver.name for receiver in record.receivers]
     if sorted(names) != sorted(asked):
-        raise InputError(f"{path}: receivers {', '.join(names)}; {record.name} has {', '.join(asked)}")
+        # Names that the other lacks come first: they would be cut off among hundreds.
+        unknown, lacking = (sorted(of, key=others.__contains__) for of, others in ((names, asked), (asked, names)))
+        raise InputError(f"{path}: receivers {listed(unknown)}; {record.name} has {listed(lacking)}")
     order = [names.index(receiver) for receiver in asked]
-    return {key: arrays[key][order] for key in ("prediction", "std") if key in arrays}
+    return {key: arrays[key][order] for key in ("prediction", "std", STD_MEAN) if key in arrays}
 
 
 def _read_csv(path: Path, record: Record) -> dict[str, NDArray[Any]]:
@@ -145,9 +148,10 @@ def _read_csv(path: Path, record: Record) -> dict[str, NDArray[Any]]:
     if lacking := [column for column in wanted if column not in table.header]:
         raise InputError(f"{path}: no column {lacking[0]}; give one of each receiver of {place_of(record)}")
     arrays = {"prediction": np.stack([table.numbers(column) for column in wanted])}
-    deviations = [f"{name}_std_db" for name in names]
-    if all(column in table.header for column in deviations):
-        arrays["std"] = np.stack([table.numbers(column) for column in deviations])
+    for key in ("std", STD_MEAN):
+        deviations = [f"{name}_{key}_db" for name in names]
+        if all(column in table.header for column in deviations):
+            arrays[key] = np.stack([table.numbers(column) for column in deviations])
     if "row" in table.header:
         return arrays | {"row": table.numbers("row")}
     return arrays | {"tx_pos": np.stack([table.numbers(axis) for axis in "xyz"], axis=-1)}

@@ -26,7 +26,7 @@ from ..models.model import Inputs
 from ..tasks import TASKS
 from .evaluate import stored_metrics, without_single_axis, write_predictions
 from .folder import METRICS
-from .results import RECEPTION
+from .results import RECEPTION, STD_MEAN
 
 NPZ, CSV = ".npz", ".csv"
 HEADING = "heading_rad"  # column or array of headings
@@ -152,8 +152,8 @@ def write_prediction_file(
 
     ``.npz`` is as of `wrf_mi.runs.evaluate.write_predictions`. ``.csv`` has one row for each position with columns
     ``x``, ``y``, ``z`` in metres, ``heading_rad`` and ``frequency_hz`` if known, ``<receiver>_dbm`` for each receiver
-    and, if stated, standard deviations ``<receiver>_std_db`` and probabilities of reception ``<receiver>_received``;
-    empty where nothing is received.
+    and, if stated, standard deviations ``<receiver>_std_db`` of a reading and ``<receiver>_std_mean_db`` of the mean,
+    and probabilities of reception ``<receiver>_received``; empty where nothing is received.
 
     Returns:
         The arrays as an ``.npz`` file has them.
@@ -168,7 +168,8 @@ def write_prediction_file(
         return write_predictions(out, arrays | observations)
     # A list, as receivers may have equal names.
     columns: list[tuple[str, Any]] = [*zip("xyz", inputs.tx_pos_m.T, strict=True), *stated]
-    for key, suffix in (("prediction", "dbm"), ("std", "std_db"), (RECEPTION, "received")):
+    deviations = ("std", "std_db"), (STD_MEAN, f"{STD_MEAN}_db")
+    for key, suffix in (("prediction", "dbm"), *deviations, (RECEPTION, "received")):
         if key in observations:
             columns += [(f"{name}_{suffix}", v) for name, v in zip(receivers, observations[key], strict=True)]
     names, values = zip(*columns, strict=True)

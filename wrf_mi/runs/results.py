@@ -29,6 +29,7 @@ Observations = NDArray[np.float32] | NDArray[np.complex64]
 REMEDY = "run evaluate to write it anew"
 CONSTANT = "constant"  # key of the block in ``metrics.json``
 PREDICTED = "predictions"  # key in ``metrics.json`` of the file of another program
+STD_MEAN = "std_mean"  # key in ``predictions.npz``: standard deviation of the mean
 RECEPTION = "probability_of_reception"  # key in ``predictions.npz`` and variable of a map
 SCORES, WORDS = "constant_score", "constant_words"
 NOT_STORED = SCORES, WORDS
@@ -66,12 +67,13 @@ class Results:
     truth: Observations  # observations of the same shape; NaN where nothing was received
     # reference predictions of the same shape by name (`wrf_mi.tasks.Task.references`)
     references: dict[str, Observations]
-    # stated standard deviations of the predictions, of the same shape and real; None: none are stated
+    # stated standard deviations of readings, of the same shape and real; None: none are stated
     std: NDArray[np.float32] | None
     # stated probabilities of reception [n_rx, m]; None: none are stated
     reception: NDArray[np.float32] | None
     # pairs (seconds, score on validation rows while they were held out) by name of the fold, "" without folds
     validation: dict[str, list[tuple[float, float]]]
+    std_mean: NDArray[np.float32] | None = None  # those of the mean, likewise
     splits: Sequence[Split] = ()  # splits with test rows, one or those of the folds; empty: not stored
 
     @cached_property
@@ -154,6 +156,7 @@ def read_run(path: str | Path, name: str | None = None) -> Results:
         truth=arrays["truth"],
         references={key: arrays[reference_key(key)] for key in references},
         std=arrays.get("std"),
+        std_mean=arrays.get(STD_MEAN),
         reception=arrays.get(RECEPTION),
         validation=_read_logs(folder),
         splits=[split for part in run_parts(folder) if len((split := load_split(part / SPLIT)).test)],
@@ -217,7 +220,7 @@ def _read_predictions(path: Path, task: Task, references: Sequence[str]) -> dict
     with readable(path, f"{path}: missing; run evaluate to write it", REMEDY):
         stored = stored_arrays(path)
     _require(path, stored, ("row", "tx_pos", "receiver_name", *observed))
-    observed += {"std", RECEPTION} & stored.keys()
+    observed += {"std", STD_MEAN, RECEPTION} & stored.keys()
     arrays: dict[str, Any] = {key: stored[key] for key in ("row", "tx_pos", *observed)}
     names = stored["receiver_name"]
     shapes = ", ".join(f"{key} {value.shape}" for key, value in arrays.items())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from ..parallel import PartsProgress, Scheduler, row_parts
 from ..training.predictor import Predictor
 from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
 from .prediction_file import check_prediction_file, spooled, write_prediction_file
-from .results import RECEPTION
+from .results import RECEPTION, STD_MEAN
 
 PREDICTED_PER_CHUNK = 256  # positions that are predicted at a time: 33 MB of spectra of 90 x 360 for each receiver
 MOST_PER_CHUNK, CHUNK_BYTES = 4096, 1 << 25
@@ -87,7 +87,8 @@ class Run:
         config = self.config
         scene = (config.scene, config.material) if self.scene is None else (str(self.scene), None)
         data, left_out = self.record or config.dataset, tuple(config.left_out)
-        problem = Problem(data, config.settings, config.seed, *scene, config.antennas, self.operator, left_out)
+        stated = None if config.stated is None else frozenset(config.stated)
+        problem = Problem(data, config.settings, config.seed, *scene, config.antennas, self.operator, left_out, stated)
         return stored_problem(problem, self.folder)
 
     @cached_property
@@ -154,8 +155,9 @@ class Run:
             carriers_hz: carrier of each position [m], Hz, where the data have several; else None.
 
         Returns:
-            Observations [m, ...] as in `wrf_mi.core.Record` and, if the model states them, standard deviations; of
-            several receivers [n_rx, m, ...], as in ``predictions.npz``; `to_xarray` names the dimensions.
+            Observations [m, ...] as in `wrf_mi.core.Record` and, if the model states them, standard deviations of a
+            reading (``std``) and of the mean without noise (``std_mean``); of several receivers [n_rx, m, ...], as in
+            ``predictions.npz``; `to_xarray` names the dimensions.
 
         Raises:
             InputError: not a finished run with one split, inputs that the model does not predict from, or no such
@@ -165,9 +167,10 @@ class Run:
         of_one = receiver is not None or len(known) == 1
         numbers = [receiver_index(known, receiver or 0)] if of_one else range(len(known))
         every = [self.predict_inputs(inputs, number) for number in numbers]
-        mean, std, reception = _joined(every, np.concatenate if of_one else np.stack)
+        joined = _joined(every, np.concatenate if of_one else np.stack)
         names = tuple(known[number].name for number in numbers)
-        return LabelledPrediction(mean, std, reception, inputs.tx_pos_m, names, self.config.task, of_one)
+        places: dict[str, Any] = {"tx_pos_m": inputs.tx_pos_m, "receiver_names": names}
+        return LabelledPrediction(**joined, **places, task=self.config.task, of_one=of_one)
 
     def score(self, split: str | None = None) -> dict[str, Any]:
         """Scores on the test rows, or on those of another split (`wrf_mi.runs.api.evaluate_run`)."""
@@ -215,7 +218,7 @@ class Run:
                 what = f"{self.folder}: predictions at {len(inputs)} positions at once"
                 require_memory(needed, what, "predict fewer at a time, or into a file (predict_to_file)")
             chunks.append(chunk)
-        return Prediction(*_joined(chunks, np.concatenate))
+        return Prediction(**_joined(chunks, np.concatenate))
 
     def predicted_parts(self, inputs: Inputs, receiver: int) -> Iterator[tuple[slice, Prediction]]:
         """Predictions of the receiver of an index in chunks, with the rows of each: memory for a chunk at a time.
@@ -281,7 +284,8 @@ class Run:
         shape, arrays = (len(self.receivers), len(inputs)), dict[str, NDArray[Any]]()
 
         def collect(rows: slice, receiver: int, chunk: Prediction) -> None:
-            for name, values in (("prediction", chunk.mean), ("std", chunk.std), (RECEPTION, chunk.reception)):
+            stated = ("prediction", chunk.mean), ("std", chunk.std), (STD_MEAN, chunk.std_mean)
+            for name, values in (*stated, (RECEPTION, chunk.reception)):
                 if values is not None:
                     values = values if name == "prediction" else values.astype(np.float32)
                     if name not in arrays:
@@ -323,14 +327,14 @@ Collect = Callable[[slice, int, Prediction], None]
 """Takes the predictions of some rows at the receiver of an index."""
 
 
-def _joined(parts: Sequence[Prediction], join: Callable[[Sequence[Any]], Any]) -> tuple[Any, Any, Any]:
-    """Mean, standard deviation and reception of joined predictions; None where one of them has none."""
+def _joined(parts: Sequence[Prediction], join: Callable[[Sequence[Any]], Any]) -> dict[str, Any]:
+    """Attributes of `Prediction` of joined predictions; None where one of them has none."""
 
     def of(name: str) -> Any:
         values = [getattr(part, name) for part in parts]
         return None if any(value is None for value in values) else values[0] if len(values) == 1 else join(values)
 
-    return of("mean"), of("std"), of("reception")
+    return {attribute.name: of(attribute.name) for attribute in fields(Prediction)}
 
 
 def _inputs(

@@ -27,7 +27,7 @@ from defusedxml.ElementTree import parse
 
 from ..core import AntennaOptions, InputError
 from ..core.digest import content_digest
-from ..core.files import one_line, readable, write_atomically, write_csv
+from ..core.files import listed, one_line, readable, write_atomically, write_csv
 from ..datasets.registry import locate
 from ..models import MODELS
 from ..parallel import Scheduler, run_module
@@ -225,7 +225,7 @@ def _with_stored(sweep: Sweep, path: Path, current: dict[str, dict[str, str]]) -
         changed = [name for name in now if known.get(name, now[name]) != now[name]]
         changed += [] if key in before else ["what it does not state"]
         if changed:
-            raise InputError(f"{sweep.folder}: holds a sweep {text} {', '.join(changed)}; choose another --out")
+            raise InputError(f"{sweep.folder}: holds a sweep {text} {listed(changed)}; choose another --out")
         merged[key] = known | now
     return merged
 
@@ -295,7 +295,7 @@ def _row(run: SweepRun, status: str) -> dict[str, Any]:
 def check_failures(rows: Sequence[Mapping[str, Any]]) -> None:
     """Raise `SweepFailed` with the names of runs without scores."""
     if failed := [f"{Path(row['run']).name}: {row['status']}" for row in rows if row["median"] is None]:
-        raise SweepFailed(f"sweep: {len(failed)} of {len(rows)} runs failed: {'; '.join(failed)}")
+        raise SweepFailed(f"sweep: {len(failed)} of {len(rows)} runs failed: {listed(failed, mark='; ')}")
 
 
 def sweep_table(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> str:

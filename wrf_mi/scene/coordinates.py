@@ -19,9 +19,31 @@ from ..core.files import one_line
 logger = logging.getLogger(__name__)
 
 Up = Literal["y", "z"]
-UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # length of each unit that a scan or mesh may be in
+UNITS_M = {
+    "m": 1.0,
+    "dm": 0.1,
+    "cm": 0.01,
+    "mm": 0.001,
+    "ft": 0.3048,
+    "in": 0.0254,
+}  # length of each unit that a scan or mesh may be in
 FORMATS = ".e57, .pcd, .pts, .ptx, .ply, .las, .laz, .xyz, .txt, or .npz with points"  # files with points
-EXTRAS = {"laspy": "lidar", "open3d": "lidar", "pye57": "lidar", "collada": "meshes", "pxr": "meshes"}
+CONVERSIONS = {
+    ".ifc": "convert it by IfcConvert to .glb or .obj",
+    ".fbx": "convert it, in Blender: File > Import > FBX, File > Export > glTF",
+    ".blend": "export it as glTF or OBJ: File > Export in Blender",
+    ".skp": "export it as COLLADA (.dae) or OBJ: File > Export > 3D Model in SketchUp",
+    **dict.fromkeys(
+        (".dxf", ".dwg"), "export its walls as faces in .obj or .stl, or draw the plan as a picture (.png)"
+    ),
+    **dict.fromkeys((".step", ".stp", ".iges", ".igs"), "export it as .stl or .obj, in FreeCAD: File > Export"),
+    **dict.fromkeys((".rvt", ".rfa", ".3ds", ".max", ".3dm"), "export it as .obj, .stl or glTF"),
+    **dict.fromkeys((".rcp", ".rcs"), "export its points as .e57: Export in ReCap"),
+    **dict.fromkeys((".b3dm", ".i3dm", ".pnts", ".cmpt"), "a tile of 3D Tiles; convert its content to .glb"),
+    **dict.fromkeys((".zip", ".7z", ".rar"), "unpack it"),
+}
+"""How scenes in other formats become one that is read, by the ending of the file."""
+EXTRAS = {"laspy": "lidar", "open3d": "lidar", "pye57": "lidar", "lzf": "lidar", "collada": "meshes", "pxr": "meshes"}
 """Extra of this package that installs a package; `SYSTEM` are libraries that Open3D needs and a small system lacks."""
 SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
 LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
@@ -207,4 +229,6 @@ def source_file(path: str | Path, units: str | None, wanted: str) -> Path:
         raise InputError(f"units {units!r}: not known; give one of {', '.join(UNITS_M)}")
     if not Path(path).is_file():
         raise InputError(f"{path}: no such file; give {wanted}")
+    if remedy := CONVERSIONS.get(Path(path).suffix.lower()):
+        raise InputError(f"{path}: {Path(path).suffix} is not read; {remedy}")
     return Path(path)

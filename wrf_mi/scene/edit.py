@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.files import listed
 from .folder import read_scene_folder, write_scene
 from .materials import Materials, check_velocity
 from .mesh.files import mesh_parts
@@ -151,7 +152,7 @@ def _chosen(folder: str | Path, surfaces: Sequence[Surface], patterns: Sequence[
     for pattern in patterns:
         names = {surface.name for surface in surfaces if fnmatchcase(surface.name, pattern)}
         if not names:
-            known = ", ".join(surface.name for surface in surfaces)
+            known = listed(surface.name for surface in surfaces)
             raise InputError(f"{folder}: no surface {pattern!r}; it has {known}")
         chosen |= names
     return chosen

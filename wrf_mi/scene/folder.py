@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, scene_xml
 
 from ..core import InputError
-from ..core.files import atomic_folder, inside, one_line, write_atomically, write_figure
+from ..core.files import atomic_folder, inside, listed, one_line, write_atomically, write_figure
 from ..core.yaml_files import read_yaml
 from .coordinates import require_near
 from .materials import FILE as MATERIALS_FILE
@@ -124,7 +124,7 @@ def _complete(materials: Materials, surfaces: Sequence[Surface]) -> Materials:
     if len(kinds) < len(surfaces):
         raise ValueError("write_scene: two surfaces have the same name")
     if unknown := [name for name in materials.surfaces if name not in kinds]:
-        raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {', '.join(kinds)}")
+        raise InputError(f"materials: no surface {unknown[0]!r} in this scene; it has {listed(kinds)}")
     return materials.complete(kinds)
 
 

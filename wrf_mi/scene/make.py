@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from dataclasses import replace as replaced
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -23,19 +24,23 @@ from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .mesh.facets import planes_of_mesh
 from .mesh.files import SUFFIXES, read_mesh
+from .mesh.measured import is_measured
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
 from .mesh.surfaces import Surface, bounds, box_of, moved, sampled
+from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES
 from .plan.sources import PlanGrid, Row0, read_layout, read_plan
 from .plan.storey import layout_walls, plan_surfaces
-from .positions import check_positions, read_positions, reflections
+from .plan.walked import warn_of_places, with_walked_floor
+from .positions import check_positions, in_plan, placed, read_positions, reflections
 from .register import register_walls, wall_points
 from .scan.cloud import surfaces_from_points
 from .scan.las_units import require_stated_metres
-from .scan.points import Scan, read_scan
+from .scan.level import level_rotation
+from .scan.points import Scan, read_scan, sampled_scan
 
 logger = logging.getLogger(__name__)
 
-PLAN_SUFFIXES = (".png", ".pgm", ".yaml", ".yml", ".csv")
+PLAN_SUFFIXES = (*PICTURE_SUFFIXES, *SHEET_SUFFIXES, ".csv")
 PREVIEW_POINTS = 20_000
 Storey = tuple[float | None, float, float | None, Row0 | None]
 """Options of a plan: height of the ceiling, z of the floor, side of a cell, and the side where the first row lies."""
@@ -67,8 +72,8 @@ def make_scene(
             (`wrf_mi.scene.plan.sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
             are cut into triangles and else used as they are.
         out: path of the folder.
-        units: unit of a scan's or mesh's coordinates: m, cm, mm or ft; None: that which COLLADA and USD state, else m,
-            which is refused for a LAS or LAZ whose header states another one.
+        units: unit of a scan's or mesh's coordinates: m, dm, cm, mm, ft or in; None: that which COLLADA and USD state,
+            else m, which is refused for a LAS or LAZ whose header states another one.
         up: axis of a scan or mesh that is up, y or z; None: that which COLLADA and USD state, y in glTF, else z, and
             coordinates that look otherwise are refused.
         origin_m: point [3] of the source, z up, metres, that becomes the origin before the registration: far from it,
@@ -117,22 +122,30 @@ def make_scene(
         shift = _shift(file, origin_m)
     if matrix is known_walls is None:  # before minutes are spent on a scan's planes
         require_near(trimesh.transform_points(source.extent_m, shift), file)
+    source, turn = source.levelled(shift)
     surfaces = source.surfaces(up)
+    motion, registered = shift, turn
     if known_walls is not None:
         matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file))
-    motion = shift if matrix is None else matrix @ shift
-    placed = moved(surfaces, motion)
+        motion, registered = matrix @ shift, matrix if turn is None else matrix @ turn
+    elif matrix is not None:  # a registration is of the file as it is
+        motion, registered = (matrix if turn is None else matrix @ turn.T) @ shift, matrix
+    scene = placed(surfaces, motion, source.grid, measured)
     if measured is not None:
-        mirrored = reflections(surfaces, file, source.grid, motion, known_walls)
-        check_positions(measured, placed, mirrored, f"{file} with the positions of {positions}")
+        mirrored = reflections(surfaces, file, source.grid, motion, known_walls, measured)
+        check_positions(measured, scene, mirrored, f"{file} with the positions of {positions}")
+        if source.grid is not None:  # only of a frame that has been checked
+            places = in_plan(measured, motion)
+            warn_of_places(source.grid, places, str(positions))
+            scene = moved(with_walked_floor(surfaces, source.grid, places, unmapped=True), motion)
     write_scene(
         out,
-        placed,
-        frame=_frame(file, origin_m, matrix),
+        scene,
+        frame=_frame(file, origin_m, registered),
         origin_m=origin_m,
         source=", ".join(map(str, files)),
         materials=materials,
-        registration=matrix,
+        registration=registered,
         replace=replace,
         **source.sample(motion),
     )
@@ -170,6 +183,25 @@ class _Source:
     def extent_m(self) -> FloatArray:
         """Lowest and highest coordinates [2, 3]."""
         return box_of(self.parts) if self.scan is None else bounds(self.scan.points_m)
+
+    def levelled(self, shift: FloatArray) -> tuple[_Source, FloatArray | None]:
+        """The source with a scan made level about the origin to which a matrix [4, 4] shifts; its rotation or None."""
+        if self.scan is None:
+            return self, None
+        try:
+            turn, angle_deg = level_rotation(self.scan.points_m)
+        except InputError as error:
+            raise InputError(f"{self.file}: {error}") from None
+        if not angle_deg:
+            return self, None
+        text = "%s: not level by %.1f degrees, and turned so that its walls are upright; scene.yml has the rotation, "
+        text += "which positions in the frame of the file need as well"
+        logger.warning(text, self.file, angle_deg)
+        motion = np.linalg.inv(shift) @ turn @ shift
+        points, places = (
+            trimesh.transform_points(part, motion) for part in (self.scan.points_m, self.scan.viewpoints_m)
+        )
+        return replaced(self, scan=replaced(self.scan, points_m=points, viewpoints_m=places)), turn
 
     def surfaces(self, up: Up | None) -> Sequence[Surface]:
         """The surfaces, those of a scan after the search for its planes, which takes minutes for large ones."""
@@ -209,8 +241,14 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
     if storey != UNSTATED:
         raise InputError(f"{file}: no plan; leave out --wall-height, --floor, --resolution and --row-0")
     if has_faces(file):
-        return _Source(file, _read_faces(file, units, up))
-    scan = read_scan(files, units, up)
+        raw = read_mesh(file, units, up)
+        require_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in raw])), file, up)
+        if not is_measured(raw):
+            return _Source(file, _split(raw, file, up))
+        logger.warning("%s: its faces are uneven as those of a scan, and are read as points of its planes", file)
+        scan = sampled_scan(raw)
+    else:
+        scan = read_scan(files, units, up)
     require_stated_metres(files, units)
     check_extent(scan.points_m, file)
     require_fine(scan.points_m, file)
@@ -259,9 +297,8 @@ def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> 
     return _Source(file, walls, plan if isinstance(plan, PlanGrid) else None)
 
 
-def _read_faces(file: Path, units: str | None, up: Up | None) -> list[Surface]:
-    raw = read_mesh(file, units, up)
-    require_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in raw])), file, up)
+def _split(raw: Sequence[Surface], file: Path, up: Up | None) -> list[Surface]:
+    """Surfaces of a mesh by kind, of which some floor shows that z is up."""
     surfaces = planes_of_mesh(raw)
     unstated = up is None and file.suffix.lower() not in STATING_UP
     if unstated and not _has_floor(surfaces) and _has_floor(planes_of_mesh(moved(raw, Y_UP.T))):

@@ -14,6 +14,12 @@ the law of ITU-R P.2040; a scene file holds it at f0:
     surfaces: {wall_03: panel}
     constants: {panel: {relative_permittivity: 2.9, conductivity: 0.01, thickness: 0.08}}
 
+Any material may scatter, with the share of the amplitude, and of the other polarisation's power, and a pattern of
+Degli-Esposti et al. (2007), ``lambertian`` by default, ``directive`` (alpha_r) or ``backscattering`` (alpha_r, alpha_i,
+lambda_):
+
+    scattering: {itu_brick: {scattering_coefficient: 0.4, scattering_pattern: directive, alpha_r: 4}}
+
 Surfaces that move have velocities, from which Doppler shifts of paths follow:
 
     velocities_mps: {wall_03: [0.0, 1.5, 0.0]}
@@ -35,9 +41,10 @@ from ..core import InputError
 from ..core.yaml_files import read_yaml
 from ..datasets.folder_files import SINGLE_MAX, shown
 from .mesh.surfaces import KINDS
+from .scattering import check_scattering
 
 FILE = "materials.yml"
-KEYS = ("rules", "surfaces", "thickness_m", "constants", "velocities_mps")
+KEYS = ("rules", "surfaces", "thickness_m", "constants", "scattering", "velocities_mps")
 FASTEST_MPS = 3e6  # 1 % of the speed of light: Doppler shifts are those of first order in v / c
 EXPONENT, CARRIER = "conductivity_exponent", "carrier_hz"
 """Optional numbers of a material with constants; both or neither."""
@@ -68,6 +75,7 @@ class Materials:
         surfaces: kind, or material, of each surface by its name.
         thickness_m: slab thickness of each material of `THICKNESS_M` in metres; by default the one there.
         constants: materials of the scene's own.
+        scattering: scattering of materials by their names, see `check_scattering`; others do not scatter.
         velocities_mps: velocities [3] of moving surfaces by their names, m/s; others are at rest.
     """
 
@@ -75,6 +83,7 @@ class Materials:
     surfaces: Mapping[str, str] = field(default_factory=dict)
     thickness_m: Mapping[str, float] = field(default_factory=dict)
     constants: Constants = field(default_factory=dict)
+    scattering: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     velocities_mps: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def of(self, name: str, kind: str) -> str:
@@ -123,6 +132,9 @@ def read_materials(path: str | Path) -> Materials:
             raise InputError(f"{file}: surfaces: {shown(name)} names no mesh; use letters, digits, _, - and .")
         _check_material(f"{file}: surfaces: {name}", entry, (*KINDS, *known))
     thicknesses(file, parts["thickness_m"])
+    for name, stated in parts["scattering"].items():
+        _check_material(f"{file}: scattering", name, (*parts["constants"], *THICKNESS_M))
+        check_scattering(f"{file}: scattering: {name}", stated)
     for name, velocity in parts["velocities_mps"].items():
         if name not in parts["surfaces"]:
             raise InputError(f"{file}: velocities_mps: no surface {shown(name)} among surfaces")
@@ -197,8 +209,8 @@ def materials_text(materials: Materials) -> str:
     head = (
         "# Radio materials of this scene (of ITU-R P.2040, perfect, or perfect_absorber). rules: of each kind of\n"
         "# surface; surfaces: the kind of each, or a material of its own; constants: relative permittivity,\n"
-        "# conductivity (S/m) and thickness (m) of further materials; velocities_mps: of moving surfaces,\n"
-        "# m/s. Edit, then open the scene with wrf-mi: scene.xml follows.\n"
+        "# conductivity (S/m) and thickness (m) of further materials; scattering: of any material; velocities_mps:\n"
+        "# of moving surfaces, m/s. Edit, then open the scene with wrf-mi: scene.xml follows.\n"
     )
     facts = {key: dict(part) for key, part in vars(materials).items() if part or key not in KEYS[3:]}
     return head + yaml.safe_dump(facts, sort_keys=False, width=110)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+import trimesh
 from scipy import sparse
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import cKDTree
@@ -21,9 +22,10 @@ from scipy.spatial import cKDTree
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..datasets.folder_files import read_csv
-from .mesh.surfaces import Surface, box_of, cut_lines, moved
+from .mesh.surfaces import Surface, box_of, cut_lines, level_area, moved
 from .plan.sources import PlanGrid
 from .plan.storey import LARGEST_GAP_M
+from .plan.walked import with_walked_floor
 from .register import best_motion, wall_points
 
 logger = logging.getLogger(__name__)
@@ -79,9 +81,7 @@ def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int
     level = [surface for surface in surfaces if surface.kind in ("floor", "ceiling")]
     if not level:
         return crossings, 0
-    corners = np.concatenate([surface.vertices_m[surface.faces][..., :2] for surface in level])
-    # Triangles are widened by a micrometre first: rounding leaves slits between them.
-    area = shapely.buffer(shapely.union_all(shapely.buffer(shapely.polygons(corners), 1e-6)), OUTSIDE_M)
+    area = shapely.buffer(level_area(level), OUTSIDE_M)
     return crossings, int(np.count_nonzero(~shapely.contains_xy(area, places)))
 
 
@@ -126,13 +126,33 @@ def _better_shift(positions_m: FloatArray, surfaces: Sequence[Surface], tolerate
     return None if min(counts) > tolerated else np.asarray(shifts[np.argmin(counts)])
 
 
+def placed(
+    surfaces: Sequence[Surface], motion: FloatArray, grid: PlanGrid | None, positions_m: FloatArray | None
+) -> list[Surface]:
+    """Surfaces moved by a matrix [4, 4], with floor where a grid is free about positions [n, 3] in the new frame."""
+    if grid is not None and positions_m is not None:
+        surfaces = with_walked_floor(surfaces, grid, in_plan(positions_m, motion))
+    return moved(surfaces, motion)
+
+
+def in_plan(positions_m: FloatArray, motion: FloatArray) -> FloatArray:
+    """Places [n, 2] in the frame of a plan that a matrix [4, 4] moves to that of positions [n, 3]."""
+    heights = np.nan_to_num(positions_m) * [1, 1, 0]
+    return np.asarray(trimesh.transform_points(heights, np.linalg.inv(motion))[:, :2])
+
+
 def reflections(
-    surfaces: Sequence[Surface], file: Path, grid: PlanGrid | None, motion: FloatArray, known_walls_m: FloatArray | None
+    surfaces: Sequence[Surface],
+    file: Path,
+    grid: PlanGrid | None,
+    motion: FloatArray,
+    known_walls_m: FloatArray | None,
+    positions_m: FloatArray | None = None,
 ) -> list[tuple[str, list[Surface]]]:
     """Remedies and surfaces of the scenes of a source with its y or its x reversed.
 
-    ``grid`` are the cells of an occupancy grid, ``motion`` moves the source to the scene's frame [4, 4], and each
-    reflection is registered anew to ``known_walls_m`` [m, 2, 2], if any.
+    ``grid`` are the cells of an occupancy grid, ``motion`` moves the source to the scene's frame [4, 4], each
+    reflection is registered anew to ``known_walls_m`` [m, 2, 2], if any, and `placed` with positions [n, 3].
     """
     if grid is not None:
         # Rows or columns in the other order keep the middle of the grid, which need not be that of its walls.
@@ -156,7 +176,7 @@ def reflections(
         flip[axis, axis], flip[axis, 3] = -1, total
         mirrored = moved(surfaces, flip)
         placing = motion if known_walls_m is None else best_motion(wall_points(mirrored), known_walls_m)
-        scenes.append((remedy, moved(mirrored, placing)))
+        scenes.append((remedy, placed(surfaces, placing @ flip, grid, positions_m)))
     return scenes
 
 

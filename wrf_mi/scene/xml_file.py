@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
@@ -34,13 +35,42 @@ VALUES = (
     *("transform", "translate", "rotate", "scale", "matrix", "lookat"),
 )
 """Elements without a plugin. ``include``, ``path`` and ``alias`` are not among them: they reach other files."""
+PARAMETER = re.compile(r"\$(\w+)")  # a place that a caller's value or a default takes
 FILES = ("filename",)  # names of texts that are files
 DEEPEST = 64  # most levels of elements: Mitsuba's reader calls itself for each
 
 
+OVERRULED = "has constants and an id of ITU-R P.2040, by which Sionna RT leaves them out; rename it, without itu"
+
+
+def overruled(bsdf: Element) -> bool:
+    """Whether a BSDF states constants, in place of which Sionna RT takes those of ITU-R P.2040 for its id."""
+    is_itu = bsdf.get("id", "").removeprefix("mat-").startswith(("itu_", "itu-"))
+    stated = {child.get("name") for child in bsdf}
+    return is_itu and bool(stated & {"relative_permittivity", "conductivity"})
+
+
+def make_files_absolute(root: Element, path: Path) -> None:
+    """Name the files of a scene file, in place, so that it may be written elsewhere."""
+    for text in root.iter("string"):
+        if text.get("name") in FILES:
+            text.set("value", str((path.parent / text.get("value", "")).absolute()))
+
+
 def parsed_xml(path: Path) -> Element:
-    """The root of an XML file; `DefusedXmlException` where it has a document type or entities."""
-    return cast(Element, parse(path, forbid_dtd=True).getroot())
+    """The root of an XML file, the values of its ``<default>`` elements in the places of ``$name``, as in Mitsuba.
+
+    `DefusedXmlException`: a document type or entities.
+    """
+    root = cast(Element, parse(path, forbid_dtd=True).getroot())
+    defaults: dict[str, str] = {}
+    for element in root.iter():
+        for key, value in element.items():
+            if "$" in value:
+                element.set(key, PARAMETER.sub(lambda match: defaults.get(match[1], match[0]), value))
+        if element.tag == "default":  # counts from here on; the first of a name holds
+            defaults.setdefault(element.get("name", ""), element.get("value", ""))
+    return root
 
 
 def read_scene_xml(path: Path) -> Element:
@@ -78,8 +108,8 @@ def _check(element: Element, where: str, named: Mapping[int, str], folder: Path,
         raise InputError(f"{where}: elements within elements to more than {DEEPEST} levels; correct the scene")
     _check_plugin(element, where)
     tag = element.tag
-    if tag in ("string", "default") and "$" in element.get("value", ""):
-        raise InputError(f"{where}: a value with a parameter ($); write the value in its place")
+    if tag == "string" and "$" in element.get("value", ""):
+        raise InputError(f"{where}: a value with a parameter ($) that has no <default>; write the value in its place")
     if tag == "string" and element.get("name") in FILES:
         inside(folder, element.get("value", ""), where)
     for child in element:

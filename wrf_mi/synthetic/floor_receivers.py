@@ -130,7 +130,9 @@ def trace_floor(scene_folder: Path, plan: FloorPlan, floor: FloorReceivers, prog
     scene = open_scene(scene_folder, CARRIER_HZ)
     receivers, transmitters = floor_devices(scene, plan, floor)
     set_scattering(scene, floor.scattering)
-    specular, every = (trace_paths(scene, transmitters, receivers, options, progress) for options in floor.options())
+    # Scattered fields from receivers, which are not reciprocal: the data stay as they were made.
+    how: dict[str, Any] = {"progress": progress, "search_from": "receivers"}
+    specular, every = (trace_paths(scene, transmitters, receivers, options, **how) for options in floor.options())
     scattered = every.select((every.paths.interactions == SCATTERING).any(axis=1))
     # Two traces of the same devices, scene and depth as one, with the options of the second.
     parts, traces = (specular.paths, scattered.paths), (specular, scattered)

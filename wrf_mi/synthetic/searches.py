@@ -132,7 +132,7 @@ def searched_paths(
                 yield slice(start, start + len(part)), traced.select(counted)
 
 
-def set_scattering(scene: Any, coefficient: float) -> None:
-    """Set the share of the reflected amplitude that every surface of a ``sionna.rt.Scene`` scatters."""
-    for material in scene.radio_materials.values():
+def set_scattering(scene: Any, coefficient: float | None) -> None:
+    """Set the share of the reflected amplitude that all surfaces of a ``sionna.rt.Scene`` scatter; None: as stated."""
+    for material in scene.radio_materials.values() if coefficient is not None else ():
         material.scattering_coefficient = coefficient

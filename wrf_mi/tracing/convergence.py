@@ -24,6 +24,7 @@ from ..receivers import rssi_dbm
 from .options import MAX_DEPTH, MAX_RAYS, TraceOptions
 from .paths.result import TraceResult
 from .paths.solve import FIRST_RAYS, Prepared, spread, trace_paths
+from .sionna.scattering import scatters
 
 logger = logging.getLogger(__name__)
 
@@ -188,6 +189,8 @@ def choose_options(
     """
     if not (np.isfinite(target_db) and target_db > 0):
         raise InputError(f"target-error {target_db}: give a number of dB above 0")
+    if not scatters(scene, options):
+        kinds = [kind for kind in kinds if kind != CHOSEN_KINDS[1]]
     trace = partial(trace_paths, scene, receivers=receivers, tx_antenna=tx_antenna, prepared=Prepared(scene))
     positions = np.atleast_2d(np.asarray(tx_pos_m, float))
     search = _Search(trace, positions[spread(len(positions), SAMPLE)], spectra, target_db / PARTS)

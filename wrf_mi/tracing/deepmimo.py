@@ -43,7 +43,7 @@ def check_deepmimo_folder(path: str | Path, replace: bool = False) -> Path:
         text = f"{folder}: {name!r} as name of a scenario, which deepmimo.load turns into lower case"
         raise InputError(f"{text}; choose small letters, digits and _")
     if folder.exists() and not replace:
-        raise InputError(f"{folder}: exists; remove it or choose another folder")
+        raise InputError(f"{folder}: exists; remove it, choose another folder, or give --replace")
     return folder
 
 

@@ -57,14 +57,15 @@ class TraceOptions(SpecularOptions):
         reflection: specular reflections.
         transmission: transmissions straight through surfaces (slabs of the material's thickness).
         diffraction: one diffraction at an edge.
-        scattering: diffuse reflection with ``scattering_coefficient`` at every surface.
+        scattering: diffuse reflection at surfaces whose materials scatter.
         depth: largest number of interactions per path, transmissions included.
         reflections: largest number of reflections among them, except in paths with scattering or diffraction; None:
             ``depth``.
         rays: number of rays from each source (best a power of two), or ``"auto"``: doubled until the paths of a sample
             of positions converge, see `wrf_mi.tracing.paths.solve.converged_rays`.
         seed: seed of the rays' directions.
-        scattering_coefficient: share of the reflected amplitude that is scattered, 0..1, if ``scattering`` is on.
+        scattering_coefficient: share of the reflected amplitude that every surface scatters, 0..1, if ``scattering`` is
+            on; None: that of each material.
         phase_error: standard deviation of the phase that each reflection adds, rad, for errors of a mesh and of its
             materials; spectra are then expectations (`wrf_mi.receivers.instruments.SpectrumInstrument`).
     """
@@ -76,18 +77,18 @@ class TraceOptions(SpecularOptions):
     reflections: int | None = None
     rays: int | Literal["auto"] = 1 << 17
     seed: int = 1
-    scattering_coefficient: float = 0.3
+    scattering_coefficient: float | None = None
     phase_error: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the settings; `InputError` for one that is out of range."""
-        is_auto, is_number = self.rays == "auto", isinstance(self.rays, int)
+        is_auto, is_number, share = self.rays == "auto", isinstance(self.rays, int), self.scattering_coefficient
         ranges = {
             "depth": (0 <= self.depth <= MAX_DEPTH, f"0 to {MAX_DEPTH}"),
             "reflections": (self.reflections is None or self.reflections >= 0, "0 or more"),
             "rays": (is_auto or (is_number and 1 <= int(self.rays) <= MAX_RAYS), f'1 to {MAX_RAYS}, or "auto"'),
             "seed": (self.seed >= 0, "0 or more"),
-            "scattering_coefficient": (0 < self.scattering_coefficient <= 1, "a number in (0, 1]"),
+            "scattering_coefficient": (share is None or 0 <= share <= 1, "a number in 0..1"),
             "phase_error": (0 <= self.phase_error < np.inf, "0 or more, rad"),
         }
         for name, (valid, text) in ranges.items():
@@ -127,7 +128,7 @@ def stated_kinds(text: str) -> dict[str, bool]:
 
 
 def without_effect(options: TraceOptions) -> dict[str, str]:
-    """Names of settings that differ from their defaults and change no path, with the reason."""
+    """Names of settings that change no path with the values of the others, with the reason."""
     interacts = any(getattr(options, kind) for kind in ("reflection", "transmission", *FURTHER))
     without_rays = not max(options.most_reflections, options.sampled)
     needs_rays = without_rays, "no reflection, diffraction or scattering is traced"
@@ -138,9 +139,8 @@ def without_effect(options: TraceOptions) -> dict[str, str]:
         "reflections": ((options.reflections or 0) > most, limit),
         "rays": needs_rays,
         "seed": needs_rays,
-        **dict.fromkeys(FURTHER, (options.depth == 0, "depth is 0")),
+        **{kind: (getattr(options, kind) and options.depth == 0, "depth is 0") for kind in FURTHER},
         "scattering_coefficient": (not options.scattering, "no scattering is traced"),
         "phase_error": needs_rays,
     }
-    idle = {name: reason for name, (is_idle, reason) in reasons.items() if is_idle}
-    return {name: reason for name, reason in idle.items() if getattr(options, name) != getattr(DEFAULTS, name)}
+    return {name: reason for name, (is_idle, reason) in reasons.items() if is_idle}

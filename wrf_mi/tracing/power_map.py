@@ -31,6 +31,7 @@ from .options import TraceOptions
 from .paths.scene_parameters import slabs_of_faces
 from .paths.solve import Prepared, trace_paths
 from .search.devices import solid_around
+from .sionna.scattering import scattering_of
 
 FOLDER, POWER = "powers", "power_dbm"
 PACKAGES = ("mitsuba", "drjit", "sionna-rt", "numpy")
@@ -102,6 +103,10 @@ class TracedPower:
         if not new.all():
             power[~new] = self.traced_dbm(position_m[~new])[receiver]
         return np.where(np.isnan(power), self.local(position_m, receiver), power)
+
+    def keeping(self) -> TracedPower:
+        """The power that keeps what it traces from now on; itself where it does."""
+        return self if self._keeps else TracedPower(self.local, self._trace, self._places, dict(self._known))
 
     def of_predictions(self, position_m: FloatArray) -> TracedPower:
         """The power for predictions, which keeps nothing but what is known at some positions [k, 3]."""
@@ -201,7 +206,8 @@ def traced_powers(
         folders = package / "tracing", package / "receivers"
         code = {str(file.relative_to(package)): file for folder in folders for file in folder.rglob("*.py")}
         versions = [importlib.metadata.version(name) for name in PACKAGES]
-        faces = prepared.surfaces.triangles, slab_of_face, slabs, float(scene.frequency[0])
+        scattering = list(map(scattering_of, scene.radio_materials.values()))
+        faces = prepared.surfaces.triangles, slab_of_face, slabs, scattering, float(scene.frequency[0])
         asked = tx_pos_m, receiver_arrays(receivers), asdict(options), tx_antenna
         path = user_cache() / FOLDER / f"{content_digest(code, versions, faces, asked)}.npz"
         if path.exists():

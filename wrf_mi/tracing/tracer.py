@@ -18,7 +18,7 @@ from ..core.types import FloatArray, IntArray
 from ..receivers import received_power
 from ..receivers.instruments import Instrument, SpectrumInstrument
 from .options import DEFAULTS, TraceOptions
-from .paths.result import TraceResult, recompute
+from .paths.result import TraceResult, recompute, recomputed_gains
 from .paths.solve import Prepared, spread, trace_paths
 from .sionna.scenes import open_scene
 
@@ -90,12 +90,11 @@ class RayTracer:
 
         # Paths do not depend on the carrier, and are searched for once; gains are those of each row's carrier.
         def gains(carrier_hz: float, which: IntArray) -> NDArray[Any]:
-            return recompute(traced.select(which), self._at(carrier_hz)).paths.gain
+            return recomputed_gains(traced.select(which), self._at(carrier_hz))
 
-        paths = traced.paths
-        if len(paths):
-            paths = replace(paths, gain=by_carrier(carriers_hz[paths.tx], gains))
-        return replace(traced, paths=paths, carriers_hz=carriers_hz)
+        if len(traced.paths):
+            traced = traced.with_gains(by_carrier(carriers_hz[traced.paths.tx], gains))
+        return replace(traced, carriers_hz=carriers_hz)
 
     def observe(self, traced: TraceResult) -> NDArray[Any]:
         """Observations of all receivers [n_rx, n, ...] for traced paths, each row at its carrier."""
@@ -105,7 +104,7 @@ class RayTracer:
         """Number of rays per search for positions [n, 3] (metres); with ``"auto"`` that which converges for them."""
         positions, receivers = self._prepared.placed(np.asarray(tx_pos_m, float), tuple(self.instrument.receivers))
         ends = positions, np.stack([receiver.position_m for receiver in receivers])
-        return self._prepared.rays(*(ends if self.options.diffraction else ends[::-1]), self.options)
+        return self._prepared.rays(*(ends if self.options.sampled else ends[::-1]), self.options)
 
     def __call__(self, tx_pos_m: ArrayLike) -> NDArray[Any]:
         """Observations of all receivers [n_rx, n, ...] for transmitter positions [n, 3] (metres)."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from typing import Annotated, Any, ClassVar, get_type_hints
 
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from ..core import InputError
+from ..core import InputError, Split
 from ..core.settings import NOT_NEGATIVE, CheckedSettings, Count, Inside, Positive, Share, ShareBelow1, with_settings
 from ..gaussians.network import unambiguous_scale
 from ..graph.receivers import AUTO
@@ -48,6 +48,18 @@ class LoopConfig(CheckedSettings):
     log_every: Count = 100  #: steps between two lines of the log
     validate_every: Count = 1000  #: steps between two scores on the validation rows
     optimiser: AdamConfig = field(default_factory=AdamConfig)  #: learning rates and running mean
+
+
+def validates(splits: Sequence[Split]) -> bool:
+    """Whether any of the splits keeps rows for validation."""
+    return any(len(split.validation) for split in splits)
+
+
+def unused_of_loop(config: LoopConfig, has_validation: bool) -> dict[str, str]:
+    """Settings of the training loop without an effect where no samples choose the state, and why."""
+    if not has_validation:
+        return dict.fromkeys(("holdout_steps_fraction", "patience"), "no training row is kept for validation")
+    return {} if config.holdout_steps_fraction else {"patience": "holdout_steps_fraction=0 leaves no validation rows"}
 
 
 _OPTIONAL = {name: kind for name, kind in get_type_hints(LoopConfig).items() if name != "optimiser"}

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -116,6 +115,8 @@ def check_memory(config: TrainConfig, field: Field) -> None:
     # The widest layer has its width of numbers for every pair; Dr.Jit's indices of 32 bits would wrap around unnoticed.
     if pairs * max(widths, default=numbers) > MOST_NUMBERS:
         raise InputError(f"{what}more numbers than an array of Dr.Jit holds; {remedy}")
+    import mitsuba as mi  # not above: commands import this module before they choose the backend
+
     # `require_memory` knows the machine's memory, not that of a GPU.
     if not (mi.variant() or "").startswith("cuda"):
         step = pairs * (BYTES_PER_NEURON * sum(widths) + BYTES_PER_PAIR)

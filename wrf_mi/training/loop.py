@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..backend.device import to_float, to_tensor
 from ..core.array_files import keyed, under
+from ..core.files import listed
 from ..gaussians.initial import DensityChange
 from .adam import NonFiniteReport, NumericsError, Schedule, watched_groups
 from .config import LoopConfig
@@ -169,6 +170,12 @@ class Progress:
     gaussians: int  # number of Gaussians; 0 without a field
     left_s: float  # estimated seconds to the end
     label: str = "SSIM"  # name of the score
+    validation_rows: int = 0  # number of rows that are scored; 0: not stated
+    # Median distance in metres of these and of the test rows from the nearest row that trains; None: unknown. Scores of
+    # rows near training rows say nothing of test rows in a region without any.
+    validation_m: float | None = None
+    test_m: float | None = None
+    far_score: float | None = None  # median over those at least as far as half of the test rows; None: there are none
 
 
 class TrainingLoop(ABC):
@@ -189,6 +196,10 @@ class TrainingLoop(ABC):
     @abstractmethod
     def validate(self) -> float:
         """Score of the running mean of the parameters on the validation rows; NaN without such rows."""
+
+    def validation_facts(self) -> dict[str, Any]:
+        """Fields of `Progress` on the rows that `validate` scored last; empty where they are not known."""
+        return {}
 
     @abstractmethod
     def record_functions(self) -> None:
@@ -280,7 +291,8 @@ class TrainingLoop(ABC):
         self.seconds = time.perf_counter() - self._origin_s
         left_s = (self.seconds - before_s) / steps * (self.config.steps - state.step)
         of_state = state.step <= self.schedule.joined, state.gaussians
-        return Progress(state.step, self.seconds, loss, score, *of_state, left_s, self.label)
+        facts = {} if score is None else self.validation_facts()
+        return Progress(state.step, self.seconds, loss, score, *of_state, left_s, self.label, **facts)
 
     def choose(self, score: float) -> bool:
         """Keep the best state; without improvement for ``patience`` scores go on from it. True: the fit went back."""
@@ -302,9 +314,9 @@ class TrainingLoop(ABC):
         groups = (self.state.params(), *self.state.moments()[:2])
         bad = {name for group in groups for name, values in group.items() if not np.isfinite(values).all()}
         if bad:
-            where = f"step {step or self.state.step}: parameters or their moments not finite: {', '.join(sorted(bad))}"
+            where = f"step {step or self.state.step}: parameters or their moments not finite: {listed(sorted(bad))}"
             raise NumericsError(f"{where}; go on from the last checkpoint with lower learning rates")
         if step:
             names = np.array(["loss", *watched_groups(self.state.adam)])[trouble.groups.numpy() > 0]
-            where = f"step {step}: not finite: {', '.join(names)}"
+            where = f"step {step}: not finite: {listed(names)}"
             raise NumericsError(f"{where}; the parameters are those before it; lower the learning rates")

@@ -38,6 +38,8 @@ class FitSession:
     run: Path | None = None  # the run folder, for files that all folds share
     on_progress: OnProgress = quiet  # progress callback
     stop: Callable[[], bool] = lambda: False  # stop condition, called wherever nothing would be lost
+    # folders that are removed once the fitted model is stored; an error before leaves them to a resumed fit
+    discarded: list[Path] = field(default_factory=list, kw_only=True)
     # the run folder that ``train --resume`` goes on with, where ``run`` is the folder of a part; None: ``run``
     root: Path | None = field(default=None, kw_only=True)
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..backend import init
 from ..core import Record, Split
@@ -87,6 +88,24 @@ class StageSelection:
         """Conditions of each port that are held out before or after a state is ``chosen``."""
         split = self.plan.choosing if self.plan.in_groups and not chosen else self.plan.split
         return [self.plan.targets.received(port, split.validation) for port in range(self.plan.targets.ports)]
+
+    def facts(self, chosen: bool) -> dict[str, Any]:
+        """Fields of `Progress` on the rows of `scores`, before or after a state is ``chosen``."""
+        plan, split = self.plan, self.plan.choosing if self.plan.in_groups and not chosen else self.plan.split
+        record, test = plan.record, plan.split.test
+        facts: dict[str, Any] = {"validation_rows": len(split.validation)}
+        if not record.has_positions or not len(split.validation):
+            return facts
+        trained = cKDTree(record.tx_pos_m[split.train])
+        by_port = plan.graph.corrects or plan.graph.scene is not None  # the order of `score`
+        scored = self._held_out(chosen) if by_port else [split.validation] * len(record.receivers)
+        away_m = trained.query(record.tx_pos_m[np.concatenate(scored)])[0]
+        facts["validation_m"] = float(np.median(away_m))
+        if not len(test):
+            return facts
+        facts["test_m"] = float(np.median(trained.query(record.tx_pos_m[test])[0]))
+        far = (away_m >= facts["test_m"]) & np.isfinite(self.scores)
+        return facts | ({"far_score": float(np.median(self.scores[far]))} if far.any() else {})
 
     def _reports(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[Any]:
         """Reports of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""
@@ -301,6 +320,10 @@ class Trainer(TrainingLoop):
     def validate(self) -> float:
         """Median score on the validation rows, all receivers pooled; NaN without such rows."""
         return self.selection.score(self.predictor(), self.state)
+
+    def validation_facts(self) -> dict[str, Any]:
+        """Number and distance of the rows that were scored, and the score of those as far as test rows."""
+        return self.selection.facts(bool(self.state.chosen))
 
     def choose(self, score: float) -> bool:
         """Early stopping (`TrainingLoop`), beside paths by `StageSelection.stage_score` and in the last stage alone."""

@@ -16,7 +16,7 @@ import psutil
 
 from ..core import InputError
 from ..core.array_files import stored_arrays
-from ..core.files import one_line, readable
+from ..core.files import listed, one_line, readable
 from ..core.memory import require_memory
 from ..maps.dataset import ZARR, require_packages
 from ..parallel import run_module
@@ -73,7 +73,7 @@ def map_content(dataset: Any, name: str) -> tuple[MapContent, list[str]]:
     receivers = tuple(map(str, dataset[RECEIVER].values)) if RECEIVER in dataset.coords else ()
     x_m, y_m, third = (np.asarray(dataset[axis], float) for axis in needed)
     z_m, height_m = (None, float(third)) if "height" in needed else (third, None)
-    notes = [f"Map {name}: {', '.join(skipped)} not shown, no numbers over {' and '.join(plane)}."] if skipped else []
+    notes = [f"Map {name}: {listed(skipped)} not shown, no numbers over {' and '.join(plane)}."] if skipped else []
     return MapContent(name, height_m, x_m, y_m, z_m, receivers, values, labels), notes
 
 

@@ -415,13 +415,16 @@
     margin: { l: 0, r: 0, t: 0, b: 0 }, showlegend: false, uirevision: "kept", hoverlabel: { align: "left" },
     scene: { aspectmode: "data", xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), camera: { eye: { x: 1.05, y: -1.55, z: 1.35 }, projection: { type: "perspective" } } },
   };
-  const FITTING_DIAGONAL = 2.2; // of a box that the camera above sees whole, in Plotly's unit
   const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["resetCameraLastSave3d"] };
+  const THINNEST = 0.05; // smallest edge of the box to its largest: Plotly's camera cannot see all of much thinner ones
+  const LABELS = 1.15; // room around the box for the labels of its axes
+  const frame = []; // two invisible points
   let pending = false;
 
   function drawNow() {
     pending = false;
-    const scene = Plotly.react("scene", layers.filter((layer) => layer.on).flatMap((layer) => layer.traces()), layout, config);
+    const shown = layers.filter((layer) => layer.on).flatMap((layer) => layer.traces());
+    const scene = Plotly.react("scene", [...shown, ...frame], layout, config);
     return Promise.all([scene, rows ? drawObservation() : null]);
   }
 
@@ -440,13 +443,17 @@
       input.value = place;
       input.dispatchEvent(new Event("input"));
     });
-    // Plotly's boxes have one volume: that of a flat scene, a map alone, is wider than a room's. Stand further back.
+    const ranges = ["x", "y", "z"].map((name) => scene._fullLayout.scene[`${name}axis`].range);
+    const thickness = THINNEST * Math.max(...ranges.map(([low, high]) => high - low));
+    const ends = [-thickness, thickness].map((by) => ranges.map(([low, high]) => (low + high + by) / 2));
+    frame.push({ type: "scatter3d", mode: "markers", ...xyz(ends.flat()), marker: { opacity: 0 }, hoverinfo: "skip" });
+    return drawNow();
+  }).then(([scene]) => {
+    // Plotly gives all boxes one volume, so that long and flat ones reach further out of a picture.
+    const eye = Object.values(layout.scene.camera.eye);
     const { x, y, z } = scene._fullLayout.scene.aspectratio;
-    const back = Math.hypot(x, y, z) / FITTING_DIAGONAL;
-    if (back > 1) {
-      const eye = layout.scene.camera.eye;
-      return Plotly.relayout(scene, { "scene.camera.eye": { x: back * eye.x, y: back * eye.y, z: back * eye.z } });
-    }
+    const scale = (LABELS * viewingDistance([x, y, z], eye, scene.clientWidth / scene.clientHeight)) / Math.hypot(...eye);
+    return Plotly.relayout(scene, { "scene.camera.eye": Object.fromEntries(eye.map((value, i) => ["xyz"[i], scale * value])) });
   }).then(() => {
     document.body.dataset.ready = "true";
   });

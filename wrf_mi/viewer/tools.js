@@ -39,6 +39,24 @@ function rotation(x, y, z, w) {
   ];
 }
 
+// Smallest distance from the middle of a box, of these lengths of edges, at which a perspective camera in a direction sees
+// all corners in a picture of this ratio of width to height. Plotly's cameras have 45 degrees from bottom to top.
+function viewingDistance(box, direction, ratio) {
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+  const unit = (a) => a.map((value) => value / Math.hypot(...a));
+  const towards = unit(direction);
+  const right = unit([-towards[1], towards[0], 0]);
+  const up = [-towards[2] * right[1], towards[2] * right[0], towards[0] * right[1] - towards[1] * right[0]];
+  const half = Math.tan(Math.PI / 8);
+  let distance = 0;
+  for (const a of [-0.5, 0.5]) for (const b of [-0.5, 0.5]) for (const c of [-0.5, 0.5]) {
+    const corner = [a * box[0], b * box[1], c * box[2]];
+    const across = Math.max(Math.abs(dot(corner, right)) / ratio, Math.abs(dot(corner, up))) / half;
+    distance = Math.max(distance, across + dot(corner, towards));
+  }
+  return distance;
+}
+
 // Icosahedron whose faces are divided once: 42 corners, 80 faces.
 function icosphere() {
   const t = (1 + Math.sqrt(5)) / 2;

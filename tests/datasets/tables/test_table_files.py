@@ -109,3 +109,53 @@ def test_missing_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(files, "import_module", absent)
     error_line(read_table, tmp_path / "t.csv", r"data import needs pandas: pip install '\.\[tables\]'")
     assert importlib.import_module("pandas") is pandas
+
+
+@pytest.mark.parametrize("lines", [1, 3])
+def test_lines_above_the_header_are_left_out(lines: int, tmp_path: Path) -> None:
+    preamble = ["Survey-1.6,appRelease=2.85,model=Phone", "made by hand", "site A, floor 3"][:lines]
+    (tmp_path / "t.csv").write_text("\n".join(preamble) + "\n" + TEXT)
+    table = read_table(tmp_path / "t.csv")
+    expected = pandas.DataFrame(ROWS, columns=NAMES)
+    pandas.testing.assert_frame_equal(table.frame, expected, check_dtype=False)
+    assert table.notes[0].endswith(f"{lines} lines above it are left out")
+
+
+def test_a_row_with_other_fields_is_no_preamble(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("1,2,-60,7\n" + "1,2,-60\n" * 5)
+    error_line(read_table, tmp_path / "t.csv", "3 fields, but the first line has 4")
+
+
+@pytest.mark.parametrize(("separator", "fields"), [("|", ["-65dBm", "-71 dBm"]), (",", ["-65 dBm", ""])])
+def test_units_of_all_fields_stand_in_the_name(separator: str, fields: list[str], tmp_path: Path) -> None:
+    rows = [separator.join(["x", "ap", "Strength", "Carrier", "Width"])]
+    rows += [
+        separator.join(["1.5", "a1", field, "2437MHz", width])
+        for field, width in zip(fields, ("20MHz", "3 m"), strict=True)
+    ]
+    (tmp_path / "t.csv").write_text("\n".join(rows) + "\n")
+    table = read_table(tmp_path / "t.csv")
+    assert list(table.frame.columns) == ["x", "ap", "Strength (dBm)", "Carrier (MHz)", "Width"]
+    np.testing.assert_array_equal(table.numbers("Strength (dBm)"), [-65, -71 if fields[1] else np.nan])
+    assert table.numbers("Carrier (MHz)").tolist() == [2437, 2437]
+
+
+def test_a_workbook_of_several_sheets_is_asked_for_one(tmp_path: Path) -> None:
+    frame = pandas.DataFrame(ROWS, columns=NAMES)
+    with pandas.ExcelWriter(tmp_path / "t.xlsx") as writer:
+        frame.to_excel(writer, sheet_name="walk 1", index=False)
+        frame[:2].to_excel(writer, sheet_name="walk 2", index=False)
+        pandas.DataFrame().to_excel(writer, sheet_name="empty", index=False)
+    assert len(read_table(tmp_path / "t.xlsx", "walk 2").frame) == 2
+    error_line(
+        read_table, tmp_path / "t.xlsx", r"several sheets \(walk 1 \(3 rows\), walk 2 \(2 rows\)\).*--sheet NAME"
+    )
+    error_line(read_table, tmp_path / "t.xlsx", "walk 3", "no sheet walk 3 with cells")
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"), [("survey.json", "x,y,bssid,rssi"), ("old.xls", "save it as"), ("a.pcap", "export")]
+)
+def test_other_formats_are_refused_with_their_conversion(name: str, remedy: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text('{"points": []}')
+    error_line(read_table, tmp_path / name, rf"{name}: \.\w+ is not read as a table; .*{remedy}")

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import contents, refused
-from traced_rooms import SHOEBOX, write_xml
+from traced_rooms import HEIGHT, SHOEBOX, WIDTH, write_xml
+from wrf_mi_scenes.build_laboratory import sheet
 
 import wrf_mi
 from wrf_mi.core import Receiver, Record, Split
@@ -139,6 +140,24 @@ def test_strengths_at_exact_positions_are_those_of_the_trace(scenes: dict[str, P
     run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["true"], split=split)
     assert json.loads((run.folder / "parts" / "paths" / "mean.json").read_text())["exact"]
     assert run.metrics["abs_error_db"]["median"] < CLEAR_DB
+    assert_restored(run, record)
+
+
+def test_strengths_at_exact_positions_without_a_path_are_restored(scenes: dict[str, Path], tmp_path: Path) -> None:
+    """A wall that nothing passes; each half of the room has a receiver."""
+    screen = {"screen": ("soak", sheet(0, 3.0, (0.0, WIDTH), (0.0, HEIGHT)))}
+    scene, record = write_xml(tmp_path / "halves", {**SHOEBOX, **screen}), measured(scenes, "rssi")[0]
+    stated, absorber = scene.read_text(), '"absorber-radio-material" id="mat-soak"'
+    scene.write_text(stated.replace('"diffuse" id="mat-soak"', absorber))
+    other = replace(record.receivers[0], name="rx1", position_m=np.array([0.8, 2.6, 1.1]))
+    record = replace(record, receivers=(*record.receivers, other), observation=np.repeat(record.observation, 2, axis=0))
+    paths = trace_paths(open_scene(scene, HZ), record.tx_pos_m, record.receivers, TRACE).paths
+    record = replace(record, observation=instrument_of(record).observe(paths).astype(np.float32))
+    assert 0.2 < np.isnan(record.observation).mean() < 0.8
+    rows = np.random.default_rng(0).permutation(60)
+    split = Split("both", 0, np.sort(rows[:40]), rows[:0], np.sort(rows[40:]))
+    run = wrf_mi.train(record, out=tmp_path / "run", scene=scene, split=split, settings=("stages=mean",))
+    assert json.loads((run.folder / "parts" / "paths" / "mean.json").read_text())["exact"]
     assert_restored(run, record)
 
 

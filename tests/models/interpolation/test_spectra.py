@@ -317,7 +317,10 @@ def test_arrays_on_a_line_and_too_many_rows_are_kriged_generically_with_a_warnin
     for data, reason in ((line, "retrieval: 9 elements on a line"), (record, "12 rows are too many")):
         if data is record:
             monkeypatch.setattr(spectra, "MOST_COVARIANCES", 9 * 11**2)
-        assert all(isinstance(kriged, UncertainKriged) for kriged in fit(data, np.arange(12)).models)
+        models = fit(data, np.arange(12), SpectrumKrigingSettings()).models
+        assert all(isinstance(kriged, UncertainKriged) for kriged in models)
+        with pytest.raises(InputError, match=f"setting directions: no effect, as .*{reason}.*; omit it"):
+            fit(data, np.arange(12), replace(SpectrumKrigingSettings(), directions=20))
         assert f"the spectra themselves are kriged: {reason}" in caplog.text
 
 

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 from changed_folders import needs
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.models.interpolation import strengths
-from wrf_mi.models.interpolation.strength_fit import PooledProcess, ReceiverObservations, folds, shift_of, widening
+from wrf_mi.models.interpolation.pooled_process import PooledProcess, ReceiverObservations
+from wrf_mi.models.interpolation.strength_fit import folds, shift_of, widening
 from wrf_mi.models.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
 from wrf_mi.models.interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from wrf_mi.models.model import Inputs
@@ -106,6 +108,25 @@ def test_reweighting_is_robust_to_outliers() -> None:
     )
     assert plain == pytest.approx(40 / 21, rel=0.02)
     assert abs(robust) < 0.3
+
+
+def test_predictions_and_refits_use_one_blas_thread(
+    turning: tuple[Record, Strengths], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Threads that wait for each other by spinning took a hundred times as long where another process was busy."""
+    record, fitted = turning
+    counts: list[int] = []
+    solve = np.linalg.solve
+
+    def counted(*matrices: np.ndarray) -> np.ndarray:
+        counts.extend(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+        return solve(*matrices)
+
+    monkeypatch.setattr(np.linalg, "solve", counted)
+    with threadpool_limits(2, "blas"):
+        fitted.refit(record, np.arange(20)).predict(Inputs(record.tx_pos_m[:5]), 0)
+    assert counts
+    assert set(counts) == {1}
 
 
 def test_rows_of_a_stop_are_joined_and_weigh_by_their_precision() -> None:
@@ -208,7 +229,7 @@ def test_search_lowers_the_held_out_error() -> None:
     record = made(120, noise_db=1.0, body_db=3.0)
     wrong = replace(DEFAULTS, shadow_db=12.0, shadow_m=0.2)
     settings = wrong, replace(wrong, search_rows=50)
-    before, after = (fit_strengths(record, np.arange(120), None, one).facts()["fitted"] for one in settings)
+    before, after = (fit_strengths(record, np.arange(120), None, one, stated=()).facts()["fitted"] for one in settings)
     assert after["held_out_db"] < before["held_out_db"] - 0.1
     assert after["shadow_db"] < 12
 

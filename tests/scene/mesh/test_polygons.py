@@ -1,9 +1,11 @@
 """Faces of OBJ and PLY with more than three corners, and the many ways to write them."""
 
+import json
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -314,3 +316,52 @@ def test_damaged_ply_is_refused_in_one_line(old, new, message, tmp_path):
     content = ply("ascii", MIXED)
     assert old in content
     refused(tmp_path, "bad.ply", content.replace(old, new), message)
+
+
+def changed_glb(file: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """A box as GLB whose description is changed."""
+    content = trimesh.creation.box((4, 3, 2.5)).export(file_type="glb")
+    length = int.from_bytes(content[12:16], "little")
+    facts = json.loads(content[20 : 20 + length])
+    change(facts)
+    text = json.dumps(facts).encode()
+    text += b" " * (-len(text) % 4)
+    body = len(text).to_bytes(4, "little") + content[16:20] + text + content[20 + length :]
+    file.write_bytes(content[:8] + (12 + len(body)).to_bytes(4, "little") + body)
+    return file
+
+
+INSTANCES = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {}}}}
+GLB_FAULTS = {
+    "instances": (lambda f: f["nodes"][-1].update(INSTANCES), "needs the extension EXT_mesh_gpu_instancing"),
+    "required": (lambda f: f.update(extensionsRequired=["ACME_shape"]), "needs the extension ACME_shape"),
+    "draco": (
+        lambda f: f["meshes"][0]["primitives"][0].update(extensions={"KHR_draco_mesh_compression": {}}),
+        "needs the extension KHR_draco_mesh_compression",
+    ),
+    "meshopt": (
+        lambda f: f["bufferViews"][0].update(extensions={"EXT_meshopt_compression": {}}),
+        "needs the extension EXT_meshopt_compression",
+    ),
+    "sparse": (lambda f: f["accessors"][0].update(sparse={"count": 1}), "has sparse accessors"),
+    "normalised": (
+        lambda f: f["accessors"][f["meshes"][0]["primitives"][0]["attributes"]["POSITION"]].update(normalized=True),
+        "has positions in normalised integers",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", GLB_FAULTS)
+def test_glb_whose_geometry_is_not_read_is_refused_by_name(case: str, tmp_path: Path) -> None:
+    change, message = GLB_FAULTS[case]
+    with pytest.raises(InputError, match=rf"box\.glb: .*{message}; export it without"):
+        mesh_parts(changed_glb(tmp_path / "box.glb", change))
+
+
+def test_extensions_beside_the_geometry_are_left_out(tmp_path: Path) -> None:
+    def change(facts: dict[str, Any]) -> None:
+        facts.update(extensionsUsed=["KHR_materials_unlit", "ACME_sound"], extensions={"ACME_sound": {}})
+        facts.update(extensionsRequired=["KHR_materials_unlit"])
+
+    (part,) = mesh_parts(changed_glb(tmp_path / "box.glb", change))
+    assert part.area == pytest.approx(2 * (4 * 3 + 4 * 2.5 + 3 * 2.5))

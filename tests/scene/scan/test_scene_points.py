@@ -44,6 +44,8 @@ def test_text_with_spaces_commas_comments_and_further_columns(text, tmp_path):
 
 NAMED_COLUMNS = (
     *("//X Y Z\n1 2 3\n", "//X,Y,Z\n1,2,3\n", "# made by, hand\n1 2 3\n", "1;2;3;0,5\n", "x y z i\n1 2 3 9\n"),
+    *("# class x y z\n11 1 2 3\n", "//R G B X Y Z\n9 8 7 1 2 3\n", "# fields: i, X[m], Y[m], Z[m]\n7,1,2,3\n"),
+    *("# x, y and z in metres\n1 2 3\n", "#t;Z(m);X(m);Y(m)\n0;3,0;1,0;2,0\n", "# class x y z in metres\n5 1 2 3\n"),
     *('"X","Y","Z"\n1,2,3\n', "time;Z;X;Y\n0;3,0;1,0;2,0\n", "\ufeffx\ty\tz\n1\t2\t3\n"),
 )
 
@@ -58,7 +60,7 @@ def test_units_scale_the_coordinates_and_las_keeps_millimetres_of_a_national_gri
     np.savez(tmp_path / "cloud.npz", xyz_m=POINTS)
     for units, factor in (("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("ft", 0.3048)):
         np.testing.assert_allclose(read_points(tmp_path / "cloud.npz", units), POINTS * factor, rtol=1e-15)
-    with pytest.raises(InputError, match=r"units 'inch': not known; give one of m, cm, mm, ft"):
+    with pytest.raises(InputError, match=r"units 'inch': not known; give one of m, dm, cm, mm, ft, in"):
         read_points(tmp_path / "cloud.npz", "inch")
     for name in ("cloud.las", "cloud.laz"):
         write_las(tmp_path / name, FAR, 1e-3)

@@ -10,8 +10,8 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from ...core import DataFault, InputError
-from ...core.files import one_line
-from ..unknown import STRENGTH, listed, long_columns, name_words
+from ...core.files import listed, one_line
+from ..unknown import SENT, STRENGTH, long_columns, name_words, preferred
 from .files import Table
 
 AFFIXES = ("", "coord", "coordinate", "pos", "position", "loc", "location", "point", "p", "gt", "true", "tag")
@@ -19,24 +19,38 @@ AFFIXES = ("", "coord", "coordinate", "pos", "position", "loc", "location", "poi
 AXES = {"x": "|easting|east|ecoord", "y": "|northing|north|ncoord", "z": "|height"}
 NAMES = {
     **{axis: "|".join(f"{affix}{axis}|{axis}{affix}" for affix in AFFIXES) + other for axis, other in AXES.items()},
-    "lat": "lat|latitude|gpslat|gpslatitude",
-    "lon": "lon|lng|long|longitude|gpslon|gpslongitude",
+    "lat": "lat|latitude|gpslat|gpslatitude|currentlatitude",
+    "lon": "lon|lng|long|longitude|gpslon|gpslongitude|currentlongitude",
     "floor": "floor|floorid|floornumber|storey|level",
     "heading": "heading|yaw|orientation|bearing|azimuth|course|compass",
-    "time": "time|timestamp|ts|datetime|date|rxtime|unixtime|epoch|t",
+    "time": "time|timestamp|ts|datetime|date|rxtime|unixtime|epoch|t|firstseen",
     "run": "run|session|visit|campaign|trajectory|track|walk",
     "split": "split|subset",
-    "frequency": "frequency|freq|carrier|carrierfrequency|centerfreq|centrefrequency",
+    "frequency": "frequency|freq|carrier|carrierfrequency|primaryfrequency|centerfreq|centrefrequency|centerfrequency",
 }
 """Names of columns, in small letters without units, blanks and marks."""
 MEANINGS = (*NAMES, "id", "rssi", "cell")
-QUANTITIES = ("rtt", "range", "distance", "dist", "tof", "rsrq", "snr", "sinr", "std", "count", "variance", "noise")
+QUANTITIES = (
+    "rtt",
+    "range",
+    "distance",
+    "dist",
+    "tof",
+    "rsrq",
+    "snr",
+    "sinr",
+    "std",
+    "count",
+    "variance",
+    "noise",
+    "quality",
+)
 """Words of columns that hold another quantity of a receiver; the first five are a length or a time."""
 RANGES = QUANTITIES[:4]
 METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048, "inch": 0.0254}
 HERTZ = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
-UNITS = (*METRES, *HERTZ, "deg", "degrees", "rad", "dbm", "mw", "s", "ms")
-MARKED_UNIT = re.compile(r"[(\[]\s*([A-Za-z]+)\s*[)\]]|[_ ]([A-Za-z]+)$")
+UNITS = (*METRES, *HERTZ, "deg", "degrees", "rad", "dbm", "mw", "s", "ms", "%")
+MARKED_UNIT = re.compile(r"[(\[]\s*([A-Za-z]+|%)\s*[)\]]|[_ ]([A-Za-z]+|%)$")
 NEVER_STRENGTHS = frozenset({0.0, 1.0, 100.0, 127.0})
 """Numbers above or at 0 dBm that columns of strengths hold where nothing was heard."""
 LOWEST_DBM = -150.0
@@ -93,6 +107,9 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
         InputError: no such column, or none that can be strengths.
     """
     names = list(table.frame.columns)
+    # A unit that all fields of a column have stands in its name, where whoever states the column does not know of it.
+    with_unit = {MARKED_UNIT.sub("", name).strip(): name for name in names if unit_of(name)}
+    stated = {meaning: name if name in names else with_unit.get(name, name) for meaning, name in stated.items()}
     if lacking := set(stated.values()) - {*names, "-"}:
         text = f"no column {one_line(min(lacking))} (columns: {shown_names(names)})"
         raise DataFault(table.files[0][0], f"{text}; correct --columns", line=1)
@@ -109,7 +126,7 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
 
 def shown_names(names: Sequence[str]) -> str:
     """The first names of columns, for a message."""
-    return one_line(listed(names, 12))
+    return one_line(listed(names))
 
 
 def named_columns(names: Sequence[str], stated: Mapping[str, str]) -> dict[str, str]:
@@ -144,13 +161,24 @@ def _is_free(name: str, of: Mapping[str, str]) -> bool:
 def _wide_columns(table: Table, names: Sequence[str], patterns: Sequence[str]) -> list[str]:
     """Columns of strengths: those of patterns, with words such as RSSI, or with values in dBm."""
     matching = [name for name in table.frame.columns if _in_pattern(name, patterns)]
-    named = [name for name in names if name_words(name) & STRENGTH and not name_words(name) & set(QUANTITIES)]
-    chosen = matching if patterns else named or _by_values(table, names)
+    named = [name for name in names if name_words(name) & STRENGTH and not name_words(name) & {*QUANTITIES, *SENT}]
+    chosen = matching if patterns else _one_quantity(named) or _by_values(table, names)
     if not chosen:
         text = f"no column of signal strengths among {shown_names(list(table.frame.columns))}"
         remedy = "name it by --columns rssi=...,id=... or by --receivers 'PATTERN*'"
         raise DataFault(table.files[0][0], f"{text}; {remedy}", line=1)
     return chosen
+
+
+def _one_quantity(names: list[str]) -> list[str]:
+    """Columns of one quantity where receivers have several: RSRP and RSSI of a cell are not two receivers."""
+    by_receiver: dict[str, list[str]] = {}
+    for name in names:
+        by_receiver.setdefault(_words_beside(name), []).append(name)
+    if all(len(columns) == 1 for columns in by_receiver.values()):
+        return names
+    first = {preferred(columns)[0] for columns in by_receiver.values()}
+    return [name for name in names if name in first]
 
 
 def _sort_others(table: Table, columns: Columns) -> None:
@@ -208,10 +236,14 @@ def _receiver_ids(names: Sequence[str]) -> list[str]:
 
 def _receiver_id(name: str) -> str:
     """What a column's name has beside the quantity and its unit; the name where nothing is left."""
+    return _words_beside(name) or name.strip()
+
+
+def _words_beside(name: str) -> str:
     words = "|".join({*STRENGTH, *QUANTITIES})
     short = re.sub(r"\(.*?\)|\[.*?\]", " ", name)
     short = re.sub(rf"(?<![a-z])(?:{words})(?![a-z])", " ", short, flags=re.IGNORECASE)
-    return re.sub(r"\s+", " ", short).strip(" _.-:") or name.strip()
+    return re.sub(r"\s+", " ", short).strip(" _.-:")
 
 
 def described(table: Table, columns: Columns, units: Mapping[str, str]) -> list[str]:

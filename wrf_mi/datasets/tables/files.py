@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
-from ...core.files import one_line, readable
+from ...core.files import listed, one_line, readable
 from ..folder_files import SINGLE_MAX
 from ..receivers_file import plain_id
 
@@ -31,6 +31,24 @@ EMPTY = ("-", "--", "?")  # fields that are empty beside those that pandas knows
 FRACTION = re.compile(r"[+-]?\d*\.\d+(?:[eE][+-]?\d+)?|[+-]?\d+\.")
 COMMA_FRACTION = re.compile(r"[+-]?\d+,\d+")
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|nan", re.IGNORECASE)
+FIELD_UNIT = re.compile(r"([+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?)\s*([a-zA-Z]{1,7}|%)")
+"""A number with its unit, as in ``-65dBm``, ``2437 MHz`` and ``85%``."""
+MOST_PREAMBLE = 20  # lines above the header that name the program, the device or the survey
+CONVERSIONS = {
+    ".json": "write its points as a table with a row for each reading: x,y,bssid,rssi",
+    ".geojson": "write its points as a table with a row for each reading: lon,lat,bssid,rssi",
+    ".kml": "write its points as a table with a row for each reading: lon,lat,bssid,rssi",
+    ".kmz": "write its points as a table with a row for each reading: lon,lat,bssid,rssi",
+    ".gpx": "write its track as a table time,lat,lon and give it by --positions",
+    ".xls": "save it as .xlsx or .csv",
+    ".xlsb": "save it as .xlsx or .csv",
+    ".ods": "save it as .xlsx or .csv",
+    ".numbers": "save it as .xlsx or .csv",
+    **dict.fromkeys((".sqlite", ".db"), "export its table of readings as .csv"),
+    **dict.fromkeys((".pcap", ".pcapng", ".cap"), "export time, address and strength of each frame as .csv"),
+    **dict.fromkeys((".zip", ".gz", ".7z"), "unpack it"),
+}
+"""How files of other formats become a table, by their ending."""
 
 
 def package(name: str) -> Any:
@@ -100,26 +118,67 @@ class Table:
         return True
 
 
-def read_table(path: str | Path) -> Table:
+def read_table(path: str | Path, sheet: str = "") -> Table:
     """Read a table by its ending: ``.parquet``, ``.xlsx``, or else text.
 
+    Numbers that all have one unit in their fields, such as ``-65dBm``, are read with that unit in the column's name.
+
+    Args:
+        path: the file.
+        sheet: name of the sheet of a workbook; "": its only one with cells.
+
     Raises:
-        InputError: missing or damaged file, rows with more or fewer fields than the first, a column named twice, or
-            more fields than `MOST_FIELDS`.
+        InputError: missing or damaged file, another format, a workbook of several sheets without ``sheet``, rows with
+            more or fewer fields than the first, a column named twice, or more fields than `MOST_FIELDS`.
     """
     path, pandas = Path(path), package("pandas")
-    readers = {".parquet": ("pyarrow", "read_parquet"), ".xlsx": ("openpyxl", "read_excel")}
-    if path.suffix.lower() not in readers:
-        return _read_text(path)
-    engine, reader = readers[path.suffix.lower()]
-    package(engine)
     missing = DataFault(path, "missing; give a file that exists")
-    with readable(path, missing, f"give a file in the format of {path.suffix}"):
-        frame = getattr(pandas, reader)(path, engine=engine)
+    suffix = path.suffix.lower()
+    if remedy := CONVERSIONS.get(suffix):
+        raise DataFault(path, f"{suffix} is not read as a table; {remedy}")
+    if suffix == ".parquet":
+        package("pyarrow")
+        with readable(path, missing, "give a file in the format of .parquet"):
+            frame, note = pandas.read_parquet(path, engine="pyarrow"), ""
+    elif suffix == ".xlsx":
+        package("openpyxl")
+        with readable(path, missing, "give a file in the format of .xlsx"):
+            sheets = pandas.read_excel(path, sheet_name=None, engine="openpyxl")
+        name = _chosen_sheet(path, {name: len(frame) for name, frame in sheets.items() if frame.size}, sheet)
+        frame, note = sheets[name], f", sheet {one_line(name)}" * (len(sheets) > 1)
+    else:
+        return _read_text(path)
     frame.columns = [str(name).strip() for name in frame.columns]
     _check_names(path, list(frame.columns))
     _check_size(path, len(frame), frame.shape[1])
-    return Table(frame, ((path, len(frame)),), (f"{path.name}: {len(frame)} rows",))
+    return Table(_with_units(frame), ((path, len(frame)),), (f"{path.name}: {len(frame)} rows{note}",))
+
+
+def _chosen_sheet(path: Path, rows: dict[str, int], sheet: str) -> str:
+    """The sheet that is asked for, or the only one with cells, of those with their number of rows."""
+    if sheet in rows or (not sheet and len(rows) == 1):
+        return sheet or next(iter(rows))
+    named = listed([f"{one_line(name)} ({count} rows)" for name, count in rows.items()])
+    what = f"no sheet {one_line(sheet)} with cells" if sheet else "several sheets"
+    raise DataFault(path, f"{what} ({named}); choose one by --sheet NAME")
+
+
+def _with_units(frame: Frame) -> Frame:
+    """Columns of numbers that all have one unit in their fields as numbers, the unit in their names."""
+    names = {}
+    for name in frame.columns:
+        if frame[name].dtype.kind in "biufM" or not frame[name].notna().any():
+            continue
+        texts = frame[name].dropna().astype(str).str.strip()
+        if FIELD_UNIT.fullmatch(texts.iloc[0]) is None:
+            continue
+        parts = texts.str.extract(f"^{FIELD_UNIT.pattern}$")
+        if parts[1].nunique() == 1 and parts[1].notna().all():
+            numbers = package("pandas").to_numeric(parts[0].str.replace(",", "."))
+            frame = frame.assign(**{name: numbers.reindex(frame.index)})
+            unit = parts[1].iloc[0]
+            names[name] = name if unit.lower() in name.lower() else f"{name} ({unit})"
+    return frame.rename(columns=names)
 
 
 def joined(tables: list[Table]) -> Table:
@@ -150,14 +209,23 @@ def _check_size(path: Path, rows: int, columns: int) -> None:
 
 @dataclass
 class _Lines:
-    """A text file: numbers of its lines without a row, its first rows, the comment above them, and its length."""
+    """A text file: numbers of its lines without a row, its first rows, the comment above them, and its length.
+
+    ``numbers`` are those of the first rows' lines, ``preamble`` those of lines above the header.
+    """
 
     encoding: str
+    numbers: list[int] = field(default_factory=list)
+    preamble: list[int] = field(default_factory=list)
     skipped: list[int] = field(default_factory=list)
     sample: list[str] = field(default_factory=list)
     comment: str = ""
-    first: int = 0
     count: int = 0
+
+    @property
+    def first(self) -> int:
+        """Number of the line of the first row."""
+        return self.numbers[0]
 
 
 def _read_text(path: Path) -> Table:
@@ -166,13 +234,14 @@ def _read_text(path: Path) -> Table:
         lines = _scan(path)
     if not lines.sample:
         raise DataFault(path, "empty; give a row per measurement")
-    separator = _separator(lines.sample)
+    separator = _without_preamble(lines)
     rows = [_fields(line, separator) for line in lines.sample]
     decimal = _decimal_mark(rows)
     has_header, named = _header(lines, rows[0], separator, decimal)
     names = [name.strip() or f"column_{number + 1}" for number, name in enumerate(named)]
     _check_names(path, names)
-    skipped = [*lines.skipped, lines.first] if has_header == "in its first line" else lines.skipped
+    skipped = [*lines.skipped, *lines.preamble]
+    skipped += [lines.first] if has_header == "in its first line" else []
     _check_size(path, lines.count - len(skipped), len(names))
     _check_widths(path, lines, separator, len(names))
     with readable(path, missing, "correct the line"):
@@ -185,7 +254,9 @@ def _read_text(path: Path) -> Table:
     form = f"separated by {SEPARATORS.get(separator, 'blanks')}" + ", decimal comma" * (decimal == ",")
     form += f", encoding {lines.encoding}" * (lines.encoding != "utf-8-sig")
     note = f"{path.name}: {len(frame)} rows, {form}, header {has_header or 'absent'}"
-    return Table(frame, ((path, len(frame)),), (note,), bool(has_header))
+    if lines.preamble:
+        note += f"; {len(lines.preamble)} lines above it are left out"
+    return Table(_with_units(frame), ((path, len(frame)),), (note,), bool(has_header))
 
 
 def _header(lines: _Lines, first: list[str], separator: str, decimal: str) -> tuple[str, list[str]]:
@@ -219,7 +290,7 @@ def _scan_as(path: Path, encoding: str) -> _Lines:
                 lines.skipped.append(number)
                 lines.comment = text if text and not lines.sample else lines.comment
             elif len(lines.sample) < SAMPLE:
-                lines.first = lines.first if lines.sample else number
+                lines.numbers.append(number)
                 lines.sample.append(line.rstrip("\n"))
             lines.count = number + 1
     return lines
@@ -229,7 +300,7 @@ def _check_widths(path: Path, lines: _Lines, separator: str, columns: int) -> No
     """Refuse a line with more or fewer fields than the first: pandas fills missing fields silently."""
     if separator == SPACES:
         return
-    skipped = set(lines.skipped)
+    skipped = {*lines.skipped, *lines.preamble}
     with path.open(encoding=lines.encoding) as stream:
         for number, line in enumerate(stream):
             fields = line.count(separator) + 1
@@ -244,16 +315,34 @@ def _fields(line: str, separator: str) -> list[str]:
     return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
 
 
-def _separator(sample: list[str]) -> str:
-    """The first separator with the same number of fields in all lines, or else that of most fields."""
+def _without_preamble(lines: _Lines) -> str:
+    """The separator of a file; lines above its header, which have other numbers of fields, leave the sample."""
+    separator = _separator(lines.sample)
+    for first in range(1, min(MOST_PREAMBLE, len(lines.sample) - 2) + 1):
+        if separator[1]:
+            break
+        after = _separator(lines.sample[first:])
+        fields = _fields(lines.sample[first], after[0])
+        if after[1] and not _is_row(fields, "."):  # where a row begins the rest, a row before it is damaged
+            lines.preamble, lines.numbers, lines.sample = (
+                lines.numbers[:first],
+                lines.numbers[first:],
+                lines.sample[first:],
+            )
+            separator = after
+    return separator[0]
+
+
+def _separator(sample: list[str]) -> tuple[str, bool]:
+    """The first separator with the same number of fields in all lines, or else that of most fields; and which."""
     most = ("", 1)
     for separator in (*SEPARATORS, SPACES):
         counts = {len(_fields(line, separator)) for line in sample}
         if len(counts) == 1 and counts != {1}:
-            return separator
+            return separator, True
         if separator != SPACES and min(counts) > most[1]:
             most = separator, min(counts)
-    return most[0] or ","
+    return most[0] or ",", False
 
 
 def _decimal_mark(rows: list[list[str]]) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import io
-import textwrap
+import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from ...core import DataFault, InputError, Receiver, Record
 from ...core.angles import FloatArray
-from ...core.files import one_line
+from ...core.files import listed, one_line
 from ...core.types import IntArray
 from ..ble_folder import CARRIER_HZ, write_ble_folder
-from ..unknown import listed
+from ..unknown import SENT, name_words
 from .columns import HERTZ, described, find_columns, parsed_columns, unit_of
 from .files import Table, joined, read_table
 from .options import ImportOptions, option_name
+from .picture import plan_picture
 from .places import (
     POSITION_DIGITS,
     LocalFrame,
@@ -40,6 +41,7 @@ from .readings import (
     Means,
     Readings,
     chosen,
+    file_offsets,
     further_columns,
     mean_strengths,
     merged,
@@ -48,12 +50,15 @@ from .readings import (
     without_not_heard,
 )
 from .receivers_table import read_receivers
+from .slots import without_slots
 
 FACTS, PICTURE = "import.yml", "plan.png"  # files beside the tables: what the import assumed, and a plan of the rows
 MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
 MOST_CELLS = 50_000_000  # largest number of receivers times places: 2 GB while means are computed
 TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
-MOST_NAMED = 9  # receivers with a colour of their own in the plan; the others are grey
+RADIOS = frozenset({"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "umts", "tdscdma", "lte", "nr", "5g"})
+"""Values of a column of kinds of radio, in small letters."""
+SENT_IN_NAME = re.compile(r"(?<![\d.])(-?\d+(?:\.\d+)?)[ _]?dbm", re.IGNORECASE)
 STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
 
 
@@ -129,15 +134,18 @@ class _Import:
     def run(self, replace: bool) -> ImportReport:
         """Read, average and write."""
         self._check_idle()
+        self._check_strengths()
         frame, xyz_m = self._positions()
         readings, notes, not_heard = without_not_heard(read_readings(self.table, self.columns), self.options.not_heard)
         self.notes += notes
         if not len(readings.dbm):
             raise DataFault(self.table.files[0][0], "no reading was heard; correct --columns or --not-heard")
+        self._check_sent(readings)
         conditions = self._conditions(readings)
         keys = {"z": xyz_m[:, 2], **conditions, "part": self.is_test}
         place = place_numbers(keys, xyz_m[:, :2], self.options.place_m)
         count = np.bincount(place)
+        self.notes += file_offsets(readings, place, self._file, [path.name for path, _ in self.table.files])
         first = np.unique(place, return_index=True)[1]
         readings, means = self._means(readings, place, len(count))
         position_m = np.column_stack([np.bincount(place, axis) / count for axis in xyz_m.T]).round(POSITION_DIGITS)
@@ -154,7 +162,7 @@ class _Import:
         self.facts |= {"columns": lines, "frame": frame.facts(), "not_heard_dbm": not_heard, "notes": self.notes}
         extra: dict[str, str | bytes] = {
             FACTS: yaml.safe_dump(self.facts, sort_keys=False, allow_unicode=True, width=120),
-            PICTURE: _plan_picture(record),
+            PICTURE: plan_picture(record),
         }
         write_ble_folder(self.out, record, replace, extra, further)
         return ImportReport(self.out, record, tuple(lines), tuple(self.notes))
@@ -163,7 +171,7 @@ class _Import:
         """All rows with their positions, and which of them test."""
         options = self.options
         paths = [*files, *options.test]
-        tables, positions = [read_table(path) for path in paths], [read_table(path) for path in options.positions]
+        tables, positions = ([read_table(path, options.sheet) for path in part] for part in (paths, options.positions))
         if len(positions) not in (0, 1, len(paths)):
             text = f"{len(positions)} files of positions for {len(paths)} tables"
             raise InputError(f"--positions: {text}; give one for each table, those of --test last, or one for all")
@@ -172,14 +180,16 @@ class _Import:
             pairs = [with_positions(*pair, self.stated) for pair in zip(tables, positions, strict=True)]
             tables = [table for table, _ in pairs]
             self.notes.append(f"positions of {options.positions[0]} are matched {pairs[0][1]}")
-        is_test = np.repeat(np.arange(len(paths)) >= len(files), list(map(len, tables)))
+        tables = [without_slots(table) for table in tables]
+        self._file = np.repeat(np.arange(len(paths)), list(map(len, tables)))
         table = joined(tables)
         for name, text in options.where.items():
             chosen_rows = table.where(name, text)
             left_out = len(table) - np.count_nonzero(chosen_rows)
             self.notes.append(f"{left_out} rows are left out: their {one_line(name)} is not {one_line(text)}")
-            table, is_test = dataclasses.replace(table, frame=table.frame[chosen_rows]), is_test[chosen_rows]
-        return table, is_test
+            table = dataclasses.replace(table, frame=table.frame[chosen_rows])
+            self._file = self._file[chosen_rows]
+        return table, self._file >= len(files)
 
     def _check_idle(self) -> None:
         """Refuse options of quantities that the tables state, or do not have."""
@@ -215,11 +225,55 @@ class _Import:
         if "z" in of:
             self.units["z"] = self.columns.unit("z") or options.units.replace("deg", "m") or "m"
             return finite_columns(table, [of["z"]])[:, 0] * unit_scale(self.units["z"], "--units")
+        height_m = self._stated_heights_m()[self._file]
         if "floor" in of:
-            self.notes.append(f"z is {options.height_m:g} m above the floor, storeys are {options.storey_m:g} m high")
-            return options.height_m + options.storey_m * floor_numbers(table, of["floor"])
-        self.notes.append(f"no column z: all rows are {options.height_m:g} m above the floor (--height)")
-        return np.full(len(table), options.height_m)
+            floors = floor_numbers(table, of["floor"])
+            names = dict(zip(table.frame[of["floor"]].astype(str), floors * options.storey_m, strict=True))
+            shown = listed(
+                [f"{one_line(name)} at {z:g} m" for name, z in sorted(names.items(), key=lambda item: item[1])]
+            )
+            self.notes.append(f"floors by names and storeys of {options.storey_m:g} m (--storey): {shown}")
+            return height_m + options.storey_m * floors
+        heights_m = np.unique(height_m)
+        text = "all rows are" if len(heights_m) == 1 else "rows are"
+        self.notes.append(f"no column z: {text} {listed([f'{z:g}' for z in heights_m])} m above the floor (--height)")
+        return height_m
+
+    def _stated_heights_m(self) -> FloatArray:
+        """Height above the floor of the rows of each table."""
+        count, stated = int(self._file.max()) + 1, np.atleast_1d(np.asarray(self.options.height_m, float))
+        if len(stated) not in (1, count):
+            raise InputError(f"--height: {len(stated)} heights for {count} tables; give one for each, or one for all")
+        return np.broadcast_to(stated, count)
+
+    def _check_strengths(self) -> None:
+        """Refuse strengths in per cent, whose scale is that of each program."""
+        of = self.columns.of
+        names = [of["rssi"]] if "rssi" in of and not self.columns.strengths else list(self.columns.strengths)
+        for name in names:
+            if unit_of(name) == "%" or name_words(name) & {"quality", "percent"}:
+                text = f"{one_line(name)} is in per cent; give dBm (in Windows dBm = quality / 2 - 100)"
+                raise DataFault(self.table.files[0][0], f"{text}, or name another column by --columns rssi=...")
+
+    def _check_sent(self, readings: Readings) -> None:
+        """Refuse strengths of one receiver at several powers that were sent, or several kinds of radio."""
+        frame = self.table.frame
+        for name in frame.columns:
+            words, stated = name_words(name), frame[name].notna().to_numpy()[readings.row]
+            values = frame[name].iloc[readings.row[stated]].astype(str).str.strip()
+            if words & SENT and self.table.is_numeric(name):
+                several = values.groupby(readings.receiver[stated]).nunique().max() > 1
+            else:
+                several = values.nunique() > 1 and set(values.str.lower()) <= RADIOS
+            if several:
+                counts = listed([f"{one_line(text)} ({rows})" for text, rows in values.value_counts().items()])
+                text = f"{one_line(name)} is {counts}: these are not pooled"
+                remedy = f"choose one by --where {shlex.quote(f'{name}={values.value_counts().index[0]}')}"
+                raise DataFault(self.table.files[0][0], f"{text}; {remedy}")
+        powers = {match[1] for path, _ in self.table.files if (match := SENT_IN_NAME.search(path.stem))}
+        if len(powers) > 1:
+            text = f"files at {', '.join(sorted(powers, key=float))} dBm sent, by their names, are not pooled"
+            raise InputError(f"{self.table.files[0][0].parent}: {text}; import each into a folder of its own")
 
     def _conditions(self, readings: Readings) -> dict[str, Any]:
         """Heading, carrier and run of each row where stated; rows that differ in them are not averaged."""
@@ -257,8 +311,8 @@ class _Import:
         means = mean_strengths(readings, place, places, options.average)
         groups = virtual_networks(readings.ids, means.dbm)
         if groups:
-            names = "; ".join(listed([readings.ids[number] for number in group]) for group in groups[:3])
-            text = f"{sum(map(len, groups))} addresses are networks of {len(groups)} radios ({names})"
+            names = listed(readings.ids[number] for number in groups[0])
+            text = f"{sum(map(len, groups))} addresses are networks of {len(groups)} radios (the first: {names})"
             self.notes.append(text + (": merged" if options.merge_radios else "; --merge-radios makes them one"))
             if options.merge_radios:
                 readings = merged(readings, groups)
@@ -279,7 +333,7 @@ class _Import:
     def _receivers(self, readings: Readings, frame: LocalFrame) -> tuple[tuple[Receiver, ...], list[str]]:
         """Receivers with the carriers of their readings, if these state any."""
         options = self.options
-        table = None if options.anchors is None else read_table(options.anchors)
+        table = None if options.anchors is None else read_table(options.anchors, options.sheet)
         receivers, notes = read_receivers(table, readings.ids, frame, options.units, options.anchor_height_m)
         pairs = list(zip(readings.ids, receivers, strict=True))
         carriers = [self.carrier_of.get(name, receiver.frequency_hz) for name, receiver in pairs]
@@ -340,44 +394,3 @@ def _hertz(table: Table, column: str) -> FloatArray:
         raise table.fault(f"{one_line(column)} is {values[row]:g}; give the carrier, or --columns frequency=-", row)
     largest = values.max()
     return values * HERTZ.get(unit_of(column), 1e9 if largest < 1e3 else 1e6 if largest < 1e6 else 1.0)
-
-
-def _plan_picture(record: Record) -> bytes:
-    """PNG with the rows of signal strengths in their plan and the receivers at known positions."""
-    from matplotlib.figure import Figure  # not before: every command imports the data sets
-    from matplotlib.text import Text
-
-    extent_m = np.ptp(record.tx_pos_m[:, :2], axis=0)
-    aspect = float(np.clip(extent_m[1] / max(extent_m[0], 1e-6), 0.3, 1.5))
-    figure = Figure(figsize=(8, 6.6 * aspect + 1.8), layout="constrained")
-    axes = figure.add_subplot()
-    heard = np.isfinite(record.observation).any(axis=0)
-    strongest = np.where(heard, np.argmax(np.nan_to_num(record.observation, nan=-np.inf), axis=0), -1)
-    numbers, counts = np.unique(strongest[heard], return_counts=True)
-    named = numbers[np.argsort(-counts, kind="stable")][:MOST_NAMED]
-    others = ~np.isin(strongest, named)
-    for number in named:
-        rows = record.tx_pos_m[strongest == number]
-        axes.plot(*rows[:, :2].T, ".", markersize=4, label=record.receivers[number].name[:24])
-    if others.any():
-        axes.plot(*record.tx_pos_m[others, :2].T, ".", color="0.7", markersize=3, label="another or none", zorder=0)
-    places = np.stack([receiver.position_m for receiver in record.receivers])
-    surveyed = np.isfinite(places).all(axis=1)
-    if surveyed.any():
-        axes.plot(*places[:, :2].T, "k^", markersize=7, label="receivers")
-    names = np.array([receiver.name[:24] for receiver in record.receivers])
-    for name, place in zip(names[surveyed], places[surveyed], strict=True) if surveyed.sum() <= MOST_NAMED else ():
-        axes.annotate(name, place[:2], (5, 3), textcoords="offset points", fontsize="small")
-    title = f"{record.name}: strongest receiver of each row"
-    if (~surveyed).any():
-        several = (~surveyed).sum() > MOST_NAMED
-        unknown = str((~surveyed).sum()) if several else ", ".join(names[~surveyed])
-        title = f"{title}\n" + textwrap.fill(f"receivers at unknown places: {unknown}", 90)
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    axes.set_title(title, fontsize="medium")
-    figure.legend(loc="outside lower center", ncols=4, fontsize="small")
-    for text in figure.findobj(Text):
-        text.set_parse_math(False)  # names may contain dollar signs
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
-    return stream.getvalue()

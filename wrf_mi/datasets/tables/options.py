@@ -27,8 +27,9 @@ class ImportOptions:
 
     Attributes:
         columns: columns by meaning (x, y, z, lat, lon, floor, heading, time, run, split, frequency, id, rssi, or cell,
-            whose texts end with the numbers floor, x and y, as L4-31-2), a mapping or text such as ``"x=X,y=Y"``; the
-            name ``-``: there is none.
+            whose texts are coordinates, as (3.5, 2.0), or end with the numbers floor, x and y, as L4-31-2), a mapping
+            or text such as ``"x=X,y=Y"``; the name ``-``: there is none.
+        sheet: name of the sheet of workbooks with several.
         receivers: patterns of the columns of strengths of a wide table, such as ``"AP* RSS(dBm)"``.
         test: files with the test rows.
         positions: files with the positions of the rows, one for each file (test files last) or one for all.
@@ -41,7 +42,7 @@ class ImportOptions:
         pitch_m: metres of a step of positions that are indices of a grid; 0: they are none.
         crs: coordinate reference system of the positions, such as EPSG:3857.
         heading: unit of headings: rad, deg, or compass (degrees clockwise from north).
-        height_m: height of the moving end without z.
+        height_m: height of the moving end without z: one for all tables, or one for each, those of ``test`` last.
         storey_m: height of a storey, where rows have a floor and no z.
         anchor_height_m: height of receivers without z.
         frequency_hz: carrier of all rows; 0: that of the table, or 2.44 GHz.
@@ -50,6 +51,7 @@ class ImportOptions:
     """
 
     columns: Mapping[str, str] | str = field(default_factory=dict)
+    sheet: str = ""
     receivers: Sequence[str] = ()
     test: Sequence[str | Path] = ()
     positions: Sequence[str | Path] = ()
@@ -62,7 +64,7 @@ class ImportOptions:
     pitch_m: float = 0.0
     crs: str = ""
     heading: str = ""
-    height_m: float = TAG_HEIGHT_M
+    height_m: float | Sequence[float] = TAG_HEIGHT_M
     storey_m: float = 3.0
     anchor_height_m: float = 2.5
     frequency_hz: float = 0.0

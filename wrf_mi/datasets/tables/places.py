@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -25,6 +26,12 @@ longitude and latitude: a room in metres is not a metre wide and twenty metres a
 FULL_TURN = 4 * np.pi  # largest heading in radians where its unit is not stated; headings may count a turn
 COMPASS = ("bearing", "azimuth", "course", "compass")  # words of headings that run clockwise from north, in degrees
 MOST_OUTSIDE = 0.5  # share of rows outside the time of the positions above which the times are not in one unit
+GROUND, BELOW = ("g", "gf", "ground", "groundfloor", "eg", "rc"), ("b", "lg", "ug", "basement", "basementlevel")
+"""Names of the ground floor, and of floors below it, which are counted downwards."""
+PAIR = re.compile(
+    r"\D{0,2}?([+-]?\d+(?:\.\d*)?)\s*[,;\s]\s*([+-]?\d+(?:\.\d*)?)(?:\s*[,;\s]\s*([+-]?\d+(?:\.\d*)?))?\D{0,2}"
+)
+"""Coordinates x, y and, if stated, z in one text, as in ``(3.5, -2.0)``."""
 PLACES = ("x", "y", "z", "lat", "lon", "floor", "heading")
 
 
@@ -143,7 +150,7 @@ def plane_columns(of: Mapping[str, str], table: Table) -> tuple[str, str, bool]:
         if first in of and second in of:
             return of[first], of[second], geographic
     names = shown_names(list(table.frame.columns))
-    remedy = "name them by --columns x=...,y=... or lon=...,lat=..., or give --positions FILE"
+    remedy = "name them by --columns x=...,y=... or lon=...,lat=..., cell=... for both in one text, or --positions FILE"
     raise InputError(f"{table.files[0][0]}: no columns of positions among {names}; {remedy}")
 
 
@@ -157,14 +164,31 @@ def finite_columns(table: Table, names: Sequence[str]) -> FloatArray:
 
 
 def floor_numbers(table: Table, column: str) -> FloatArray:
-    """Numbers of floors [rows], also of those that are called L2; an `InputError` for a name without a number."""
+    """Numbers of floors [rows] from numbers or names: B1 (below the ground), G, F2, L-2, Level 3.
+
+    Where floors below the ground are named and none is 0, the first floor (F1) is the one above B1.
+
+    Raises:
+        InputError: a name without a number, or names whose order is not known (F1, P1).
+    """
     if table.is_numeric(column):
         return finite_columns(table, [column])[:, 0]
-    numbers = table.frame[column].astype(str).str.extract(r"(-?\d+)")[0].astype(float).to_numpy()
-    if (wrong := np.isnan(numbers)).any():
+    names = table.frame[column].astype(str).str.strip()
+    # A minus between a word and its number joins them (L-2); before a number alone it is a sign (floor -1).
+    parts = names.str.extract(r"^([A-Za-z .]*?)[\s_.]*(?:(?<=[A-Za-z])-)?(-?\d*)\.?$").fillna("")
+    words = parts[0].str.lower().str.replace(r"[\s.]", "", regex=True)
+    is_ground = words.isin(GROUND) & (parts[1] == "")
+    is_below = words.isin(BELOW)
+    kinds = set(words[~is_ground & ~is_below])
+    wrong = (parts[1].isin(("", "-")) & ~is_ground) | (~is_ground & ~is_below if len(kinds) > 1 else False)
+    if wrong.any():
         row = int(np.argmax(wrong))
-        text = f"{one_line(column)} is {str(table.frame[column].iloc[row])[:40]!r}; give its number"
-        raise table.fault(f"{text}, or leave the column out by --columns floor=-", row)
+        text = f"{one_line(column)} is {names.iloc[row][:40]!r}" + ", beside other kinds of names" * (len(kinds) > 1)
+        raise table.fault(f"{text}; give its number, or leave the column out by --columns floor=-", row)
+    numbers = parts[1].where(~is_ground, "0").astype(float).to_numpy(float)
+    numbers = np.where(is_below, -np.abs(numbers), numbers)
+    if is_below.any() and not (numbers == 0).any():
+        numbers = numbers - (numbers > 0)
     return np.asarray(numbers)
 
 
@@ -266,16 +290,27 @@ def _interpolated(values: Table, time: str, positions: Table, other: str, new: S
 
 
 def with_cells(table: Table, column: str) -> Table:
-    """A table with the columns x, y, and floor if it is stated, from the last numbers in the texts of a column."""
+    """A table with the columns x, y, and z or floor if stated, from the numbers in the texts of a column.
+
+    Texts are coordinates, ``(3.5, -2.0)``, or names of cells whose last whole numbers are floor, x and y, ``L4-31-2``.
+    """
     if column not in table.frame:
         raise DataFault(table.files[0][0], f"no column {one_line(column)}; correct --columns", line=1)
-    numbers = table.frame[column].astype(str).str.findall(r"\d+")
-    count = int(numbers.str.len().min())
-    if count < 2:
-        row = int(np.argmin(numbers.str.len()))
-        text = f"{one_line(column)} is {str(table.frame[column].iloc[row])[:40]!r}"
-        raise table.fault(f"{text}; give a text with the numbers x and y, such as L4-31-2", row)
-    names = ["floor", "x", "y"][-count:]
+    texts = table.frame[column].astype(str).str.strip()
+    pairs = texts.str.extract(f"^{PAIR.pattern}$")
+    if pairs[1].notna().all():
+        names = ["x", "y", "z"][: 3 if pairs[2].notna().all() else 2]
+        return replace(
+            table, frame=table.frame.assign(**{name: pairs[k].astype(float) for k, name in enumerate(names)})
+        )
+    numbers = texts.str.findall(r"\d+")
+    # A decimal point joins two numbers to one, so that the last whole numbers are no x and y.
+    wrong = (numbers.str.len() < 2) | texts.str.contains(r"\d\.\d")
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        text = f"{one_line(column)} is {texts.iloc[row][:40]!r}"
+        raise table.fault(f"{text}; give a text such as (3.5, 2.0), or whole numbers as in L4-31-2", row)
+    names = ["floor", "x", "y"][-int(numbers.str.len().min()) :]
     columns = {name: numbers.str[place - len(names)].astype(float) for place, name in enumerate(names)}
     return replace(table, frame=table.frame.assign(**columns))
 

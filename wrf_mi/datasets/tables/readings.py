@@ -14,11 +14,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ...core.angles import FloatArray
-from ...core.files import one_line
+from ...core.files import listed, one_line
 from ...core.types import IntArray
 from ..receivers_file import plain_id
 from ..sentinels import CUSTOMARY_DBM, suspicious_values
-from ..unknown import listed
 from .columns import MAC, METRES, RANGES, Columns, unit_of
 from .files import Table, package
 
@@ -28,6 +27,9 @@ LEAST_STD_DB = 0.05  # noise of a mean of whole dB is not below this
 FEWEST_SHARED, LEAST_CORRELATION, MOST_DIFFERENCE_DB = 5, 0.8, 3.0
 """Places at which two networks were heard, correlation and median difference from which they are one radio's: the bands
 of one access point differ by more, and so do neighbouring access points."""
+FEWEST_COMPARED, LEAST_OFFSET_DB, OFFSET_STANDARD_ERRORS = 10, 2.0, 4.0
+"""Places and receivers that files share, and the difference of their strengths, from which it is said: one in 16,000
+files differs by four standard errors by chance, and a quantisation to whole dB by less than 2 dB."""
 RESERVED = ("x", "y", "z", "heading", "frequency_hz", "run", "split")
 PREFIXES = ("rssi_", "count_", "std_")  # columns of the layout, which kept columns must not be taken for
 FEWEST_EQUAL = 3
@@ -57,8 +59,12 @@ def normal_id(text: str) -> str:
 
 
 def id_key(name: str) -> str:
-    """What ids of one receiver share: the digits of a hardware address in any case and notation, else the id."""
-    digits = re.sub("[:_-]", "", name).lower()
+    """What ids of one receiver share: the digits of a hardware address in any case and notation, else the id.
+
+    An address may stand beside other words, as in ``02:00:00:00:00:01;Guest``.
+    """
+    addresses = MAC.findall(name)
+    digits = re.sub("[:_-]", "", addresses[0] if len(addresses) == 1 else name).lower()
     return digits if re.fullmatch("[0-9a-f]{12}", digits) else name
 
 
@@ -166,6 +172,36 @@ def mean_strengths(readings: Readings, place: IntArray, places: int, average: st
     return Means(dbm.reshape(shape), count.reshape(shape).astype(np.int64), std.reshape(shape))
 
 
+def file_offsets(readings: Readings, place: IntArray, file: IntArray, names: Sequence[str]) -> list[str]:
+    """Notes on files whose strengths differ from those of the others by a constant at the same places.
+
+    Args:
+        readings: all readings.
+        place: number of the place of each row of the table.
+        file: number of the file of each row.
+        names: names of the files.
+    """
+    cell, of_file, notes = readings.receiver * (place.max() + 1) + place[readings.row], file[readings.row], list[str]()
+    for number, name in enumerate(names) if len(names) > 1 else ():
+        in_file = of_file == number
+        shared = np.intersect1d(cell[in_file], cell[~in_file])
+        means = [
+            _means(readings.dbm[part], np.searchsorted(shared, cell[part]), len(shared))
+            for part in (in_file & np.isin(cell, shared), ~in_file & np.isin(cell, shared))
+        ]
+        if len(shared) < FEWEST_COMPARED:
+            continue
+        difference = means[0] - means[1]
+        offset = float(np.median(difference))
+        # Standard error of a median of Gaussian differences, by their median absolute deviation (Rousseeuw and Croux,
+        # J. Am. Stat. Assoc. 88, 1993).
+        error = 1.2533 * 1.4826 * float(np.median(np.abs(difference - offset))) / np.sqrt(len(difference))
+        if abs(offset) > max(LEAST_OFFSET_DB, OFFSET_STANDARD_ERRORS * error):
+            text = f"{name}: strengths are {offset:+.1f} dB from those of the other files at {len(shared)} equal places"
+            notes.append(f"{text}: another sent power or device, pooled here; import it into a folder of its own")
+    return notes
+
+
 def virtual_networks(ids: Sequence[str], dbm: FloatArray) -> list[list[int]]:
     """Groups of receivers that are networks of one radio, by their hardware addresses and strengths [n_rx, n].
 
@@ -235,7 +271,7 @@ def further_columns(
         values |= {f"{quantity}_{normal_id(receiver_id)}{unit}": column for receiver_id, column in means.items()}
     values |= {one_line(name): _of_places(table, name, place) for name in columns.kept}
     if values:
-        notes.append(f"kept as columns that no model uses: {listed(list(values))}")
+        notes.append(f"kept as columns that no model uses: {listed(values)}")
     return {_free(name): column for name, column in values.items()}, list(dict.fromkeys(notes))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -11,9 +13,10 @@ from ...core import DataFault, Receiver
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.carriers import FREQUENCY
+from ...core.files import listed
 from ..folder_files import CsvTable
 from ..receivers_file import COLUMNS, TX_COLUMNS, read_antennas, read_orientations, receiver_of
-from ..unknown import RECEIVER, listed, name_words
+from ..unknown import RECEIVER, name_words
 from .columns import named_columns, shown_names, unit_of
 from .files import Table
 from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale
@@ -43,12 +46,27 @@ def read_receivers(
         text = "positions of the receivers are unknown, their fields empty; --anchors FILE states them"
         return tuple(unknown.values()), [text]
     table = _with_ids(table)
-    stated = _stated(table, frame, units, height_m, {id_key(name): name for name in ids})
+    stated = _stated(table, frame, units, height_m, _measured(ids))
+    if not unknown.keys() & stated.keys():
+        text = f"none of its ids ({listed(list(stated))}) is measured ({listed(list(ids))})"
+        raise DataFault(table.files[0][0], f"{text}; give the ids of the measurements, or omit --anchors")
     receivers = unknown | {name: receiver for name, receiver in stated.items() if name in unknown}
     notes = _notes(table, receivers, stated)
     if "z" not in named_columns(list(table.frame.columns), {}):
         notes.append(f"{table.files[0][0].name}: no column z, so receivers are {height_m:g} m above the floor")
     return tuple(receivers.values()), notes
+
+
+def _measured(ids: Sequence[str]) -> dict[str, str]:
+    """Ids of the measurements by what anchors may call them: the id, its address, or a part that no other id has."""
+    parts = Counter(part for name in ids for part in _parts(name))
+    by_part = {part: name for name in ids for part in _parts(name) if parts[part] == 1}
+    return by_part | {id_key(name): name for name in ids}
+
+
+def _parts(name: str) -> set[str]:
+    """Address and network of a receiver that is named by both, as ``02:00:00:00:00:01;Guest``."""
+    return {part for part in re.split(r"\s*[;|]\s*", name) if part}
 
 
 def _notes(table: Table, receivers: Mapping[str, Receiver], stated: Mapping[str, Receiver]) -> list[str]:

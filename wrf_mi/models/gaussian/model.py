@@ -6,9 +6,8 @@ calibrates `wrf_mi.models.ray_tracing`.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
-from dataclasses import astuple, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -19,15 +18,17 @@ from numpy.typing import NDArray
 from ...backend.device import release_memory
 from ...core import Antenna, InputError, Prediction, Receiver, Record, Split, receiver_arrays, stored_receivers
 from ...core.array_files import keyed, under
+from ...core.settings import names_of
 from ...graph.graph import LEVEL, Graph
 from ...graph.receivers import GAPS, Form
 from ...graph.settings import TRACED_NAMES
 from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers, scene_carrier
+from ...tracing.options import without_effect
 from ...tracing.paths.edited_scene import parameters_in
 from ...training.by_distance import Reach
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
-from ...training.config import PRESETS, TrainConfig, task_settings
+from ...training.config import PRESETS, TrainConfig, task_settings, unused_of_loop, validates
 from ...training.fit_plan import FitPlan, check_params, field_of
 from ...training.initial import initial_gaussians
 from ...training.loop import FitState, Progress
@@ -77,8 +78,6 @@ def of_all_receivers(
     positions_m |= dict(zip(trained, reach.known_m, strict=True))
     return of_all, replace(reach, known_m=tuple(positions_m.values()))
 
-
-logger = logging.getLogger(__name__)
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
 PARAM = "param/"  # prefix of a parameter's array in ``model.npz``
@@ -189,6 +188,54 @@ def _scene(problem: Problem, split: Split) -> Any | None:
     return problem.open_scene(scene_carrier(problem.record, split.all_train))
 
 
+def _unused_of_gaussians(plan: FitPlan, name: str) -> dict[str, str]:
+    """Settings of Gaussians, their networks, start and density control without effect in a fit, and why."""
+    s, task, field = plan.config, plan.task, plan.graph.field
+    assert field is not None
+    unused: dict[str, str] = {}
+    for group in ("opacity", "signal"):
+        if group not in field.per_gaussian:
+            unused |= {f"optimiser.{group}": f"Gaussians of {name} have no static {group}"}
+    if "opacity" not in field.per_gaussian:
+        unused["initial.opacity"] = f"Gaussians of {name} have no static opacity"
+    if name == "factorised":
+        unused |= dict.fromkeys(("encoding.position_octaves", "encoding.position_scale_m"), "Gaussians are not encoded")
+    else:
+        unused["network.terms"] = f"{name} has none"
+    if name != "wrf-gs+":
+        unused["network.static_geometry"] = f"{name} always moves signals alone"
+    if not plan.graph.kind.levels:
+        unused["optimiser.level"] = "the receiver model has no level"
+    if plan.graph.form.features:
+        unused |= dict.fromkeys(
+            ("encoding.tx_octaves", "encoding.tx_scale_m"), "transmitters are known by their uplink"
+        )
+    if not task.image:
+        unused["loss.ssim_weight"] = f"of images, and the data hold {task.name}"
+    unused |= {"view": "observations are spectra, with directions of their own"} if task.image else {}
+    if not task.is_complex:
+        unused["view.components"] = f"of channels, and the data hold {task.name}"
+    if source := next((name for name in ("points", "mesh", "paths") if getattr(s.initial, name)), None):
+        random = ("size_deg", "nearest_m", "farthest_m")
+        unused |= {f"initial.{name}": f"Gaussians start from initial.{source}" for name in random}
+    if not s.density.every:
+        unused |= {f"density.{name}": "density.every=0" for name in names_of(type(s.density)) - {"every"}}
+    return unused
+
+
+def _unused_of_paths(plan: FitPlan, splits: Sequence[Split]) -> dict[str, str]:
+    """Settings of traced paths without effect, and of validation without rows."""
+    if plan.graph.scene is None:
+        return unused_of_loop(plan.config, validates(splits)) | {"traced": "paths of a scene are traced; give --scene"}
+    traced = plan.config.traced
+    unused = without_effect(traced.options)
+    unused |= {} if traced.pattern_degree else {"pattern": "pattern_degree is 0"}
+    unused |= {} if traced.pattern else {"pattern_degree": "pattern is 0, so patterns are not trained"}
+    unused |= {} if traced.material else {"materials": "material is 0, so materials are not trained"}
+    unused |= {} if traced.surface else {"surface_spacing": "surface is 0, so there are no Gaussians on surfaces"}
+    return {f"traced.{name}": why for name, why in unused.items()}
+
+
 class GaussianField(Model):
     """A model of 3D Gaussians, of `wrf_mi.gaussians.FIELDS`, for any task or for data of one."""
 
@@ -270,12 +317,7 @@ class GaussianField(Model):
         return FittedField(arrays, problem.settings, problem, folder)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
-        """Refuse settings, files and scenes that a training would refuse; warn of settings of paths without a scene."""
-        traced, default = problem.settings.traced, TrainConfig().traced
-        if problem.scene is None and traced != default:
-            names = [field.name for field in fields(traced)]
-            changed = [f"traced.{name}" for name in names if getattr(traced, name) != getattr(default, name)]
-            logger.warning("%s: no effect without a scene, whose paths are traced; give --scene", ", ".join(changed))
+        """Refuse settings, files and scenes that a training would refuse."""
         # The last plan that is made is that of the part that is fitted first: plans of all would be in memory together.
         for split in reversed(splits):
             # The first part of a fit, which takes no time: what it refuses is refused before a run folder exists.
@@ -284,6 +326,11 @@ class GaussianField(Model):
             placed = replace(plan.record, receivers=plan.graph.receivers)
             initial_gaussians(plan.config.initial, placed, plan.split.train, drawn)
             problem.checked.append(plan)
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of other fields and tasks, of paths without a scene, of starts and rounds that are not made."""
+        plan: FitPlan = problem.checked[-1] if problem.checked else self._plan(problem, splits[-1])
+        return _unused_of_gaussians(plan, self.name) | _unused_of_paths(plan, splits)
 
     def prepare(self, problem: Problem, splits: Sequence[Split], session: Session) -> TrainConfig:
         """Settings with number of steps and scale of transmitters resolved."""

@@ -139,6 +139,18 @@ class FittedHybrid(Fitted):
             return super().in_scene(scene)
         return replace(self, parts=self.parts | {PATHS: self.parts[PATHS].in_scene(scene)})
 
+    def tracing_once(self) -> FittedHybrid:
+        """The hybrid of parts that trace once."""
+        return replace(self, parts={name: part.tracing_once() for name, part in self.parts.items()})
+
+    def refit(self, record: Record, rows: IntArray) -> FittedHybrid | None:
+        """The parts given some rows, see `Fitted`, mixed at the distances to these; None if a part has to be fitted."""
+        refits = {name: part.refit(record, rows) for name, part in self.parts.items()}
+        parts = {name: part for name, part in refits.items() if part is not None}
+        if len(parts) < len(self.parts) or self.residuals is not None:
+            return None
+        return replace(self, known=rows, parts=parts)
+
     @property
     def depends_on_heading(self) -> bool:
         """Whether the predictions of a part depend on the heading of the transmitter."""
@@ -171,7 +183,7 @@ class FittedHybrid(Fitted):
         weights = self._weights(distance_m)
         residual_weight = weights[:, len(self.parts)] if self.residuals is not None else np.zeros(len(tx_pos_m))
         sides, totals = np.zeros((2, len(tx_pos_m), *shape), kind), np.zeros((2, len(tx_pos_m)))
-        paths, size = None, np.zeros((len(tx_pos_m), *shape))
+        paths, (size, size_of_mean) = None, np.zeros((2, len(tx_pos_m), *shape))
         for (name, part), weight in zip(self.parts.items(), weights.T, strict=False):
             # Residuals are about the scene's side, which is therefore a part of what they predict.
             share = weight + residual_weight if name == PATHS else weight
@@ -184,6 +196,9 @@ class FittedHybrid(Fitted):
             totals[side, rows] += share[rows]
             if by_part.prediction.std is not None:
                 size[rows] += _spread(share[rows], shape) * by_part.prediction.std
+            # NaN of a part that does not state it.
+            of_mean = by_part.prediction.std_mean
+            size_of_mean[rows] += _spread(share[rows], shape) * (np.nan if of_mean is None else of_mean)
             paths = paths or (by_part.paths and by_part.paths.placed(rows, len(tx_pos_m)))
         mean = sides.sum(axis=0)
         rows = np.flatnonzero(residual_weight)
@@ -192,7 +207,7 @@ class FittedHybrid(Fitted):
             mean[rows] += _spread(residual_weight[rows], shape) * residual
         if task_of(self.problem.record).image:
             mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
-        prediction = self._with_intervals(mean, size, distance_m) if std else Prediction(mean)
+        prediction = self._with_intervals(mean, size, distance_m, size_of_mean) if std else Prediction(mean)
         if std and self.reception is not None:
             prediction = self.reception(prediction, tx_pos_m, receiver)
         if not totals.any(axis=1).all():
@@ -207,13 +222,20 @@ class FittedHybrid(Fitted):
         weights = np.where(weights < NEGLIGIBLE, 0, weights)
         return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
-    def _with_intervals(self, mean: NDArray[Any], size: FloatArray, distance_m: FloatArray) -> Prediction:
-        """Means [m, ...] with calibrated standard deviations, from the mixed ones that the parts state, if they do."""
+    def _with_intervals(
+        self, mean: NDArray[Any], size: FloatArray, distance_m: FloatArray, size_of_mean: FloatArray | None = None
+    ) -> Prediction:
+        """Means [m, ...] with calibrated standard deviations, from the mixed ones that the parts state, if they do.
+
+        Those of the mean are left out where a part does not state them.
+        """
         if self.intervals is None:
             return Prediction(mean)
         if self._states_sizes:
             factor = self.intervals(mean, np.ones(mean.shape), distance_m).stated_std
-            return Prediction(mean, np.maximum(size * factor, LEAST))
+            known = size_of_mean is not None and np.isfinite(size_of_mean).all()
+            of_mean = size_of_mean * factor if size_of_mean is not None and known else None
+            return Prediction(mean, np.maximum(size * factor, LEAST), std_mean=of_mean)
         return self.intervals(mean, expected_size(task_of(self.problem.record), Prediction(mean)), distance_m)
 
     def fit_reception(self, fold: Split, held_out: HeldOut, every: Mapping[str, Prediction]) -> None:

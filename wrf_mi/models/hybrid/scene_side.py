@@ -9,6 +9,7 @@ import json
 import logging
 import shutil
 from collections.abc import Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -80,6 +81,12 @@ class SceneSide(Fitted):
     def error_prior(self, receiver: int) -> ErrorPrior | None:
         """As of the fitted model."""
         return self.fitted.error_prior(receiver)
+
+    def tracing_once(self) -> SceneSide:
+        """As of the fitted model."""
+        shared = copy(self)
+        shared.fitted = self.fitted.tracing_once()
+        return shared
 
     def in_scene(self, scene: str) -> SceneSide:
         """The fitted model in an edited copy of the scene that it was fitted in."""

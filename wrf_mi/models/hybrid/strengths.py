@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from ...core import InputError, Receiver, Split
+from ...core import InputError, Receiver, Record, Split
 from ...core.files import write_atomically
+from ...core.types import IntArray
 from ...correction.options import STRENGTHS
+from ...scene.correction_data import read_correction_data
 from ...tasks import task_of
 from ...tracing.options import TraceOptions
 from ...tracing.paths.solve import Prepared
@@ -29,7 +31,7 @@ from ...tracing.tracer import check_polarization
 from ...training.by_distance import unit_means
 from ...training.selection import HeldOut, hold_out
 from ..held_out import HeldOutPrediction, held_out_predictions
-from ..interpolation.by_task import STOPS, StrengthKriging
+from ..interpolation.by_task import StrengthKriging
 from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
 from ..model import Arrays, Model, Problem, Session
 from .scene_side import MEAN, SCENE, SceneSide, corrected, in_scene, inside, write_reports
@@ -39,7 +41,7 @@ SPACING_M, SMOOTH_M = 0.25, 0.3
 TRACE = TraceOptions(transmission=True, depth=STRENGTHS.depth, reflections=STRENGTHS.reflections)  # as a correction's
 DEFAULT = StrengthSettings()
 SEARCH_ROWS = 30  # least number of rows by which hyperparameters about an exact mean are searched
-HELD = "held"  # folder of the predictions of held-out rows
+HELD, TRIED = "held", "tried"  # folders of the predictions of held-out rows, and of those that choose the mean
 NEVER = 2**31  # `StrengthSettings.search_rows` above any number of rows
 ExactMean = Callable[[Sequence[Receiver]], TracedPower]
 """Power at positions themselves for some receivers of a problem; fits share what was traced."""
@@ -60,6 +62,14 @@ class FittedStrengths(SceneSide):
         field.prior = replace(field.prior, traced=power)
         return FittedStrengths(replace(self.fitted, field=field), problem)
 
+    def refit(self, record: Record, rows: IntArray) -> FittedStrengths:
+        """The kriging given some rows, see `Fitted`, about the power traced in the scene that all rows corrected."""
+        strengths, data = self.fitted.refit(record, rows), read_correction_data(self.problem.scene)
+        if data is not None and data.knows(record.name, rows).any():
+            # Errors of the other rows, which the scene knows, are as much too small: deviations stay in proportion.
+            strengths = replace(strengths, widen=strengths.widen / data.error_ratio)
+        return FittedStrengths(strengths, self.problem)
+
     def held_out_at(self, held_out: HeldOut) -> HeldOutPrediction | None:
         """Predictions of the rows that were held out, see `SceneSide`."""
         return self.unseen
@@ -72,18 +82,17 @@ def _chosen(
     record, received = stated.record, replace(held_out, every=held_out.every[:0])
     unit = held_out.receiver if split.held_receivers else held_out.row
 
-    def score(problem: Problem, mean: ExactMean | None = None) -> float:
+    def score(problem: Problem, name: str, mean: ExactMean | None = None) -> float:
         # Which mean is better does not depend on a search for hyperparameters.
-        model, place = StrengthsInScene(StrengthSettings(search_rows=NEVER), mean), inside(session, "tried")
+        model, place = StrengthsInScene(StrengthSettings(search_rows=NEVER), mean), inside(session, TRIED, name)
         means = held_out_predictions(model, problem, fold, received, place, "mean").mean
-        shutil.rmtree(place.folder)
         of_row = task_of(record).mixtures(means[None], held_out.observed(record))
         return float(unit_means(of_row(np.ones((len(held_out), 1)), np.arange(len(held_out))), unit).mean())
 
-    problem, best = inner, score(inner)
+    problem, best = inner, score(inner, "corrected")
     if inner is not stated:
         # The correction has gained as a trace, but may add nothing to kriging, which knows the level around each row.
-        before = score(stated)
+        before = score(stated, "stated")
         if before >= best:
             problem, best = stated, before
     mean = None
@@ -91,7 +100,7 @@ def _chosen(
         # Whoever turns carries the antenna beside the stated position; elsewhere, positions may be exact, unless
         # receivers' are estimates, which each hold-out makes anew.
         exact = _traced(problem)
-        mean = exact if score(problem, exact) > best else None
+        mean = exact if score(problem, "exact", exact) > best else None
     judged = _Remembering(_searched(mean), mean)
     shutil.rmtree(session.folder / HELD, ignore_errors=True)  # of a stopped fit
     held_out_predictions(judged, problem, fold, held_out, inside(session, HELD), "paths")
@@ -127,7 +136,7 @@ class StrengthsInScene(Model):
     """
 
     name, source, settings = "strengths", StrengthKriging.source, object
-    tasks, gaps = ("rssi",), (STOPS,)
+    tasks, gaps = ("rssi",), StrengthKriging.gaps
     scene, uplink, headings = "required", "optional", True
     several_carriers, new_receivers = True, True
 
@@ -139,7 +148,7 @@ class StrengthsInScene(Model):
         session.report("tracing a map", 0.0)
         record = problem.record
         power = _local_mean(problem) if self.mean is None else self.mean(record.receivers)
-        fitted = fit_strengths(record, problem.rows(split), power, self.search, session.report)
+        fitted = fit_strengths(record, problem.rows(split), power, self.search, session.report, stated=())
         if power.exact:
             field = fitted.field
             field.prior = replace(field.prior, traced=power.of_predictions(field.stops.poses.position_m))
@@ -192,6 +201,7 @@ class TracedStrengths(StrengthsInScene):
             held_out, path = HeldOut.of(problem.record, fold, problem.seed), session.folder / "mean.json"
             if not path.exists():
                 write_atomically(path, json.dumps(_chosen(problem, inner, split, fold, held_out, session)) + "\n")
+            session.discarded.append(session.folder / TRIED)
             choice = json.loads(path.read_text())
             if inner is not problem and not choice["corrected"]:
                 inner, reports = problem, [replace(report, kept=report.stage == MEAN) for report in reports]

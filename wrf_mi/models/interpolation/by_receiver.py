@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -205,6 +206,10 @@ class ByReceiverModel(Model):
 
     def takes_headings(self, record: Record, settings: Any) -> bool:
         """Whether headings count where the record has them."""
+        return False
+
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Most interpolate over the transmitter's positions, whatever the receiver's."""
         return False
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> Fitted:

@@ -9,9 +9,9 @@ from ...core import InputError, Split
 from ...training.session import FitSession
 from ..model import Arrays, Fitted, Model, Problem, known_positions
 from .diffuse import ChannelKriging
-from .kriging import GenericKriging, KrigingSettings
+from .kriging import GENERIC_ONLY, GenericKriging, KrigingSettings, asks_generic
 from .spectra import SpectrumKriging, SpectrumKrigingSettings
-from .strengths import Strengths, StrengthSettings, fit_strengths
+from .strengths import EXACT, POOLED_ONLY, Strengths, StrengthSettings, fit_strengths, unused_of_pooled
 
 STOPS = "stop.value_dbm"
 """Array of pooled strengths, which generic kriging has not: readings, NaN where a receiver did not report at a stop."""
@@ -20,11 +20,15 @@ STOPS = "stop.value_dbm"
 class StrengthKriging(GenericKriging):
     """Kriging of signal strengths, pooled over receivers where a single, known carrier states free space."""
 
-    settings, new_receivers, gaps = StrengthSettings, True, (STOPS,)
+    settings, new_receivers, gaps = StrengthSettings, True, (STOPS, EXACT)
 
     def pools_receivers(self, problem: Problem) -> bool:
         """Whether strengths have a single, known carrier and settings ask for no other covariance."""
-        return not problem.settings.is_generic and problem.record.frequencies_hz is not None
+        return not asks_generic(problem) and problem.record.frequencies_hz is not None
+
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Pooled kriging is about the law of distance."""
+        return self.pools_receivers(problem) or super().uses_places(problem, splits)
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> Fitted:
         """Kriging of all receivers together where they are pooled, else of each by itself."""
@@ -32,7 +36,17 @@ class StrengthKriging(GenericKriging):
             return super().fit(problem, split, session)
         rows = problem.rows(split)
         known_positions(problem.record, rows, self.name)
-        return fit_strengths(problem.record, rows, None, problem.settings, session.report)
+        return fit_strengths(problem.record, rows, None, problem.settings, session.report, problem.stated_settings)
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of pooled receivers where each is kriged alone; of headings, and of a search that is not made."""
+        unused = super().unused_settings(problem, splits)
+        if self.pools_receivers(problem):
+            return {**unused, **unused_of_pooled(problem, splits)}
+        why = "no single carrier is known"
+        if stated := sorted(GENERIC_ONLY & problem.stated_settings) or ["generic"] * problem.settings.generic:
+            why = f"each receiver is kriged alone with {stated[0]}"
+        return {**unused, **dict.fromkeys(POOLED_ONLY, why)}
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
         """The model of either kind."""

@@ -20,7 +20,7 @@ from ...core.angles import FloatArray
 from ...core.array_files import keyed, under
 from ..model import Arrays, field_arrays, from_field_arrays
 from .by_receiver import ReceiverRows, Single, observed_rows
-from .kriging import NEAREST_M, GenericKriging, UncertainKriged, kriged
+from .kriging import NEAREST_M, GenericKriging, UncertainKriged, asks_generic, kriged
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 NEIGHBOURS = 32
@@ -171,7 +171,7 @@ class ChannelKriging(GenericKriging):
             InputError: no row that was received, or channels that are all zero.
         """
         record = rows.problem.record
-        if rows.problem.settings.is_generic or record.frequencies_hz is None or rows.observation.ndim != 2:
+        if asks_generic(rows.problem) or record.frequencies_hz is None or rows.observation.ndim != 2:
             return kriged(rows)
         position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
         generic = UncertainKriged.of(kriged(rows), observed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from ...core import InputError, Receiver
+from ...core import InputError, Receiver, Split
 from ...tasks import task_of
-from ..model import Arrays
+from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows, observed_rows
 
 
@@ -99,17 +99,25 @@ class Idw(ByReceiverModel):
     source = "Shepard, 'A two-dimensional interpolation function for irregularly-spaced data' (1968)"
     summary = "inverse-distance weighting"
 
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of weights where a single row is taken."""
+        return dict.fromkeys(("power", "softening_m"), "one neighbour has all weight") if _count(problem) == 1 else {}
+
     def fit_single(self, rows: ReceiverRows) -> InverseDistance:
         """Keep the rows of a receiver."""
         settings: IdwSettings = rows.problem.settings
-        task = task_of(rows.problem.record)
-        k = task.neighbours if settings.neighbours is None else settings.neighbours
+        task, k = task_of(rows.problem.record), _count(rows.problem)
         softening_m = task.softening_m if settings.softening_m is None else settings.softening_m
         return InverseDistance(k, settings.power, softening_m).fit(rows.tx_pos_m, rows.observation)
 
     def load_single(self, receiver: Receiver, arrays: Arrays) -> InverseDistance:
         """The rows that were kept."""
         return InverseDistance.from_arrays(arrays)
+
+
+def _count(problem: Problem) -> int:
+    stated: int | None = problem.settings.neighbours
+    return task_of(problem.record).neighbours if stated is None else stated
 
 
 MODEL = Idw()

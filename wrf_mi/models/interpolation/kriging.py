@@ -7,8 +7,8 @@ Cov(z(x), z(x')) = s^2 c(x, x') and Var(e) = s^2 noise. The covariance is shared
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -18,12 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.optimize import minimize
 
-from ...core import InputError, Prediction, Receiver, Record
+from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
-from ...core.settings import CheckedSettings
+from ...core.settings import CheckedSettings, names_of
 from ...tasks import task_of
 from ..error_prior import ErrorPrior, with_columns
-from ..model import Arrays
+from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
 
@@ -149,11 +149,15 @@ class UncertainKriged(Kriged):
         return np.asarray(self.weights / np.diag(self._system.precision)[:, None])
 
     def prediction(self, tx_pos: FloatArray) -> Prediction:
-        """Observations and standard deviations at positions [m, 3], metres."""
+        """Observations, and standard deviations of these and of their mean, at positions [m, 3], metres."""
         mean, length_m = self.predict(tx_pos), self.lengths[0]
         cross = correlation(tx_pos / length_m, self.positions_m / length_m, self.kernel)
-        unknown = self.noise + self._system.variance(1.0, cross, self.trend(tx_pos))
-        return Prediction(mean, (np.sqrt(unknown)[:, None] * self.scale).reshape(mean.shape))
+        of_mean = self._system.variance(1.0, cross, self.trend(tx_pos))
+        std, std_mean = (
+            (np.sqrt(variance)[:, None] * self.scale).reshape(mean.shape)
+            for variance in (of_mean + self.noise, of_mean)
+        )
+        return Prediction(mean, std, std_mean=std_mean)
 
     def facts(self) -> dict[str, Any]:
         """Form, correlation length and noise."""
@@ -317,11 +321,14 @@ class KrigingSettings(CovarianceSettings):
     generic: bool = False
     heading: bool = True
 
-    @property
-    def is_generic(self) -> bool:
-        """Whether `generic` or any setting that only generic kriging has differs from its default."""
-        only = [setting for setting in fields(KrigingSettings) if setting.name != "heading"]
-        return any(getattr(self, setting.name) != setting.default for setting in only)
+
+GENERIC_ONLY = names_of(KrigingSettings) - {"generic", "heading"}
+"""Settings that only generic kriging has."""
+
+
+def asks_generic(problem: Problem) -> bool:
+    """Whether `KrigingSettings.generic` is set, or settings are stated that only generic kriging has."""
+    return problem.settings.generic or bool(GENERIC_ONLY & problem.stated_settings)
 
 
 class GenericKriging(ByReceiverModel):
@@ -335,6 +342,25 @@ class GenericKriging(ByReceiverModel):
         """Whether the settings let headings count, which matter to strengths alone."""
         return settings.heading and task_of(record).in_decibel
 
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Whether its trend is a law of distance."""
+        return _trend_name(problem) == LOG_DISTANCE
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of headings that do not count, and a choice of rows for a likelihood without free parameters."""
+        s, record, unused = problem.settings, problem.record, dict[str, str]()
+        turns = record.tx_heading_rad is not None and self.takes_headings(record, replace(s, heading=True))
+        if not turns:
+            why = "the data have no headings" if record.tx_heading_rad is None else "they count for strengths alone"
+            unused |= dict.fromkeys(("heading", "heading_length"), why)
+        elif not s.heading:
+            unused["heading_length"] = "heading=false"
+        if None not in (s.length_m, s.noise, *([s.heading_length] if turns and s.heading else [])):
+            unused["likelihood_rows"] = "lengths and noise are stated"
+        if "generic" in problem.stated_settings and not s.generic:
+            unused |= dict.fromkeys(GENERIC_ONLY, "generic=false")
+        return unused
+
     def fit_single(self, rows: ReceiverRows) -> Single:
         """Kriging of the observations themselves, see `kriged`."""
         return kriged(rows)
@@ -344,6 +370,10 @@ class GenericKriging(ByReceiverModel):
         if SCALE not in arrays:
             return Kriged.from_arrays(arrays, receiver)
         return UncertainKriged.from_arrays(arrays, receiver, noise=float(arrays["noise"]), scale=arrays[SCALE])
+
+
+def _trend_name(problem: Problem) -> str:
+    return problem.settings.trend or (LOG_DISTANCE if task_of(problem.record).in_decibel else CONSTANT)
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:
@@ -359,7 +389,7 @@ def kriged(rows: ReceiverRows) -> Kriged:
     s, record = rows.problem.settings, rows.problem.record
     if s.heading_length is not None and record.tx_heading_rad is None:
         raise InputError(f"{record.name}: has no headings for kriging's heading_length; omit the setting")
-    name = s.trend or (LOG_DISTANCE if task_of(record).in_decibel else CONSTANT)
+    name = _trend_name(rows.problem)
     if name not in (CONSTANT, LOG_DISTANCE):
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
     # The law of distance is that of the whole room: each row weighs the same in it, however dense the rows around it.

@@ -11,16 +11,17 @@ Mobile Computing 14, 1231 (2015); Rappaport, "Wireless Communications" (2002), s
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Receiver, Record
+from ...core import InputError, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..model import Arrays
+from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows
 from .kriging import Trend
 
@@ -75,6 +76,14 @@ class Mri(ByReceiverModel):
     summary = "log-distance path loss of each receiver"
     tasks = ("rssi",)
     new_receivers = True
+
+    def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """The law is of the distance from them."""
+        return True
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """``shared`` for a single receiver."""
+        return {"shared": "there is one receiver"} if len(problem.record.receivers) == 1 else {}
 
     def fit_single(self, rows: ReceiverRows) -> PathLoss:
         """The law of a receiver, or that of all receivers."""

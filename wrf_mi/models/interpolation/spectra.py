@@ -17,7 +17,7 @@ Source: Rice, "Mathematical analysis of random noise" (1944), section 3.10.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -28,18 +28,19 @@ from scipy.constants import speed_of_light
 from scipy.spatial.distance import cdist
 from scipy.special import i0e, i1e
 
-from ...core import InputError, Prediction, Receiver
+from ...core import InputError, Prediction, Receiver, Split
 from ...core.angles import FloatArray, pixel_directions
 from ...core.array_files import keyed
-from ...core.settings import Count
+from ...core.settings import Count, names_of
+from ...datasets.observations import rows_received
 from ...parallel.threads import one_blas_thread
 from ...receivers.array import Lags, array_response
 from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks.scores import REAL_90
 from ...training.session import OnProgress
-from ..model import Arrays, field_arrays, from_field_arrays
+from ..model import Arrays, Problem, field_arrays, from_field_arrays
 from .by_receiver import ReceiverRows, Single, observed_rows
-from .kriging import GenericKriging, KrigingSettings, UncertainKriged, kriged
+from .kriging import GenericKriging, KrigingSettings, UncertainKriged, asks_generic, kriged
 from .kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight
 from .signals import ComplexArray, Covariances, Posterior, SignalProcess, departures, fit_signals
 
@@ -81,6 +82,10 @@ class SpectrumKrigingSettings(KrigingSettings):
     directions: Count = 120
     lengths: Count = 4
     FIXED: ClassVar[Mapping[str, float]] = {"longest": LONGEST, "shortest": SHORTEST}
+
+
+OF_SIGNALS = names_of(SpectrumKrigingSettings) - names_of(KrigingSettings)
+"""Settings of the process of element signals."""
 
 
 def rician(mean: NDArray[Any], variance: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
@@ -328,6 +333,16 @@ class SpectrumKriging(GenericKriging):
     settings = SpectrumKrigingSettings
     headings = False  # a spectrum has no scale on which the transmitter's pattern could act
 
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of element signals where the spectra themselves are kriged."""
+        record, unused = problem.record, super().unused_settings(problem, splits)
+        arrays = any(receiver.array_m is not None for receiver in record.receivers)
+        few = max(rows_received(record, split.all_train).max() for split in splits) < LEAST_ROWS
+        if asks_generic(problem) or not arrays or record.frequencies_hz is None or few:
+            why = "the spectra themselves are kriged, not signals of an array's elements"
+            return {**unused, **dict.fromkeys(OF_SIGNALS, why)}
+        return unused
+
     def fit_single(self, rows: ReceiverRows) -> Single:
         """Kriging of the spectra of one receiver.
 
@@ -338,7 +353,7 @@ class SpectrumKriging(GenericKriging):
             InputError: no row that was received.
         """
         record, receiver, frequencies_hz = rows.problem.record, rows.receiver, rows.problem.record.frequencies_hz
-        if rows.problem.settings.is_generic or receiver.array_m is None or frequencies_hz is None:
+        if asks_generic(rows.problem) or receiver.array_m is None or frequencies_hz is None:
             return kriged(rows)
         position_m, observed, _ = observed_rows(rows.tx_pos_m, rows.observation)
         frequency_hz = float(frequencies_hz[0])
@@ -350,6 +365,8 @@ class SpectrumKriging(GenericKriging):
                         raise InputError(f"{len(observed)} rows are too many for a process of element signals")
                     signals = _retrieved(observed, lags, rows.problem.seed, rows.on_progress)
                 except InputError as error:  # or a line of elements, or elements too far apart for lags
+                    if stated := OF_SIGNALS & rows.problem.stated_settings:
+                        raise InputError(f"setting {min(stated)}: no effect, as {error}; omit it") from None
                     what = f"{record.name}, receiver {receiver.name}"
                     logger.warning("%s: the spectra themselves are kriged: %s", what, error)
                 else:

@@ -1,23 +1,14 @@
-"""Fit of signal strengths: Gaussian processes, folds, choice of hyperparameters, calibration of predictions.
+"""Fit of signal strengths: expected power, folds, choice of hyperparameters, calibration of predictions.
 
-The processes of the receivers share part of their mean:
-
-    y_r(x) = phi_r(x) . beta + f_r(x) + e,    beta ~ N(0, diag(sd^2)),  f_r ~ GP(0, k),  e ~ Student-t
-
-beta is common to all receivers and learned from all of them; the fields f_r are independent, so that the exact
-posterior needs one Cholesky factor for each receiver (`wrf_mi.models.interpolation.kriging_equations`). The noise's
-heavy tails are reached by reweighting: a row with a large residual has a larger variance.
-
-Source: Rasmussen and Williams, "Gaussian Processes for Machine Learning" (2006), sections 2.2 and 2.7 (mean with
-explicit basis functions); Lange, Little and Taylor, "Robust statistical modeling using the t distribution" (1989),
-JASA 84 (the weights).
+The processes of the receivers are those of `wrf_mi.models.interpolation.pooled_process`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.constants import speed_of_light
@@ -26,26 +17,20 @@ from scipy.spatial import cKDTree
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ...parallel.threads import on_threads
 from ...tasks.scores import REAL_90
-from .kriging_equations import KrigingSystem
-from .strength_terms import NEAREST_M, NOISE, Hyperparameters, Measured, Poses, Stops, basis
+from .pooled_process import PooledProcess, ReceiverObservations, of_each
+from .strength_terms import NEAREST_M, NOISE, PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced
 
-Result = TypeVar("Result")
-Kernel = Callable[[Any, Any], FloatArray]
-"""Covariance [n, m] of the field between two sets of inputs."""
-
-THREADED_ROWS = 1000  # rows of all receivers from which these are computed on threads
-JITTER = 1e-9  # noise added to coincident inputs, as a share of the field's variance
-DEGREES = 4.0  # degrees of freedom of the noise's Student-t distribution: fades are deep
 FREE_SPACE = 2.0  # exponent of the distance in free space
 FOLDS = 7
 STRETCH = (4, 150)
 """Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
 BUFFER = 0.25  # share of a stretch that is left out on either side of it, as consecutive rows share noise
+SEARCHED, SEARCHED_OF_HEADINGS = ("shadow_db", "shadow_m", *PARTS_OF_NOISE), ("body_db", "body_m", "lever_m")
+"""Hyperparameters that the search may change, the latter where headings count."""
 LEAST_GAIN_DB = 0.005  # least reduction of the held-out error by which the search changes a parameter
 MOST_STEPS = 5  # steps of one parameter in one direction
 TRUST = 500.0  # number of held-out values that weigh as much as the prior in estimates from their distribution
@@ -58,97 +43,6 @@ AREA_SHADOW_DB, AREA_NOISE_DB = 6.0, 2.0  # shadowing of areas a priori, and bot
 LIKELIHOOD_STOPS, LIKELIHOOD_RECEIVERS, LIKELIHOOD_STEPS = 400, 12, 80
 """Largest numbers of stops and receivers in the likelihood, those with most rows, and of its evaluations."""
 COVERED = 0.9  # share of residuals that calibrated intervals cover
-
-
-def _of_each(work: Callable[[Any], Result], parts: Sequence[Any], rows: int) -> list[Result]:
-    """Results of ``work(part)``, on threads where so many rows take longer than to start these."""
-    return on_threads(work, parts) if rows > THREADED_ROWS else [work(part) for part in parts]
-
-
-@dataclass(frozen=True)
-class ReceiverObservations:
-    """Observations of one receiver: inputs of the kernel, phi [n, k], y [n], variance of the noise [n]."""
-
-    inputs: Any
-    basis: FloatArray
-    value: FloatArray
-    variance: FloatArray
-
-
-class PooledProcess:
-    """The posterior of all receivers.
-
-    ``parts`` are the observations of each receiver, possibly without rows; ``prior_sd`` [k] the standard deviations of
-    beta, above zero; ``point_variance`` is k(x, x); ``rounds`` reweight rows for Student-t noise; ``beta`` [k] is the
-    posterior mean of the shared coefficients.
-
-    Raises:
-        numpy.linalg.LinAlgError: a covariance that is not positive definite.
-    """
-
-    def __init__(
-        self,
-        parts: Sequence[ReceiverObservations],
-        kernel: Kernel,
-        prior_sd: FloatArray,
-        point_variance: float,
-        rounds: int = 0,
-    ) -> None:
-        self._kernel, self._prior_sd, self._point_variance = kernel, prior_sd, point_variance
-        self._solve(parts)
-        for _ in range(rounds):
-            self._solve(self._reweighted([part.variance for part in parts]))
-
-    def _solve(self, parts: Sequence[ReceiverObservations]) -> None:
-        kernel, jitter, self._parts = self._kernel, JITTER * self._point_variance, parts
-
-        def system(p: ReceiverObservations) -> KrigingSystem:
-            return KrigingSystem(kernel(p.inputs, p.inputs), p.variance + jitter, p.basis)
-
-        self._systems = _of_each(system, parts, sum(len(p.value) for p in parts))
-        pairs = list(zip(self._systems, parts, strict=True))
-        # Receivers are independent given beta: their information adds up to the prior's (equation 2.41).
-        self._information = np.diag(1 / np.square(self._prior_sd)) + sum(system.information for system in self._systems)
-        self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
-        self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
-
-    @property
-    def cost(self) -> float:
-        """Minus twice the logarithm of the marginal likelihood of the observations, up to a constant."""
-        # y ~ N(0, K + B S B^T), by the lemmas of inversion and determinants: rows of receivers share beta alone.
-        pairs = list(zip(self._systems, self._parts, strict=True))
-        square = sum(float(part.value @ system.solve(part.value)) for system, part in pairs)
-        square -= float(self.beta @ self._information @ self.beta)
-        volume = float(np.linalg.slogdet(self._information)[1] + 2 * np.log(self._prior_sd).sum())
-        return square + volume + sum(system.log_determinant for system in self._systems)
-
-    def predict(self, receiver: int, inputs: Any, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis`` [m, k]."""
-        cross = self._kernel(inputs, self._parts[receiver].inputs)
-        mean = basis @ self.beta + cross @ self._weights[receiver]
-        return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self._information)
-
-    def weights(self, receiver: int) -> tuple[Any, FloatArray]:
-        """Inputs of a receiver's observations, and weights [n] of the field's covariances with them in a mean."""
-        return self._parts[receiver].inputs, self._weights[receiver]
-
-    def _reweighted(self, variance: Sequence[FloatArray]) -> list[ReceiverObservations]:
-        """Parts with the noise variances that their residuals imply for Student-t noise.
-
-        The expected squared residual, posterior variance of the field included, is compared with the squared scale
-        ``variance`` of each row's noise, [n] for each receiver: v = s (degrees + e^2 / s) / (degrees + 1).
-        """
-
-        def reweighted(receiver: int) -> ReceiverObservations:
-            part, system, weights = self._parts[receiver], self._systems[receiver], self._weights[receiver]
-            scale = variance[receiver]
-            # y - f = V K^-1 (y - B beta); the field's posterior variance is the diagonal of V - V K^-1 V.
-            precision = np.square(system.whiten(np.eye(len(part.value)))).sum(axis=0)
-            residual = part.variance * weights
-            square = residual**2 + np.maximum(part.variance - part.variance**2 * precision, 0)
-            return replace(part, variance=scale * (DEGREES + square / scale) / (DEGREES + 1))
-
-        return _of_each(reweighted, range(len(variance)), sum(len(scale) for scale in variance))
 
 
 @dataclass(frozen=True)
@@ -183,14 +77,25 @@ class StrengthPosterior:
     """Posterior of the signal strengths, given stops (possibly none) and hyperparameters.
 
     ``ratio`` [n_rx] is that of each receiver's noise to the noise of all; ``rounds`` reweight for Student-t noise.
+    Means are those of ``hyperparameters``, deviations those of ``spread`` (`likely_deviations`); None: the same.
     """
 
     def __init__(
-        self, prior: PriorMean, hyperparameters: Hyperparameters, ratio: FloatArray, stops: Stops, rounds: int = 0
+        self,
+        prior: PriorMean,
+        hyperparameters: Hyperparameters,
+        ratio: FloatArray,
+        stops: Stops,
+        rounds: int = 0,
+        spread: Hyperparameters | None = None,
     ) -> None:
         self.prior, self.hyperparameters, self.ratio, self.stops = prior, hyperparameters, ratio, stops
-        self.rounds, self.headings = rounds, stops.poses.heading_rad is not None
-        h, parts = hyperparameters, []
+        self.spread, self.rounds = spread or hyperparameters, rounds
+        self.headings = stops.poses.heading_rad is not None
+        self._process = self._process_of(hyperparameters)
+
+    def _process_of(self, h: Hyperparameters) -> PooledProcess:
+        prior, stops, ratio, parts = self.prior, self.stops, self.ratio, []
         for receiver in range(len(prior.receivers_m)):
             received = np.isfinite(stops.value_dbm[receiver])
             poses = stops.poses.take(received).moved(h.lever_m)
@@ -198,7 +103,11 @@ class StrengthPosterior:
             # Reports of a stop average their own noise out, but not the fading that persists during the stop.
             variance = (h.drift_db**2 + h.noise_db**2 / stops.count[receiver, received]) * ratio[receiver] ** 2
             parts.append(ReceiverObservations(poses, columns, stops.value_dbm[receiver, received] - expected, variance))
-        self._process = PooledProcess(parts, h.covariance, sd, h.variance(self.headings), rounds)
+        return PooledProcess(parts, h.covariance, sd, h.variance(self.headings), self.rounds)
+
+    @cached_property
+    def _spread_process(self) -> PooledProcess:
+        return self._process if self.spread == self.hyperparameters else self._process_of(self.spread)
 
     @property
     def cost(self) -> float:
@@ -206,7 +115,7 @@ class StrengthPosterior:
         return self._process.cost
 
     def predict(self, poses: Sequence[Poses], receiver: int) -> list[tuple[FloatArray, FloatArray]]:
-        """Mean in dBm, and variance of a single report about it before calibration, [m] each, of several poses [m]."""
+        """Mean in dBm, and variance of the local mean power about it, [m] each, of several poses [m]."""
         h = self.hyperparameters
         moved = [each.moved(h.lever_m) for each in poses]
         # Paths may be traced for the mean, which is not for threads.
@@ -214,9 +123,16 @@ class StrengthPosterior:
 
         def posterior(k: int) -> tuple[FloatArray, FloatArray]:
             mean, variance = self._process.predict(receiver, moved[k], terms[k][1])
-            return terms[k][0] + mean, variance + (h.drift_db**2 + h.noise_db**2) * self.ratio[receiver] ** 2
+            if spread is not self._process:
+                variance = spread.predict(receiver, moved[k], terms[k][1])[1]
+            return terms[k][0] + mean, variance
 
-        return _of_each(posterior, range(len(poses)), sum(map(len, poses)))
+        spread = self._spread_process  # computed here, not on threads
+        return of_each(posterior, range(len(poses)), sum(map(len, poses)))
+
+    def noise(self, receiver: int) -> float:
+        """Variance of a single report about the local mean power, dB^2."""
+        return float((self.spread.drift_db**2 + self.spread.noise_db**2) * self.ratio[receiver] ** 2)
 
     def mean(self, poses: Poses, receiver: int) -> FloatArray:
         """The mean of `predict`, dBm."""
@@ -226,12 +142,14 @@ class StrengthPosterior:
         return expected + columns @ self._process.beta + field
 
 
-def by_likelihood(prior: PriorMean, stops: Stops, start: Hyperparameters) -> tuple[PriorMean, Hyperparameters]:
+def by_likelihood(
+    prior: PriorMean, stops: Stops, start: Hyperparameters, stated: Collection[str] = ()
+) -> tuple[PriorMean, Hyperparameters]:
     """Mean and hyperparameters over an area larger than the rooms that ``start`` is for.
 
     Shadowing, noise and the deviation of the receivers' patterns, which may be sectors, have the greatest posterior
     density. The length is a priori the geometric mean of the stops' spacing and half of their extent, uncertain by a
-    factor e.
+    factor e. Hyperparameters that are ``stated`` hold.
     """
     stops, few = stops.thinned(LIKELIHOOD_STOPS), prior
     if prior.traced is None and len(prior.receivers_m) > LIKELIHOOD_RECEIVERS:
@@ -246,16 +164,37 @@ def by_likelihood(prior: PriorMean, stops: Stops, start: Hyperparameters) -> tup
 
     def at(logarithms: FloatArray, prior: PriorMean) -> tuple[PriorMean, Hyperparameters]:
         shadow_db, shadow_m, noise_db, rx_sd_db = map(float, np.exp(logarithms))
-        field = replace(start, shadow_db=shadow_db, shadow_m=shadow_m, drift_db=noise_db, noise_db=noise_db)
+        chosen = {"shadow_db": shadow_db, "shadow_m": shadow_m, "drift_db": noise_db, "noise_db": noise_db}
+        field = replace(start, **{name: value for name, value in chosen.items() if name not in stated})
         return replace(prior, rx_sd_db=rx_sd_db), field
 
-    def cost(logarithms: FloatArray) -> float:
-        fit = StrengthPosterior(*at(logarithms, few), ratio, stops)
-        return fit.cost + float(np.square((logarithms - middle) / deviation).sum())
+    parts = (("shadow_db",), ("shadow_m",), PARTS_OF_NOISE)
+    free = np.array([*(not {*names} <= {*stated} for names in parts), True])
 
-    simplex = np.vstack([middle, middle + np.diag(deviation)])
+    def every(chosen: FloatArray) -> FloatArray:
+        logarithms = middle.copy()
+        logarithms[free] = chosen
+        return logarithms
+
+    def cost(chosen: FloatArray) -> float:
+        fit = StrengthPosterior(*at(every(chosen), few), ratio, stops)
+        return fit.cost + float(np.square((chosen - middle[free]) / deviation[free]).sum())
+
+    simplex = np.vstack([middle[free], middle[free] + np.diag(deviation[free])])
     options = {"initial_simplex": simplex, "maxfev": LIKELIHOOD_STEPS, "xatol": 0.05, "fatol": 0.1}
-    return at(minimize(cost, middle, method="Nelder-Mead", options=options).x, prior)
+    return at(every(minimize(cost, middle[free], method="Nelder-Mead", options=options).x), prior)
+
+
+def likely_deviations(
+    prior: PriorMean, stops: Stops, hyperparameters: Hyperparameters, stated: Collection[str]
+) -> Hyperparameters:
+    """Hyperparameters with the deviations of shadowing and noise by likelihood, at the stated or chosen length.
+
+    Hyperparameters that predict well may state deviations that are wrong: a mean depends on the ratio of field and
+    noise, and little on that. The likelihood tells both, by differences of rows at all distances, so that what a
+    reading adds to the uncertainty of the mean is known. Parameters that are ``stated`` hold.
+    """
+    return by_likelihood(prior, stops, hyperparameters, {*stated, "shadow_m"})[1]
 
 
 def scales(position_m: FloatArray) -> tuple[float, float]:
@@ -290,12 +229,13 @@ class Fit:
     def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops]) -> None:
         self._prior, self._measured = prior, measured
         self.ratio = np.ones(len(prior.receivers_m))
+        self.spread: Hyperparameters | None = None
         self._folds = [(join(measured.take(train)), held_out) for train, held_out in folds(len(measured.rows))]
 
     def held_out(
         self, hyperparameters: Hyperparameters, rounds: int = 0, unheard: bool = False
     ) -> tuple[FloatArray, FloatArray]:
-        """Mean (dBm) and standard deviation [n_rx, n] of each row by the fold without it; NaN where none.
+        """Mean (dBm) and standard deviation of a reading [n_rx, n] of each row by the fold without it; NaN where none.
 
         With ``unheard``, receivers are predicted from the others: every second one by the first two folds.
         """
@@ -305,7 +245,7 @@ class Fit:
             hidden = (np.arange(len(mean)) % 2 == number) & unheard
             value_dbm = np.where(hidden[:, None], np.nan, stops.value_dbm)
             field = StrengthPosterior(
-                self._prior, hyperparameters, self.ratio, replace(stops, value_dbm=value_dbm), rounds
+                self._prior, hyperparameters, self.ratio, replace(stops, value_dbm=value_dbm), rounds, self.spread
             )
             predicts = hidden | (not unheard)
             measured_dbm = np.where(predicts[:, None], self._measured.value_dbm, np.nan)
@@ -318,9 +258,10 @@ class Fit:
             ) -> tuple[FloatArray, FloatArray]:
                 return field.predict([self._measured.poses.take(received[receiver])], receiver)[0]
 
-            predictions = _of_each(predicted, range(len(mean)), sum(map(len, received)))
+            predictions = of_each(predicted, range(len(mean)), sum(map(len, received)))
             for receiver, (value, variance) in enumerate(predictions):
-                mean[receiver, received[receiver]], std[receiver, received[receiver]] = value, np.sqrt(variance)
+                total = variance + field.noise(receiver)
+                mean[receiver, received[receiver]], std[receiver, received[receiver]] = value, np.sqrt(total)
         return mean, std
 
     def _residual(self, hyperparameters: Hyperparameters) -> FloatArray:
@@ -334,10 +275,12 @@ class Fit:
         # Shrunk towards 1 in the logarithm: the spread of few residuals is chance.
         self.ratio = np.clip(spread / np.median(spread), *RATIO) ** (count / (count + TRUST))
 
-    def search(self, hyperparameters: Hyperparameters, on_progress: Callable[[float], None]) -> Hyperparameters:
+    def search(
+        self, hyperparameters: Hyperparameters, stated: Collection[str], on_progress: Callable[[float], None]
+    ) -> Hyperparameters:
         """Change one parameter at a time while that lowers the mean absolute held-out error by `LEAST_GAIN_DB`.
 
-        One pass through all parameters; ``on_progress`` takes the fraction done.
+        One pass through all parameters that are not ``stated``; ``on_progress`` takes the fraction done.
         """
 
         def error_db(candidate: Hyperparameters) -> float:
@@ -345,15 +288,14 @@ class Fit:
 
         names = ["shadow_db", "shadow_m", NOISE]
         if self._measured.poses.heading_rad is not None:
-            names += ["body_db", "body_m", "lever_m"]
+            names += SEARCHED_OF_HEADINGS
         # Each error fits all folds anew, a Cholesky factor for every receiver: only a few steps are affordable.
         best = error_db(hyperparameters)
         for done, name in enumerate(names, start=1):
             for sign in (1, -1):
                 for _ in range(MOST_STEPS):
-                    candidate = hyperparameters.changed(name, sign)
-                    error = error_db(candidate)
-                    if error > best - LEAST_GAIN_DB:
+                    candidate = hyperparameters.changed(name, sign, stated)
+                    if candidate == hyperparameters or (error := error_db(candidate)) > best - LEAST_GAIN_DB:
                         break
                     best, hyperparameters = error, candidate
             on_progress(done / len(names))

@@ -7,7 +7,8 @@ held-out stretches of the training rows (`strength_fit`). Terms that all receive
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -15,18 +16,32 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Prediction, Record
+from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray
+from ...core.settings import changed, names_of
 from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS
+from ...parallel.threads import one_blas_thread
 from ...tasks import require
 from ...training.session import OnProgress, quiet
 from ..error_prior import ErrorPrior, with_columns
-from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
+from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays
 from .by_receiver import finite_positions
 from .kriging import KrigingSettings
-from .strength_fit import AREA_M, Fit, PriorMean, StrengthPosterior, by_likelihood, scales, shift_of, widening
-from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
+from .strength_fit import (
+    AREA_M,
+    SEARCHED,
+    SEARCHED_OF_HEADINGS,
+    Fit,
+    PriorMean,
+    StrengthPosterior,
+    by_likelihood,
+    likely_deviations,
+    scales,
+    shift_of,
+    widening,
+)
+from .strength_terms import OF_HEADINGS, Hyperparameters, Measured, Poses, Stops, stops_of
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced, Tracer
@@ -47,11 +62,14 @@ EXPONENT_SD = (1.0, 0.3)
 TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
 BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
+EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
 
 
 @dataclass(frozen=True)
 class StrengthSettings(KrigingSettings, Hyperparameters):
-    """Settings of kriging of signal strengths; hyperparameters are those at the start of the search.
+    """Settings of kriging of signal strengths.
+
+    Hyperparameters that are stated hold; others are those at the start of a search, or priors of a likelihood.
 
     Attributes:
         transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
@@ -70,13 +88,31 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
 
     @property
     def hyperparameters(self) -> Hyperparameters:
-        """Start of the search."""
+        """Stated hyperparameters, and the start of a search for the others."""
         return Hyperparameters(**{each.name: getattr(self, each.name) for each in fields(Hyperparameters)})
+
+
+POOLED_ONLY = names_of(StrengthSettings) - names_of(KrigingSettings)
+"""Settings that kriging of each receiver alone lacks."""
+
+
+def unused_of_pooled(problem: Problem, splits: Sequence[Split]) -> dict[str, str]:
+    """Settings without effect on pooled strengths: of headings that do not count, and of a search that is not made."""
+    s, record, unused = problem.settings, problem.record, dict[str, str]()
+    turns = s.heading and record.tx_heading_rad is not None
+    if not turns:
+        unused = dict.fromkeys(OF_HEADINGS, "heading=false" if not s.heading else "the data have no headings")
+    searched = [*SEARCHED, *(SEARCHED_OF_HEADINGS if turns else ())]
+    if problem.stated_settings.issuperset(searched):
+        unused["search_rows"] = "all hyperparameters of the search are stated"
+    elif all(scales(record.tx_pos_m[split.all_train])[1] > AREA_M for split in splits):
+        unused["search_rows"] = f"rows extend over more than {AREA_M:g} m, where no search chooses hyperparameters"
+    return unused
 
 
 @dataclass(eq=False, repr=False)
 class Strengths(Fitted):
-    """Fitted signal strengths; made by `fit_strengths`. Standard deviations are those of a single report."""
+    """Fitted signal strengths; made by `fit_strengths`."""
 
     field: StrengthPosterior
     shift_db: float
@@ -88,19 +124,22 @@ class Strengths(Fitted):
         self.uses_heading = self.field.headings
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Signal strengths in dBm and their standard deviations, see `Fitted`.
+        """Signal strengths in dBm with standard deviations of a reading and of the local mean power, see `Fitted`.
 
         Raises:
             InputError: positions that are not known.
         """
         position_m = finite_positions(inputs, "kriging")
-        mean, std = np.empty((2, len(position_m)))
+        mean, std, std_mean = np.empty((3, len(position_m)))
+        noise = self.field.noise(receiver) * self.widen[receiver] ** 2
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
-            means, variances = zip(*self.field.predict(poses, receiver), strict=True)
+            with one_blas_thread():
+                means, variances = zip(*self.field.predict(poses, receiver), strict=True)
             # Of unknown headings: variance within each, and between their means.
             variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
-            mean[rows], std[rows] = np.mean(means, axis=0) + self.shift_db, np.sqrt(variance)
-        return Prediction(mean, std)
+            mean[rows] = np.mean(means, axis=0) + self.shift_db
+            std[rows], std_mean[rows] = np.sqrt(variance + noise), np.sqrt(variance)
+        return Prediction(mean, std, std_mean=std_mean)
 
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict` in a fraction of its time: variances take the most of that."""
@@ -109,6 +148,25 @@ class Strengths(Fitted):
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
             mean[rows] = np.mean([self.field.mean(each, receiver) for each in poses], axis=0) + self.shift_db
         return mean
+
+    def tracing_once(self) -> Strengths:
+        """The model about a traced mean that keeps powers, see `Fitted`; itself about any other mean."""
+        traced = self.field.prior.traced
+        if traced is None or not traced.exact:
+            return self
+        field = copy(self.field)
+        field.prior = replace(field.prior, traced=traced.keeping())
+        return replace(self, field=field)
+
+    def refit(self, record: Record, rows: IntArray) -> Strengths:
+        """The posterior given some rows, see `Fitted`; factors of deviations are those of held-out stretches of all."""
+        field = self.tracing_once().field
+        stops = _stops(_measured(record, rows, field.headings))
+        with one_blas_thread():
+            posterior = StrengthPosterior(
+                field.prior, field.hyperparameters, field.ratio, stops, field.rounds, field.spread
+            )
+        return replace(self, field=posterior)
 
     def _chunks(self, position_m: FloatArray, heading_rad: FloatArray | None) -> list[tuple[slice, list[Poses]]]:
         """Slices of the rows, and poses that predictions are averaged over.
@@ -127,7 +185,7 @@ class Strengths(Fitted):
     def error_prior(self, receiver: int) -> ErrorPrior:
         """Shadowing and the uncertain terms of the mean, about the stops of the training rows."""
         field, widen = self.field, self.widen[receiver] ** 2
-        h, received = field.hyperparameters, np.isfinite(field.stops.value_dbm[receiver])
+        h, received = field.spread, np.isfinite(field.stops.value_dbm[receiver])
         # Headings of a plan are not known: the part of the field that depends on them is noise there.
         turned = h.body_db**2 if field.headings else 0.0
 
@@ -166,11 +224,12 @@ class Strengths(Fitted):
             "fact.name": np.array(list(self.fit_facts)),
             "fact.value": np.array(list(self.fit_facts.values()), float),
             **field_arrays(field.hyperparameters, "knob."),
+            **field_arrays(field.spread, "spread."),
         }
         if prior.traced is not None:
             arrays |= field_arrays(prior.traced.local if prior.traced.exact else prior.traced, "map.")
             if prior.traced.exact:
-                arrays["exact.traced_dbm"] = prior.traced.traced_dbm(stops.poses.position_m)
+                arrays[EXACT] = prior.traced.traced_dbm(stops.poses.position_m)
         return {name: np.asarray(value) for name, value in arrays.items()}
 
     @classmethod
@@ -181,10 +240,10 @@ class Strengths(Fitted):
             from ...tracing.power_map import PowerMap, TracedPower  # the tracer is imported where there is a scene
 
             traced = from_field_arrays(PowerMap, arrays, "map.")
-            if "exact.traced_dbm" in arrays:
+            if EXACT in arrays:
                 assert trace is not None
                 positions_m = arrays["stop.position_m"]
-                power_dbm = arrays["exact.traced_dbm"].T
+                power_dbm = arrays[EXACT].T
                 known = dict(zip(map(np.ndarray.tobytes, positions_m), power_dbm, strict=True))
                 traced = TracedPower(traced, trace, np.arange(power_dbm.shape[1]), known, keeps=False)
         transmit_dbm, frequency_hz = float(arrays["base"][0]), arrays["base"][1:]
@@ -193,7 +252,10 @@ class Strengths(Fitted):
         poses = from_field_arrays(Poses, arrays, "stop.")
         stops = Stops(poses, *(arrays[f"stop.{name}"] for name in ("value_dbm", "count", "row")))
         hyperparameters = from_field_arrays(Hyperparameters, arrays, "knob.")
-        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]))
+        spread = hyperparameters  # earlier versions stored no other
+        if "spread.shadow_m" in arrays:
+            spread = from_field_arrays(Hyperparameters, arrays, "spread.")
+        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]), spread)
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         return cls(field, float(arrays["shift_db"]), arrays["widen"], facts)
 
@@ -208,6 +270,9 @@ class Strengths(Fitted):
             "noise_ratio": [float(ratio) for ratio in self.field.ratio],
             "shift_db": self.shift_db,
             "widen": [float(factor) for factor in self.widen],
+            "noise_of_reading_db": [
+                float(np.sqrt(self.field.noise(k)) * factor) for k, factor in enumerate(self.widen)
+            ],
             **self.fit_facts,
         }
         return {"fitted": fitted}
@@ -219,6 +284,7 @@ def fit_strengths(
     power_map: Traced | None = None,
     settings: StrengthSettings = StrengthSettings(),
     on_progress: OnProgress = quiet,
+    stated: Collection[str] | None = None,
 ) -> Strengths:
     """Fit signal strengths to some rows of a record; nothing is drawn, so there is no seed.
 
@@ -228,6 +294,8 @@ def fit_strengths(
         power_map: traced power, a local mean or at positions themselves; None: free space is expected.
         settings: settings.
         on_progress: progress callback.
+        stated: names of the hyperparameters that hold, whatever a search or likelihood chooses for the others; None:
+            those that differ from their defaults.
 
     Raises:
         InputError: a record of another task or without its carrier, or neither rows nor a map.
@@ -235,37 +303,31 @@ def fit_strengths(
     require(record, "rssi", why="these strengths are in dBm")
     if record.frequencies_hz is None:
         raise InputError(f"{record.name}: carrier frequency unknown; state it in the data")
-    rows = np.unique(np.asarray(rows, np.int64))
-    values = np.asarray(record.observation[:, rows], float)
-    received = np.isfinite(values).any(axis=0)
-    rows, values = rows[received], values[:, received]
+    measured = _measured(record, rows, settings.heading)
+    rows, values = measured.rows, measured.value_dbm
     if not len(rows) and power_map is None:
         raise InputError(f"{record.name}: neither a training row that was received nor a scene; give one of them")
-    heading = record.tx_heading_rad if settings.heading else None
-    poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
-    measured = Measured(poses, values, rows, record.precision(rows))
     prior = _prior(record, measured, power_map, settings)
-    hyperparameters = settings.hyperparameters
-
-    def join(rows: Measured, factor: float = 1.0) -> Stops:
-        stops = stops_of(rows, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
-        return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(values))))
-
+    hyperparameters, stated = settings.hyperparameters, changed(settings) if stated is None else stated
     ratio, widen = np.ones((2, len(values)))
+    spread: Hyperparameters | None = None
     # Traces at exact positions have no fades left in what they do not predict.
     skew_db = 0.0 if power_map is not None and power_map.exact else SKEW_DB
     shift, facts = skew_db, {"rows": float(len(rows))}
     if len(rows) > 1:
-        if scales(poses.position_m)[1] > AREA_M:
-            prior, hyperparameters = by_likelihood(prior, join(measured), hyperparameters)
+        over_area = scales(measured.poses.position_m)[1] > AREA_M
+        if over_area:
+            prior, hyperparameters = by_likelihood(prior, _stops(measured), hyperparameters, stated)
         elif len(rows) >= settings.search_rows:
-            search = Fit(prior, measured, partial(join, factor=WIDER))
+            search = Fit(prior, measured, partial(_stops, factor=WIDER))
             search.set_ratio(hyperparameters)
             hyperparameters = search.search(
-                hyperparameters, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
+                hyperparameters, stated, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
             )
-        fit = Fit(prior, measured, join)
+        fit = Fit(prior, measured, _stops)
         fit.set_ratio(hyperparameters)
+        if not over_area:  # there the hyperparameters are those of a likelihood
+            fit.spread = spread = likely_deviations(prior, _stops(measured), hyperparameters, stated)
         on_progress("strengths: held-out rows", 0.8)
         mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
         residual = values - mean
@@ -279,9 +341,25 @@ def fit_strengths(
         if np.isfinite(residual).any():
             facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
     on_progress("strengths: all rows", 0.9)
-    field = StrengthPosterior(prior, hyperparameters, ratio, join(measured), ROBUST_ROUNDS)
+    field = StrengthPosterior(prior, hyperparameters, ratio, _stops(measured), ROBUST_ROUNDS, spread)
     on_progress("strengths: all rows", 1.0)
     return Strengths(field, shift, widen, facts)
+
+
+def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:
+    """Those of some rows of a record that a receiver received, with or without headings."""
+    rows = np.unique(np.asarray(rows, np.int64))
+    values = np.asarray(record.observation[:, rows], float)
+    received = np.isfinite(values).any(axis=0)
+    rows, values = rows[received], values[:, received]
+    heading = record.tx_heading_rad if headings else None
+    poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
+    return Measured(poses, values, rows, record.precision(rows))
+
+
+def _stops(measured: Measured, factor: float = 1.0) -> Stops:
+    stops = stops_of(measured, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
+    return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(measured.value_dbm))))
 
 
 def _prior(record: Record, measured: Measured, power_map: Traced | None, settings: StrengthSettings) -> PriorMean:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError, Receiver, Record
+from ...core import InputError, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count
-from ..model import Arrays
+from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows, observed_rows
 
 
@@ -133,6 +134,10 @@ class TreesModel(ByReceiverModel):
     def takes_headings(self, record: Record, settings: Trees) -> bool:
         """As the settings say."""
         return settings.heading
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """``heading`` where the data have none."""
+        return {"heading": "the data have no headings"} if problem.record.tx_heading_rad is None else {}
 
     def fit_single(self, rows: ReceiverRows) -> GrownTrees:
         """Grow the trees of a receiver."""

@@ -18,7 +18,7 @@ receivers of a record share a pair of networks, unless ``shared`` is false. Chos
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ from ...core.settings import Count
 from ...core.types import IntArray
 from ...receivers.reports import SQUARED_MAGNITUDE_EPS
 from ...tasks import Task, conditions, task_of
-from ...training.config import AdamConfig
+from ...training.config import AdamConfig, unused_of_loop, validates
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions, received_rows, slices
@@ -305,6 +305,19 @@ class Nerf2Model(Model):
     summary = "neural field of voxels, marched along rays"
     tasks = ("spectrum", "rssi", "csi")
     uplink, headings = "optional", True
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of rays of another task, of validation without rows, of positions beside an uplink."""
+        s, record, unused = problem.settings, problem.record, unused_of_loop(problem.settings, validates(splits))
+        if task_of(record).image:
+            unused |= dict.fromkeys(("sphere_rays", "sphere_batch"), "rays are pixels of spectra")
+        else:
+            unused |= {"rays": "of spectra; give sphere_rays", "batch": "of spectra; give sphere_batch"}
+        if s.networks.skip >= s.networks.layers:
+            unused["networks.skip"] = f"there are {s.networks.layers} layers"
+        if record.uplink is not None:
+            unused["tx_octaves"] = "transmitters are described by their uplink"
+        return unused | ({"shared": "there is one receiver"} if len(record.receivers) == 1 else {})
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> Nerf2Field:
         """Fit the networks (InputError: unknown positions or poses, or a receiver without training rows)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from ...backend.device import to_float, to_tensor
 from ...core import Prediction, Split
 from ...tasks import TASKS
 from ...tasks.losses import ssim
+from ...training.config import unused_of_loop, validates
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions, received_rows, slices
@@ -44,6 +46,10 @@ class SpectrumNetwork(Model):
     # width], a flat array, from features of positions [features, m]
     generator_class: Any
     at_once: int  # spectra that are predicted together, which bounds the memory
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of the training loop that choose by validation rows, where there are none."""
+        return unused_of_loop(problem.settings, validates(splits))
 
     @abstractmethod
     def network(self, rows: NetworkRows, settings: Any, rng: np.random.Generator) -> Network:

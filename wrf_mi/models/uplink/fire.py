@@ -17,7 +17,7 @@ are divided by the uplink's scale and phase. Chosen here:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -32,13 +32,14 @@ from ...core import Prediction, Split
 from ...core.settings import Count, Positive
 from ...core.types import IntArray
 from ...tasks.conditions import real_parts
+from ...training.config import unused_of_loop, validates
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Fitted, Inputs, Problem, slices
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
 from ..networks.vae import normal_divergence
-from .uplink_waves import Bands, UplinkModel, bands_of, relative_error
+from .uplink_waves import Bands, UplinkModel, bands_of, relative_error, unused_spacing
 
 Sample = Literal["antenna", "row", "auto"]
 CHUNK_SIZE = 4096  # samples that are predicted together: bounds the memory
@@ -200,6 +201,12 @@ class FireModel(UplinkModel):
     name, settings = "fire", FireSettings
     source = "Liu et al., FIRE: enabling reciprocity for FDD MIMO systems (MobiCom 2021)"
     summary = "variational autoencoder from uplink to downlink"
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of validation without rows, of antennas where rows are samples, and of known frequencies."""
+        s, unused = problem.settings, unused_of_loop(problem.settings, validates(splits))
+        unused |= {"batch": "samples are whole rows"} if s.sample == "row" else {}
+        return unused | unused_spacing(problem.record)
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> FittedFire:
         """Fit a network, or two of which the better is kept."""

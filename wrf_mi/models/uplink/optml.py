@@ -17,7 +17,7 @@ and direction; peaks of the map start R2F2's optimisation, which then needs few 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -32,15 +32,15 @@ from ...backend.device import to_tensor, to_uint
 from ...core import Split
 from ...core.angles import FloatArray
 from ...core.settings import Count
-from ...training.config import AdamConfig
+from ...training.config import AdamConfig, unused_of_loop
 from ...training.session import FitSession
 from .. import model
 from ..model import Arrays, Inputs, Problem, slices
 from ..networks.layers import Linear, Module, columns
 from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
-from .r2f2 import R2F2, PathSettings, choose
+from .r2f2 import R2F2, PathSettings, R2F2Model, choose
 from .uplink_paths import ROWS, UplinkPaths, in_parts, refine, refine_paths
-from .uplink_waves import ArrayWaves, Bands, Complex, Mask, UplinkModel, Waves, waves_of
+from .uplink_waves import ArrayWaves, Bands, Complex, Mask, Waves, waves_of
 
 FLOOR_DB = 30.0  # range of maps, dB: 0 is this far below the strongest path, 1 the strongest path
 BLUR = 1.0  # width of a path in the map to be learned, in cells
@@ -250,12 +250,17 @@ def prune(
     return theta, present, waves.solve(theta, present, h).residual
 
 
-class OptMLModel(UplinkModel):
+class OptMLModel(R2F2Model):
     """OptML."""
 
     name, settings = "optml", OptMLSettings
     source = "Bakshi et al., Fast and efficient cross band channel prediction using machine learning (MobiCom 2019)"
     summary = "paths fitted to the uplink, started by a network"
+    scene = "none"
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """As of R2F2, and ``patience`` where no simulated channels choose."""
+        return {**super().unused_settings(problem, splits), **unused_of_loop(problem.settings, has_validation=True)}
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> OptML:
         """Choose the wave model on validation rows, then learn maps of the paths of simulated channels."""

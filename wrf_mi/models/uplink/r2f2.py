@@ -24,7 +24,7 @@ bands.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -35,13 +35,23 @@ from numpy.typing import NDArray
 from ...core import Antenna, InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.array_files import keyed, under
-from ...core.settings import CheckedSettings, Count, Positive
+from ...core.settings import CheckedSettings, Count, Positive, names_of
 from ...core.types import IntArray
-from ...tracing.options import SpecularOptions, TraceOptions
+from ...tracing.options import SpecularOptions, TraceOptions, without_effect
 from ...training.session import FitSession, OnProgress
 from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, slices
 from .uplink_paths import Start, UplinkPaths, expected_gains, find_paths, in_parts
-from .uplink_waves import Bands, Complex, UplinkModel, Waves, bands_of, principal_axes, relative_error, waves_of
+from .uplink_waves import (
+    Bands,
+    Complex,
+    UplinkModel,
+    Waves,
+    bands_of,
+    principal_axes,
+    relative_error,
+    unused_spacing,
+    waves_of,
+)
 
 CHUNK_SIZE = 256  # positions that are traced together
 LENGTH_SD_M, COSINE_SD = 0.3, 0.03
@@ -168,6 +178,14 @@ def _wave_models(record: Record, settings: PathSettings, has_elements: bool, dir
     return every if settings.wavefront == "auto" else [settings.wavefront]
 
 
+def _options(record: Record, settings: PathSettings, directions: bool) -> list[tuple[str, Bands]]:
+    """Wave models and bands among which `choose` chooses; errors as there."""
+    first = bands_of(record, settings.spacing_hz)
+    kinds = _wave_models(record, settings, first.elements_m is not None, directions)
+    known = [first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS]
+    return [(kind, bands) for bands in known for kind in kinds]
+
+
 def choose(
     rows: tuple[IntArray, IntArray],
     record: Record,
@@ -184,10 +202,7 @@ def choose(
         InputError: as `bands_of`, or a wave front that needs elements where there are none.
     """
     train, validation = rows
-    first = bands_of(record, settings.spacing_hz)
-    kinds = _wave_models(record, settings, first.elements_m is not None, directions)
-    known = [first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS]
-    options = [(kind, bands) for bands in known for kind in kinds]
+    options = _options(record, settings, directions)
     if len(options) == 1:  # nothing to choose, and no row needs a downlink
         return options[0]
     judges = validation if len(validation) else train
@@ -240,10 +255,22 @@ def _scene_paths(problem: Problem, settings: PathSettings) -> ScenePaths | None:
 class R2F2Model(UplinkModel):
     """R2F2, from the paths of a scene where there is one."""
 
-    name, settings = "r2f2", PathSettings
+    name = "r2f2"
+    settings: type = PathSettings
     source = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"
     summary = "paths fitted to the uplink"
-    scene = "optional"
+    scene: Literal["none", "optional", "required"] = "optional"
+
+    def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
+        """Settings of known frequencies, of a choice without options, and of paths that are not traced."""
+        s, record = problem.settings, problem.record
+        self.known_rows(record, splits[0])  # refuses data that have no bands
+        unused = unused_spacing(record) | without_effect(s.options)
+        if problem.scene is None:
+            unused |= dict.fromkeys(names_of(SpecularOptions), "no scene is traced")
+        if len(_options(record, s, problem.scene is not None)) == 1:
+            unused["choice_rows"] = "there is one wave model, and nothing to choose"
+        return unused
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> R2F2:
         """Choose the wave model and, where frequencies are unknown, the bands."""

@@ -66,7 +66,7 @@ def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
     (antennas, up), down = record.uplink.shape[1:], record.observation.shape[3]
     if up < 2:
         raise InputError(f"{record.name}: {up} uplink subcarrier; delays show in two or more")
-    known = record.uplink_hz is not None and record.frequencies_hz is not None
+    known = _knows_frequencies(record)
     if known:
         uplink_hz, downlink_hz = np.asarray(record.uplink_hz, float), np.asarray(record.frequencies_hz, float)
     else:
@@ -79,6 +79,15 @@ def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
             raise InputError(f"{record.name}: array {elements.shape} for {antennas} antennas; give x, y, z of each")
         elements = (elements - elements.mean(axis=0)) @ principal_axes(elements).T
     return Bands(uplink_hz, downlink_hz, antennas, known, elements)
+
+
+def _knows_frequencies(record: Record) -> bool:
+    return record.uplink_hz is not None and record.frequencies_hz is not None
+
+
+def unused_spacing(record: Record) -> dict[str, str]:
+    """``spacing_hz`` where the data state their frequencies (`wrf_mi.models.model.Model.unused_settings`)."""
+    return {"spacing_hz": "the data state their frequencies"} if _knows_frequencies(record) else {}
 
 
 def principal_axes(elements_m: FloatArray) -> FloatArray:

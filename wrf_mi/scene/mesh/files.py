@@ -22,7 +22,8 @@ from ...core.files import one_line
 from ...core.types import IntArray
 from ..coordinates import FORMATS, UNITS_M, Up, check_extent, require_precise, source_file, turned, up_of
 from .polygon_files import Polygons, read_obj, read_ply
-from .scene_files import USD_SUFFIXES, Beside, bare_gltf, read_collada, read_usd
+from .scene_files import USD_SUFFIXES, Beside, bare_gltf, gltf_facts, read_collada, read_usd
+from .sheets import as_sheets
 from .surfaces import Surface, number_names
 
 logger = logging.getLogger(__name__)
@@ -36,6 +37,9 @@ SMALLEST_FACE_M2 = 1e-10  # smaller faces are degenerate: nothing reflects from 
 POLYGON_READERS = {".obj": read_obj, ".ply": read_ply}
 STL_HEADER, STL_FACE = 84, 50
 """Bytes of the header of a binary STL file, whose last four are the number of triangles, and of a triangle."""
+LEVEL, END_SHARE, ROOM_SHARE = 0.99, 0.05, 0.8
+"""Cosine of level faces, share of the height that is floor and ceiling, and least share of both in all level faces."""
+HIGHEST_ROOM_M = 12.0  # highest single room whose unit is not asked for: a sports hall has 7 to 12 m
 FLAT_POLYGON = 1e-9  # least ratio of a polygon's second extent to its first; below it has no area
 COLLINEAR = 1e-6  # sine of the angle below which a corner lies in a straight side: rounding of float32
 GRID = 1e-5
@@ -97,8 +101,10 @@ def _trimesh_parts(file: Path) -> list[trimesh.Trimesh]:
     options: dict[str, Any] = {"file_type": file.suffix.lower()[1:], "process": False}
     # Without a name no other file is looked for: materials and textures are not used.
     source: Any = BytesIO(file.read_bytes())
-    if file.suffix.lower() == ".gltf":
-        source, options["resolver"] = BytesIO(bare_gltf(source.read())), Beside(file)
+    if file.suffix.lower() in (".gltf", ".glb"):
+        facts = gltf_facts(file)
+        if file.suffix.lower() == ".gltf":
+            source, options["resolver"] = BytesIO(bare_gltf(facts)), Beside(file)
     dump: list[Any] = trimesh.load_scene(source, **options).dump()
     return [part for part in dump if len(getattr(part, "faces", ()))]
 
@@ -168,7 +174,25 @@ def read_mesh(path: str | Path, units: str | None = None, up: Up | None = None) 
         raise InputError(f"{file}: has no faces, so no surface; {remedy}")
     surfaces = sound_surfaces(parts, UNITS_M[units] if units else stated_m or 1.0, file)
     check_extent(np.concatenate([surface.vertices_m for surface in surfaces]), file)
+    surfaces = as_sheets(surfaces, file)
+    if units is None and stated_m is None:
+        _check_height(surfaces, file)
     return surfaces
+
+
+def _check_height(surfaces: Sequence[Surface], file: Path) -> None:
+    """Refuse a room of a file without a unit that is higher than rooms are: it is in inches or decimetres."""
+    corners = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
+    heights = corners[..., 2]
+    low, high = float(heights.min()), float(heights.max())
+    cross = trimesh.triangles.cross(corners)
+    level_m2 = np.abs(cross[:, 2]) / 2 * (np.abs(cross[:, 2]) > LEVEL * np.linalg.norm(cross, axis=-1))
+    ends = [level_m2[(np.abs(heights - end) < END_SHARE * (high - low)).all(axis=1)].sum() for end in (low, high)]
+    # A town has no ceiling, and a house has floors between its lowest and its highest.
+    is_room = min(ends) > ROOM_SHARE * level_m2.sum() / 2
+    if is_room and high - low > HIGHEST_ROOM_M:
+        choices = ", ".join(f"{unit} ({(high - low) * UNITS_M[unit]:.3g} m)" for unit in ("in", "ft", "dm", "m"))
+        raise InputError(f"{file}: a room {high - low:.4g} units high; give --units: {choices}, or another")
 
 
 def sound_surfaces(parts: Sequence[trimesh.Trimesh], unit_m: float, name: str | Path) -> list[Surface]:

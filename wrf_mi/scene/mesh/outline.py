@@ -59,13 +59,13 @@ def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
     bins = np.ceil((flat.max(axis=0) - low) / cell).astype(int) + CLOSED_CELLS + 2
     index = ((flat - low) / cell).astype(int)
     count = np.bincount(np.ravel_multi_index(tuple(index.T), tuple(bins)), minlength=bins.prod()).reshape(bins)
-    area = _boxes(_covered(count, cell), low, cell)
+    area = boxes(_covered(count, cell), low, cell)
     parts = [_rectangle(part) or part.simplify(1.2 * cell) for part in polygons(area)]
     # Edges are moved inwards because a cell that the edge crosses counts as a whole.
     return shapely.buffer(shapely.union_all(parts), -EDGE_SHARE * cell, join_style="mitre"), cell
 
 
-def _boxes(mask: Mask, low: FloatArray, cell: float) -> Any:
+def boxes(mask: Mask, low: FloatArray, cell: float) -> Any:
     """The area of the marked cells: a rectangle for each run of them."""
     steps = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, start = np.nonzero(steps == 1)
@@ -109,11 +109,11 @@ class Raster:
         parts, count = ndimage.label(mask | inside)
         meets = np.isin(np.arange(count + 1), np.unique(parts[inside])) & (np.arange(count + 1) > 0)
         beyond = ndimage.binary_opening(meets[parts] & ~inside, np.ones((2, 2)))
-        added = _boxes(large_parts(beyond, LEAST_ADDED_M2 / self.cell_m**2), self.low_m, self.cell_m)
+        added = boxes(large_parts(beyond, LEAST_ADDED_M2 / self.cell_m**2), self.low_m, self.cell_m)
         if added.is_empty:
             return area
         # Cells of the area that the added ones touch would leave a seam.
-        cells = _boxes(mask | inside, self.low_m, self.cell_m)
+        cells = boxes(mask | inside, self.low_m, self.cell_m)
         seam = shapely.intersection(shapely.buffer(added, 2 * self.cell_m, join_style="mitre"), cells)
         grown = shapely.union_all([area, added, seam], grid_size=GRID_M)
         grown = shapely.union_all([grown, *(hole for hole in _holes(grown) if hole.area < SMALL_HOLE_M2)])

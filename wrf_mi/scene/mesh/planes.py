@@ -25,6 +25,7 @@ LARGE_SHARE, LARGE_M2 = 0.2, 6.0
 WALL_SHARE, WALL_HEIGHT_M = 0.7, 2.0
 """Least height of a wall: share of the room's height, or metres where that is not known."""
 NARROWEST_WALL_M = 0.15
+BORNE_SHARE = 0.5  # least share of a ceiling's outline above walls; a terrace has a cliff at one side
 
 Mask = NDArray[np.bool_]
 
@@ -149,28 +150,43 @@ def kinds(faces: Sequence[Face], middle_m: float) -> list[Kind]:
     large faces over a floor are sloping ceilings. Upright faces that span most of a room's height are walls.
     """
     least_m2 = least_level_area(faces)
-    large = sorted((face for face in faces if face.area.area >= least_m2), key=lambda face: face.span_m[0])
+    large = [face for face in faces if face.area.area >= least_m2]
+    large.sort(key=lambda face: (face.span_m[0], -face.area.area))
     roles = dict[Face, Kind]()
     for face in large:
-        if role := _level_role(face, roles, middle_m):
+        if role := _level_role(face, roles, middle_m, faces):
             roles[face] = role
     roles |= {face: "ceiling" for face in large if _is_sloping_ceiling(face, roles, middle_m)}
     roles |= {face: "wall" for face in faces if _is_wall(face, roles)}
     return [roles.get(face, "other") for face in faces]
 
 
-def _level_role(face: Face, roles: Mapping[Face, Kind], middle_m: float) -> Kind | None:
+def _level_role(face: Face, roles: Mapping[Face, Kind], middle_m: float, faces: Sequence[Face]) -> Kind | None:
     """Role of a level face by the highest face below it; None: it is not level, a table, or a second layer."""
     if face.slope <= LEVEL:
         return None
     below = max((other for other in roles if face.overlaps(other)), key=lambda other: other.span_m[0], default=None)
     low = face.span_m[0]
     if below is None:
-        return "floor" if low < middle_m else "ceiling"
+        is_terrace = "floor" in roles.values() and not _is_borne(face, faces)
+        return "floor" if low < middle_m or is_terrace else "ceiling"
     apart_m = low - below.span_m[0]
     if roles[below] == "floor":
         return "ceiling" if apart_m > STOREY_M else None
     return "floor" if apart_m < SLAB_M else "ceiling"
+
+
+def _is_borne(face: Face, faces: Sequence[Face]) -> bool:
+    """Whether walls below most of the outline of a level face bear it: the ceiling of a room, not a higher ground."""
+    low = face.span_m[0]
+    walls = [
+        wall.shadow
+        for wall in faces
+        if wall.slope < UPRIGHT and wall.span_m[0] < low - STOREY_M and wall.span_m[1] > low - SLAB_M
+    ]
+    outline = shapely.boundary(face.shadow)
+    borne = shapely.intersection(outline, shapely.buffer(shapely.union_all(walls), THICKEST_M))
+    return bool(borne.length >= BORNE_SHARE * outline.length)
 
 
 def _is_sloping_ceiling(face: Face, roles: Mapping[Face, Kind], middle_m: float) -> bool:

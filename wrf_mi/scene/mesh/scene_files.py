@@ -16,7 +16,7 @@ from defusedxml.ElementTree import parse
 from numpy.typing import ArrayLike
 
 from ...core import InputError
-from ...core.files import inside
+from ...core.files import inside, one_line
 from ...core.types import IntArray
 from ..coordinates import Up, extra_package
 from .polygon_files import Polygons
@@ -24,6 +24,18 @@ from .polygon_files import Polygons
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 MOST_PARTS = 100_000  # most parts of a file: nested copies of a small file would be without end
 UP = {"Z_UP": "z", "Y_UP": "y", "Z": "z", "Y": "y"}
+GEOMETRY = ("nodes", "meshes", "accessors", "bufferViews", "buffers", "scenes")
+"""Parts of a glTF file in which an extension may change the geometry."""
+HARMLESS = (
+    "KHR_materials_",
+    "KHR_texture_",
+    "EXT_texture_",
+    "KHR_lights_",
+    "KHR_mesh_quantization",
+    "KHR_xmp",
+    "EXT_struc",
+)
+"""Beginnings of extensions of light, colour and description, and of integers as positions, which trimesh reads."""
 Content = tuple[list[Polygons], float, Up]
 """Polygons of each part, the unit of their vertices in metres, and the axis that is up."""
 
@@ -113,9 +125,37 @@ def _up(path: Path, stated: str) -> Up:
     return "y" if UP[stated] == "y" else "z"
 
 
-def bare_gltf(content: bytes) -> bytes:
+def gltf_facts(file: Path) -> dict[str, Any]:
+    """JSON of a glTF or GLB file, of which trimesh reads all that belongs to its geometry.
+
+    Source: Khronos Group, "glTF 2.0", 3.6.2 (accessors), 3.12 (extensions) and 4.4 (binary chunks).
+
+    Raises:
+        InputError: an extension of the geometry, sparse or normalised positions, which trimesh would read as others.
+    """
+    content = file.read_bytes()
+    if file.suffix.lower() == ".glb":
+        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    facts: dict[str, Any] = json.loads(content)
+    primitives = [primitive for mesh in facts.get("meshes", ()) for primitive in mesh["primitives"]]
+    parts = [*primitives, *(part for key in GEOMETRY for part in facts.get(key, ()))]
+    named = [name for part in parts for name in part.get("extensions", ())]
+    # What is not required may be left out by a reader, unless it stands in a part of the geometry.
+    needed = sorted({*named, *facts.get("extensionsRequired", ())})
+    if unknown := [name for name in needed if not name.startswith(HARMLESS)]:
+        raise InputError(f"{file}: its geometry needs the extension {one_line(unknown[0])}; export it without")
+    for primitive in primitives:
+        numbers = [primitive.get("indices"), *primitive["attributes"].values()]
+        accessors = [facts["accessors"][number] for number in numbers if number is not None]
+        if any("sparse" in accessor for accessor in accessors):
+            raise InputError(f"{file}: has sparse accessors; export it without")
+        if facts["accessors"][primitive["attributes"]["POSITION"]].get("normalized"):
+            raise InputError(f"{file}: has positions in normalised integers; export it without")
+    return facts
+
+
+def bare_gltf(facts: dict[str, Any]) -> bytes:
     """A glTF file without materials and textures, of which no file is read."""
-    facts = json.loads(content)
     for key in ("materials", "textures", "images", "samplers"):
         facts.pop(key, None)
     for mesh in facts.get("meshes", ()):

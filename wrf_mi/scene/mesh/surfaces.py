@@ -6,9 +6,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
+import shapely
 import trimesh
 
 from ...core.angles import FloatArray
@@ -89,6 +90,13 @@ def bounds(points_m: FloatArray) -> FloatArray:
 def box_of(surfaces: Sequence[Surface]) -> FloatArray:
     """Lower and upper corner [2, 3] of the box around surfaces, metres."""
     return bounds(np.concatenate([surface.vertices_m for surface in surfaces]))
+
+
+def level_area(surfaces: Sequence[Surface]) -> Any:
+    """Area (shapely) that surfaces cover, seen from above."""
+    corners = np.concatenate([surface.vertices_m[surface.faces][..., :2] for surface in surfaces])
+    # Triangles are widened by a micrometre first: rounding leaves slits between them.
+    return shapely.union_all(shapely.buffer(shapely.polygons(corners), 1e-6))
 
 
 def cut_lines(surface: Surface, height_m: float) -> FloatArray:

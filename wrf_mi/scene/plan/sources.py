@@ -19,10 +19,9 @@ from scipy import ndimage
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.array_files import stored_arrays
-from ...core.files import inside, one_line, text_lines
-from ...core.pictures import PICTURE_ERRORS, open_picture
-from ...core.yaml_files import read_yaml
+from ...core.files import inside, listed, one_line, text_lines
 from ...datasets.folder_files import read_columns
+from .pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES, WHITE, read_pixels, read_sheet
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +56,11 @@ class PlanGrid:
     resolution_m: float
     origin_m: FloatArray
 
+    @property
+    def unmapped(self) -> Mask:
+        """Cells of which it is not known what is there [rows, columns]."""
+        return ~(self.occupied | self.free)
+
     def occupied_at(self, xy_m: FloatArray) -> Mask:
         """Whether the cells of points [..., 2] are occupied; those outside the grid are not."""
         column, row = np.moveaxis(np.floor((xy_m - self.origin_m) / self.resolution_m).astype(int), -1, 0)
@@ -79,11 +83,17 @@ class PlanPoints:
 
 
 def grid_from_probability(
-    probability: ArrayLike, resolution_m: float, row_0: Row0, origin_m: ArrayLike = (0.0, 0.0), name: str = "grid"
+    probability: ArrayLike,
+    resolution_m: float,
+    row_0: Row0,
+    origin_m: ArrayLike = (0.0, 0.0),
+    name: str = "grid",
+    thresholds: tuple[float, float] = (FREE_PROBABILITY, OCCUPIED_PROBABILITY),
 ) -> PlanGrid:
     """A grid from the probability [rows, columns] that a cell is occupied, NaN where that is unknown.
 
-    `InputError`: it has not two axes, holds nothing occupied, or the resolution is not positive.
+    Cells below the first threshold are free, those above the second occupied. `InputError`: it has not two axes, holds
+    nothing occupied, or the resolution is not positive.
     """
     p = np.asarray(probability, float)
     if p.size > LARGEST_PICTURE:
@@ -96,7 +106,7 @@ def grid_from_probability(
     if row_0 == "top":
         p = p[::-1]
     with np.errstate(invalid="ignore"):
-        occupied, free = p > OCCUPIED_PROBABILITY, p < FREE_PROBABILITY
+        occupied, free = p > thresholds[1], p < thresholds[0]
     if not occupied.any():
         what = "every cell is NaN" if np.isnan(p).all() else "no cell is occupied"
         raise InputError(f"{name}: {what}; there is no wall to find, give another map")
@@ -136,10 +146,10 @@ def read_plan(
       ``origin_m`` [2] of the lower left corner, zero by default. Values that all lie in 0..1 are taken as probabilities
       (log odds of free cells are negative).
     - ``.npz`` with points ``xy_m`` [n, 2] and optionally ``time_s`` [n], equal for all returns of a scan.
-    - ``.png``, ``.pgm``: a grey picture, dark where occupied, with or without the ``.yaml`` of a ROS map beside it,
-      which may be given in its place: ``image``, ``resolution``, ``origin`` [x, y, yaw], ``negate``
-      (https://wiki.ros.org/map_server). The yaw has to be zero; its thresholds are not used. Without a YAML, lines
-      thinner than `THINNEST_WALL_M` are not walls (`without_thin_lines`).
+    - ``.png``, ``.pgm``, ``.jpg``: a picture, dark where occupied, transparent pixels on white, with or without the
+      ``.yaml`` of a ROS map beside it, which may be given in its place (`wrf_mi.scene.plan.pictures.read_sheet`); its
+      yaw has to be zero. Without a YAML, and with other greys than those of map_saver, lines thinner than
+      `THINNEST_WALL_M` are not walls (`without_thin_lines`), and a picture with colours has no unmapped cells.
     - ``.csv`` with the header ``x,y``: wall vertices (`read_layout`).
     - ``.xyz``, ``.txt``: points in two columns x, y (metres), separated by spaces, tabs or commas; # begins a comment.
 
@@ -156,21 +166,21 @@ def read_plan(
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: missing; give a plan as .npz, .png, .pgm, .yaml, .csv or .xyz")
+        raise InputError(f"{path}: missing; give a plan as .npz, .png, .pgm, .jpg, .yaml, .csv or .xyz")
     suffix = path.suffix.lower()
     if row_0 is not None and suffix != ".npz":
-        fixed = suffix in (".png", ".pgm", ".yaml", ".yml")
+        fixed = suffix in (*PICTURE_SUFFIXES, *SHEET_SUFFIXES)
         raise _no_rows(path, "the first row of a picture is its top" if fixed else "this file has no rows of cells")
+    if suffix in (*PICTURE_SUFFIXES, *SHEET_SUFFIXES):
+        return _read_picture(path, resolution_m)
     match suffix:
         case ".npz":
             return _read_arrays(path, resolution_m, row_0)
-        case ".png" | ".pgm" | ".yaml" | ".yml":
-            return _read_picture(path, resolution_m)
         case ".csv":
             return read_layout(path)
         case ".xyz" | ".txt":
             return _read_text(path)
-    raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .yaml, .csv or .xyz")
+    raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .jpg, .yaml, .csv or .xyz")
 
 
 def read_layout(path: str | Path) -> FloatArray:
@@ -197,7 +207,7 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
     if "log_odds" in numbers:
         return _grid_of_arrays(path, {**content, **numbers}, resolution_m, row_0)
     if "xy_m" not in numbers:
-        text = f"{path}: has neither log_odds nor xy_m but {', '.join(content) or 'nothing'}"
+        text = f"{path}: has neither log_odds nor xy_m but {listed(content) or 'nothing'}"
         raise InputError(f"{text}; give one of them")
     if row_0 is not None:
         raise _no_rows(path, "it holds points, which have no rows")
@@ -246,19 +256,31 @@ def _no_rows(path: Path, why: str) -> InputError:
 
 
 def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
-    sheet = path if path.suffix in (".yaml", ".yml") else path.with_suffix(".yaml")
-    negate, origin = False, np.zeros(2)
-    if sheet.is_file():
-        path, negate, origin, resolution_m = _read_sheet(sheet, path, resolution_m)
+    is_sheet = path.suffix.lower() in SHEET_SUFFIXES
+    file, sheet = path if is_sheet else path.with_suffix(".yaml"), None
+    if file.is_file():
+        sheet = read_sheet(file, resolution_m, (FREE_PROBABILITY, OCCUPIED_PROBABILITY))
+        path, resolution_m = inside(path.parent, sheet.image, path) if is_sheet else path, sheet.resolution_m
     if resolution_m is None:
         raise InputError(f"{path}: a picture has no resolution; give the side of a pixel in metres (--resolution)")
-    try:
-        with open_picture(path, LARGEST_PICTURE) as picture:
-            grey = np.asarray(picture.convert("L"), float) / 255
-    except PICTURE_ERRORS as error:
-        raise InputError(f"{path}: not a picture that can be read ({one_line(error)})") from None
-    grid = grid_from_probability(grey if negate else 1 - grey, resolution_m, "top", origin, str(path))
-    return grid if sheet.is_file() else without_thin_lines(grid, str(path))
+    pixels = read_pixels(path, LARGEST_PICTURE)
+    probability = pixels.probability(sheet)
+    if sheet is not None:
+        return grid_from_probability(
+            probability, resolution_m, "top", sheet.origin_m, str(path), thresholds=sheet.thresholds
+        )
+    if pixels.coloured:  # a drawing: what is no line is ground, of whatever colour
+        probability = np.where(probability > OCCUPIED_PROBABILITY, 1.0, 0.0)
+    grid = grid_from_probability(probability, resolution_m, "top", name=str(path))
+    if pixels.is_saved_map:
+        return grid
+    if pixels.coloured:
+        text = (
+            "%s: %.2g %% of its pixels, those darker than grey %d, count as walls; if walls are lighter, darken them, "
+        )
+        text += "or state a lower occupied_thresh in the YAML of a ROS map beside it"
+        logger.warning(text, path, 100 * grid.occupied.mean(), WHITE * (1 - OCCUPIED_PROBABILITY))
+    return without_thin_lines(grid, str(path))
 
 
 def without_thin_lines(grid: PlanGrid, name: str = "plan") -> PlanGrid:
@@ -281,23 +303,6 @@ def without_thin_lines(grid: PlanGrid, name: str = "plan") -> PlanGrid:
     text = "%s: lines thinner than %g m, %.2g %% of the dark cells, are not walls (door leaves, dimensions, letters)"
     logger.warning(f"{text}; draw those thicker that are", name, THINNEST_WALL_M, 100 * share)
     return replace(grid, occupied=grid.occupied & ~lines, free=grid.free | lines)
-
-
-def _read_sheet(sheet: Path, path: Path, resolution_m: float | None) -> tuple[Path, bool, FloatArray, float]:
-    """Picture, negation, origin [2] and resolution of a ROS map, of which a picture or resolution may be stated."""
-    try:
-        facts = read_yaml(sheet)
-        path = inside(sheet.parent, facts["image"], sheet) if path == sheet else path
-        x, y, yaw = np.array([*facts["origin"], 0.0][:3], float)
-        resolution_m = float(facts["resolution"]) if resolution_m is None else resolution_m
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        text = f"not the YAML of a ROS map ({one_line(error)})"
-        raise InputError(f"{sheet}: {text}; it needs image, resolution, origin") from None
-    if yaw or not np.isfinite(yaw):
-        raise InputError(f"{sheet}: the map is turned by {yaw} rad; set the yaw to 0 and register the scene")
-    return path, bool(facts.get("negate")), np.array([x, y]), resolution_m
 
 
 def _read_text(path: Path) -> PlanPoints:

@@ -14,13 +14,13 @@ from ..mesh.surfaces import Surface, number_names
 from .alignment import grid_from_scans
 from .lines import HALF_WIDTH_M, THICKEST_WALL_M
 from .sources import PlanGrid, PlanPoints, grid_from_points
+from .walked import NARROWEST_ROOM_M, mapped_part
 from .walls import find_walls, joined
 
 CLOSING_M = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Half-widths of openings that are closed to find the floor: doors first, then larger gaps."""
 LARGEST_GAP_M = 2.5  # widest entrance in an outer wall, a double door: rooms behind wider gaps are open to the outside
 WALLED = 0.75  # least share of a room's outline along walls: the rest are gaps; niches of a facade have less
-NARROWEST_ROOM_M = 0.6  # as wide as the narrowest door
 COVERED = 0.9  # least share of the walls that stand on the floor or at its edge
 EDGE_M = 0.1  # a wall this near to the floor's edge stands at it
 SMALLEST_FLOOR_M2 = 0.5
@@ -147,7 +147,8 @@ def plan_surfaces(
         walls_m = walls_of_plan(source, resolution_m)
         if isinstance(source, PlanGrid):
             walls_m = at_inner_faces(walls_m, source)
-        flat, faces = triangulated(floor_of(walls_m))
+        area = floor_of(walls_m)
+        flat, faces = triangulated(mapped_part(area, source, name) if isinstance(source, PlanGrid) else area)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
     top_m, halves = floor_m + height_m, np.array([[0, 1, 2], [0, 2, 3]])

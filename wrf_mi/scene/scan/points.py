@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
 
 from ...core import InputError
 from ...core.angles import FloatArray
@@ -24,6 +26,8 @@ from ...parallel import run_module
 from ..coordinates import FORMATS, UNITS_M, Up, extra_package, require_precise, source_file, turned, up_of
 from ..mesh.planes import Mask
 from ..mesh.polygon_files import read_obj, read_ply
+from ..mesh.surfaces import Surface, sampled
+from .read_child import surveyed_points
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +42,16 @@ LAS_RECORDS = (("records", 100, 54), ("extended records", 243, 60))
 CHILD_BYTES, CHILD_S, CHILD_BYTES_PER_S = 4 << 30, 30.0, 1 << 20
 """Address space of the process that reads a file beside its points, and the time that it has."""
 PCD_HEADER = 1 << 16  # bytes in which the header of a PCD has to end
+PCD_KEYS = {"POINTS", "SIZE", "TYPE"}
+PCD_TYPES = {"F": "<f", "I": "<i", "U": "<u"}
 COMMENTS = ("#", "//")  # CloudCompare begins the line of the columns' names with slashes
+STRAY_NEIGHBOURS = 20  # a surface has more returns about each of its own
+STRAY_REACH = 0.05  # radius in which they lie, relative to the distance from the middle of the scan
+FAR_OUT = 3.0
+"""Quartile ranges beyond a quartile from which values are far out (Tukey 1977, "Exploratory data analysis")."""
+SAMPLES_PER_FACE, SAMPLES_PER_M2, MOST_SAMPLES = 2, 150, 3_000_000
+"""Points drawn on a mesh: of more on a face, whose noise is the same, medians would look like layers of a wall; of
+fewer on a square metre no plane is found. The most of them are as many as a large scan has."""
 PTX_LINES = 8  # lines of a PTX after columns and rows: position and axes of the scanner, and its pose
 
 Part = tuple[FloatArray, FloatArray | None]
@@ -87,12 +100,42 @@ def read_scan(paths: Sequence[str | Path], units: str | None = None, up: Up | No
     for path in paths:
         file = source_file(path, units, f"a point cloud ({FORMATS})")
         for part, viewpoint in _parts(file):
+            near = ~_strays(part, file)
+            part = part[near]
             require_precise(part, unit_m, file)
             points.append(turned(part * unit_m, up_of(file, up)))
             numbers.append(np.full(len(part), -1 if viewpoint is None else len(viewpoints)))
             if viewpoint is not None:
                 viewpoints.append(turned(viewpoint * unit_m, up_of(file, up)))
     return Scan(np.concatenate(points), np.array(viewpoints, float).reshape(-1, 3), np.concatenate(numbers))
+
+
+def _strays(points: FloatArray, file: Path) -> Mask:
+    """Returns [n] far out of a scan that no surface explains, such as reflections in windows; logged.
+
+    Few others are near them: at any distance, the directions of a scanner are spread as evenly on a surface.
+    """
+    strays = np.zeros(len(points), bool)
+    low, middle, high = np.quantile(points, (0.25, 0.5, 0.75), axis=0)
+    fence = FAR_OUT * (high - low)
+    far = np.flatnonzero(((points < low - fence) | (points > high + fence)).any(axis=1))
+    if not len(far) or len(points) < 2 * STRAY_NEIGHBOURS:
+        return strays
+    distance = np.linalg.norm(points[far] - middle, axis=-1)
+    reach, _ = cKDTree(points).query(points[far], k=[STRAY_NEIGHBOURS + 1])  # the first is the point
+    strays[far] = reach[:, 0] > STRAY_REACH * distance
+    if strays.any():
+        text = "%s: %d of %d points, up to %.4g from the middle, are strays without a surface, and are left out"
+        logger.warning(text, file, strays.sum(), len(points), distance[strays[far]].max())
+    return strays
+
+
+def sampled_scan(surfaces: Sequence[Surface]) -> Scan:
+    """Points on the faces of a measured mesh."""
+    corners = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
+    least = int(SAMPLES_PER_M2 * trimesh.triangles.area(corners).sum())
+    count = min(MOST_SAMPLES, max(SAMPLES_PER_FACE * len(corners), least))
+    return Scan(sampled(corners, count), np.empty((0, 3)), np.full(count, -1))
 
 
 def _parts(file: Path) -> list[Part]:
@@ -124,22 +167,54 @@ def _read_npz(file: Path) -> list[Part]:
 
 
 def _read_text(file: Path) -> list[Part]:
-    """Points of lines of text, whose columns a first line may name; between commas, semicolons or blanks."""
+    """Points of lines of text, whose columns a line above them may name; between commas, semicolons or blanks."""
     with file.open(encoding="utf-8-sig") as text:
-        first = next((line for line in text if line.strip() and not line.startswith(COMMENTS)), "")
-        delimiter = next((mark for mark in ";," if mark in first), None)
-        names = [name.strip(" \t\r\n\"'").lower() for name in first.split(delimiter)]
-        named = set(names) >= set("xyz")
-        columns = [names.index(axis) for axis in "xyz"] if named else [0, 1, 2]
-        if not named:
+        comments, first = list[str](), ""
+        for first in filter(str.strip, text):
+            if not first.startswith(COMMENTS):
+                break
+            comments.append(first)
+        columns = _named_columns(first, len(_fields(first)))
+        if columns is None:  # the line has numbers, and a comment above may name them: CloudCompare's "//X Y Z R G B"
+            columns = next(filter(None, (_named_columns(line, len(_fields(first))) for line in comments[::-1])), None)
             text.seek(0)
+        delimiter = next((mark for mark in ";," if mark in first), None)
         # Where semicolons separate fields, a comma is the decimal mark.
         rows: Iterable[str] = text if delimiter != ";" else (line.replace(",", ".") for line in text)
-        return [(_text_rows(rows, columns, delimiter), None)]
+        table = _text_rows(rows, columns, delimiter)
+    if columns is not None:
+        return [(table, None)]
+    whole = (table == np.round(table)).all(axis=0)
+    if whole.size and whole[0] and np.count_nonzero(~whole) >= 3:
+        raise ValueError(
+            f"column 1 has whole numbers alone, such as {table[0, 0]:g}, as labels, colours and indices are; "
+            "name the columns in a first line, as in: label x y z"
+        )
+    return [(table[:, :3], None)]
 
 
-def _text_rows(rows: Iterable[str], columns: Sequence[int] = (0, 1, 2), delimiter: str | None = None) -> FloatArray:
-    """Points [n, 3] of rows of text; none, and no warning of NumPy's, where there are no rows."""
+def _fields(line: str) -> list[str]:
+    """Fields of a line between semicolons, else between commas and blanks."""
+    return re.split(r"\s*;\s*" if ";" in line else r"\s*,\s*|\s+", line.strip())
+
+
+def _named_columns(line: str, count: int) -> list[int] | None:
+    """Places of x, y and z among ``count`` columns that a line names, with or without units: X[m], "x", x_m.
+
+    Other words may stand before and after the names, as in ``# columns: class x y z``. None: the line names no columns.
+    """
+    words = [word.strip("\"'") for word in _fields(line.strip().lstrip("#/"))]
+    names = [re.sub(r"[\[(].*|_m$", "", word).lower() for word in words]
+    for first in range(max(len(names) - count, 0) + 1):
+        if set(window := names[first : first + count]) >= set("xyz"):
+            return [window.index(axis) for axis in "xyz"]
+    return None
+
+
+def _text_rows(
+    rows: Iterable[str], columns: Sequence[int] | None = (0, 1, 2), delimiter: str | None = None
+) -> FloatArray:
+    """Columns [n, k] of rows of text, None: all; no row, and no warning of NumPy's, where there are no rows."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "loadtxt: input contained no data")
         return np.loadtxt(rows, usecols=columns, delimiter=delimiter, ndmin=2, comments=COMMENTS)
@@ -168,9 +243,8 @@ def _read_las(file: Path) -> list[Part]:
         header = source.header
         packed, needed = header.are_points_compressed, header.point_count * header.point_format.size
         _check_count(file, header.point_count, needed, size * (MOST_LAZ if packed else 1))
-        if not packed:
-            return [(source.read().xyz, None)]
-    return _read_apart(file, needed)
+        parts = _read_apart(file, needed) if packed else [(surveyed_points(source.read()), None)]
+    return [(_kept(points, file, "points of classes noise or withheld"), place) for points, place in parts]
 
 
 def _check_count(file: Path, count: int, needed: int, most: int) -> None:
@@ -210,38 +284,47 @@ def _read_e57(file: Path) -> list[Part]:
 
 def _read_pcd(file: Path) -> list[Part]:
     """Points of a PCD file (https://pointclouds.org/documentation/tutorials/pcd_file_format.html)."""
-    extra_package("open3d")
-    header, lines = _pcd_header(file)
-    kind = header["DATA"][0]
+    header, begin = _pcd_header(file)
+    storage = header["DATA"][0]
     count, fields = int(header["POINTS"][0]), header["FIELDS"]
     lengths = [int(length) for length in header.get("COUNT", ["1"] * len(fields))]
-    record = sum(int(size) * length for size, length in zip(header["SIZE"], lengths, strict=True))
-    most = file.stat().st_size * (MOST_LZF if kind == "binary_compressed" else 1)
-    _check_count(file, count, count * (LEAST_ROW if kind == "ascii" else record), most)
-    if kind == "ascii":  # Open3D fills what a file lacks with whatever is in memory
-        columns = [sum(lengths[: fields.index(axis)]) for axis in "xyz"]
-        with file.open(encoding="ascii") as text:
-            points = _text_rows(islice(text, lines, lines + count), columns)
-    else:
-        ((points, _),) = _read_apart(file, count * max(record, 24))
+    # Fields differ in type and width, and several may be called "_": their places name them.
+    types = [PCD_TYPES[letter] + size for letter, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    record = np.dtype([(str(i), kind, (n,)) for i, (kind, n) in enumerate(zip(types, lengths, strict=True))])
+    most = file.stat().st_size * (MOST_LZF if storage == "binary_compressed" else 1)
+    _check_count(file, count, count * (LEAST_ROW if storage == "ascii" else record.itemsize), most)
+    places = [fields.index(axis) for axis in "xyz"]
+    with file.open("rb") as stream:
+        stream.seek(begin)
+        if storage == "ascii":
+            rows = (line.decode("ascii") for line in islice(stream, count))
+            points = _text_rows(rows, [sum(lengths[:place]) for place in places])
+        elif storage == "binary":
+            table = np.frombuffer(stream.read(count * record.itemsize), record)
+            points = np.stack([table[str(place)][:, 0] for place in places], axis=1, dtype=float)
+        else:  # compressed as one block, of each field after the other
+            packed, unpacked = np.frombuffer(stream.read(8), "<u4").tolist()
+            if unpacked != count * record.itemsize:
+                raise ValueError(f"states {count} points and {unpacked} bytes of them; it is damaged")
+            block = extra_package("lzf").decompress(stream.read(packed), unpacked) or b""
+            starts = count * np.cumsum([0, *(record[i].itemsize for i in range(len(fields)))])
+            columns = [np.frombuffer(block[starts[i] : starts[i + 1]], types[i]) for i in places]
+            points = np.stack(columns, axis=1, dtype=float)
     if len(points) != count:
         raise ValueError(f"states {count} points and ends after {len(points)}; it is cut off or damaged")
     place = np.array(header.get("VIEWPOINT", ["nan"] * 3)[:3], float)
-    return [(_returns(points, ~np.isnan(points), file), place if np.isfinite(place).all() else None)]
+    return [(_kept(points, file, "directions without a return"), place if np.isfinite(place).all() else None)]
 
 
 def _pcd_header(file: Path) -> tuple[dict[str, list[str]], int]:
-    """Words of the lines of a PCD file's header by their first, and their number."""
+    """Words of the lines of a PCD file's header by their first, and the byte at which its points begin."""
     with file.open("rb") as stream:
-        head, data_line, remainder = stream.read(PCD_HEADER).partition(b"\nDATA ")
-    lines = [
-        *head.decode("ascii", "replace").split("\n"),
-        "DATA " + remainder.split(b"\n")[0].decode("ascii", "replace"),
-    ]
+        head = re.match(rb"(?:.*\n)*?DATA .*\n", stream.read(PCD_HEADER))
+    lines = head[0].decode("ascii", "replace").splitlines() if head else []
     header = {words[0]: words[1:] for line in lines if (words := line.split())}
-    if not data_line or not {"x", "y", "z"} <= set(header.get("FIELDS", ())) or not {"POINTS", "SIZE"} <= set(header):
-        raise ValueError("no header of a PCD file with x, y, z, SIZE and POINTS")
-    return header, len(lines)
+    if head is None or not {"x", "y", "z"} <= set(header.get("FIELDS", ())) or not header.keys() >= PCD_KEYS:
+        raise ValueError(f"no header of a PCD file with x, y, z and {', '.join(sorted(PCD_KEYS))}")
+    return header, head.end()
 
 
 def _read_blocks(file: Path) -> Iterator[Part]:
@@ -267,7 +350,8 @@ def _read_blocks(file: Path) -> Iterator[Part]:
             if pose is None:
                 yield points, None
             else:  # rows are multiplied from the left, and the scanner is at the origin of its scan
-                points = _returns(points, points != 0, file)
+                points[(points == 0).all(axis=1)] = np.nan
+                points = _kept(points, file, "directions without a return")
                 yield points @ pose[:3, :3] + pose[3, :3], pose[3, :3]
 
 
@@ -278,12 +362,12 @@ def _ptx_pose(stream: Iterator[str]) -> FloatArray:
     return pose
 
 
-def _returns(points: FloatArray, valid: Mask, file: Path) -> FloatArray:
-    """Points of directions with a return, which have a valid coordinate; those without are none of the format."""
-    returned = valid.any(axis=1)
-    if missing := len(points) - np.count_nonzero(returned):
-        logger.info("%s: %d of %d directions without a return", file, missing, len(points))
-    return points[returned]
+def _kept(points: FloatArray, file: Path, what: str) -> FloatArray:
+    """Points without those that a reader marked as none, by NaN in all coordinates; their count is logged."""
+    none = np.isnan(points).all(axis=1)
+    if none.any():
+        logger.info("%s: %d of %d are %s: left out", file, np.count_nonzero(none), len(points), what)
+    return points[~none]
 
 
 READERS: dict[str, Callable[[Path], Iterable[Part]]] = {

@@ -1,4 +1,4 @@
-"""Points of a LAZ, E57 or PCD file, read in a child process.
+"""Points of a LAZ or E57 file, read in a child process.
 
 ``python -m wrf_mi.scene.scan.read_child FILE OUT.npz MOST_BYTES``: readers in other languages end the process where a
 damaged file states a size that they cannot allocate.
@@ -9,13 +9,17 @@ from __future__ import annotations
 import resource
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+NOISE_CLASSES = (7, 18)
+"""Low and high noise in LAS."""
 
 
 def main(file: str, out: str, most_bytes: str) -> int:
     """Write points, number of points of each scan and viewpoints; 1 with a line on standard error for a bad file."""
-    read = {".laz": _laz, ".e57": _e57, ".pcd": _pcd}[Path(file).suffix.lower()]
+    read = {".laz": _laz, ".e57": _e57}[Path(file).suffix.lower()]
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
     most = int(most_bytes) if hard == resource.RLIM_INFINITY else min(int(most_bytes), hard)
     resource.setrlimit(resource.RLIMIT_AS, (most, hard))
@@ -35,7 +39,17 @@ def _laz(file: str) -> list[tuple[np.ndarray, list[float]]]:
 
     # Not in parallel: its threads' errors are none of Python.
     with laspy.open(file, laz_backend=laspy.LazBackend.Lazrs) as source:
-        return [(np.asarray(source.read().xyz), [np.nan] * 3)]
+        return [(surveyed_points(source.read()), [np.nan] * 3)]
+
+
+def surveyed_points(las: Any) -> np.ndarray:
+    """Points [n, 3] of a LAS file, NaN where it marks them as noise or withheld.
+
+    Source: ASPRS, "LAS specification 1.4 - R15", tables 8, 16 and 17.
+    """
+    points = np.array(las.xyz)
+    points[np.isin(las.classification, NOISE_CLASSES) | (np.asarray(las.withheld) != 0)] = np.nan
+    return points
 
 
 def _e57(file: str) -> list[tuple[np.ndarray, list[float]]]:
@@ -50,13 +64,6 @@ def _e57(file: str) -> list[tuple[np.ndarray, list[float]]]:
         points = np.stack([columns[f"cartesian{axis}"] for axis in "XYZ"], axis=1)
         scans.append((points, list(header.translation) if header.has_pose() else [np.nan] * 3))
     return scans
-
-
-def _pcd(file: str) -> list[tuple[np.ndarray, list[float]]]:
-    import open3d
-
-    # Places without a return are NaN in PCD, and left out by the caller.
-    return [(np.asarray(open3d.io.read_point_cloud(Path(file), format="pcd").points), [np.nan] * 3)]
 
 
 if __name__ == "__main__":

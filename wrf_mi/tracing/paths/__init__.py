@@ -6,3 +6,8 @@
 - `traced_field`: paths of one receiver that follow these parameters, at one or several carriers;
 - `corrected_scene`: a scene with trained planes and materials, as a folder or for another search.
 """
+
+from ...backend import init
+
+# Dr.Jit loads an LLVM when it is imported, so the choice must be made before.
+init()

@@ -23,11 +23,13 @@ from ...backend.device import on_device, to_tensor
 from ...core import InputError
 from ...core.types import FloatArray, IntArray
 from ...scene.folder import plain_name, write_scene
-from ...scene.materials import CARRIER, THICKNESS_M, Materials
+from ...scene.materials import CARRIER, Materials
 from ...scene.materials import EXPONENT as LAW
 from ...scene.mesh.surfaces import SAME_CORNER_M, Kind, Surface
+from ...scene.scattering import check_scattering
 from ..search.surfaces import Surfaces, largest_face, plane_bounds, scene_surfaces, shape_id
-from ..sionna.materials import absorbs, in_itu_range
+from ..sionna.materials import absorbs, in_itu_range, is_standard
+from ..sionna.scattering import scattering_of
 from .scene_parameters import QUANTITIES, SHIFT, TILT, MaterialGrouping, read_materials, slabs_of_faces
 from .solve import Prepared
 
@@ -151,7 +153,7 @@ def write_corrected_scene(
     carrier_hz = float(scene.frequency[0])
     parts, thickness = list[Surface](), dict[str, float]()
     entries, constants = dict[str, str](), dict[str, dict[str, float]]()
-    fitted_names, moving = dict[str, str](), dict[str, list[float]]()
+    fitted_names, moving, scattering = dict[str, str](), dict[str, list[float]](), dict[str, dict[str, Any]]()
     together = ~changed & _facets(surfaces, slab_of_face, len(slabs.names))
     together[list(absent)] = False
     # Each object in pieces of one material each, which become objects of their own.
@@ -172,10 +174,11 @@ def write_corrected_scene(
             if any(velocity := np.ravel(scene.objects[name].velocity).tolist()):
                 moving[part] = velocity
             # Its material: absorbing, fitted, by constants where ITU-R P.2040 has none at the carrier, or by name.
-            material = scene.objects[name].radio_material.name
+            radio_material = scene.objects[name].radio_material
+            material, facts_of_scattering = radio_material.name, scattering_of(radio_material)
             if slab < 0:
                 material = ABSORBER
-            elif changed[slab] or material not in THICKNESS_M:
+            elif changed[slab] or not is_standard(radio_material):
                 owner = part if grouping == "surface" else material
                 if owner not in fitted_names:
                     fitted_names[owner] = plain_name(f"fitted_{owner}", ODD_IN_MATERIALS, constants)
@@ -188,7 +191,12 @@ def write_corrected_scene(
             else:
                 thickness[material] = float(fitted[slab, 2])
             entries[part] = material
-    facts = Materials(surfaces=entries, thickness_m=thickness, constants=constants, velocities_mps=moving)
+            if facts_of_scattering:
+                scattering[material] = check_scattering(
+                    f"object {name}: material {radio_material.name}", facts_of_scattering
+                )
+    how: dict[str, Any] = {"constants": constants, "scattering": scattering, "velocities_mps": moving}
+    facts = Materials(surfaces=entries, thickness_m=thickness, **how)
     source = f"a scene corrected by measurements at {carrier_hz / 1e9:.6g} GHz, for which its constants hold"
     frame, title = "that of the scene it was made from", "A scene corrected by measurements"
     return write_scene(folder, parts, frame=frame, source=source, materials=facts, description=title, replace=replace)

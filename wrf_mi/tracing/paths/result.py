@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from operator import attrgetter
@@ -19,10 +20,13 @@ from ...core.paths import ARRAYS, read_paths_file, save_paths
 from ...core.settings import settings_from
 from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
-from ..search.chains import Legs
+from ..search.chains import SPECULAR, Legs
 from ..search.surfaces import Surfaces, scene_surfaces
 from ..sionna.materials import absorbs, at_frequency
-from ..sionna.path_solver import Devices, Ends, path_gains, scattering_materials
+from ..sionna.path_solver import Devices, Ends, path_gains
+from ..sionna.scattering import scattering_coefficients, scattering_materials
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,7 @@ class TraceResult:
         frequency_hz: carrier frequency of the search.
         tx_antenna: antenna of the transmitters.
         carriers_hz: carrier frequency of the gains for each transmitter [n_tx]; None: ``frequency_hz``.
+        lost: number of paths that are left out, as their gain is not a number.
     """
 
     paths: Paths
@@ -56,6 +61,7 @@ class TraceResult:
     frequency_hz: float
     tx_antenna: Antenna = ANTENNA
     carriers_hz: FloatArray | None = None
+    lost: int = 0
 
     @property
     def path_carriers_hz(self) -> FloatArray:
@@ -70,13 +76,30 @@ class TraceResult:
         paths, primitives, probability = self.paths.select(which), self.primitives[which], self.probability[which]
         return replace(self, paths=paths, primitives=primitives, probability=probability, wedge=wedge)
 
+    def with_gains(self, gain: NDArray[np.complex128]) -> TraceResult:
+        """The trace with gains [p]; paths whose gain is not a number are left out, counted and logged.
+
+        `InputError`: no path has a gain.
+        """
+        lost = int(np.count_nonzero(~np.isfinite(gain)))
+        result = replace(self, paths=replace(self.paths, gain=gain), lost=self.lost + lost)
+        if not lost:
+            return result
+        if lost == len(gain):
+            raise InputError("gains that are not numbers: give materials constants that single precision can hold")
+        logger.warning("%d of %d paths are left out: their gains are not numbers", lost, len(gain))
+        return result.select(np.flatnonzero(np.isfinite(gain)))
+
     def unabsorbed(self, scene: Any) -> TraceResult:
-        """The paths that meet no absorber of the ``sionna.rt.Scene``; others have no gain."""
-        names = self.paths.object_names
-        absorbing = [number for number, name in enumerate(names) if absorbs(scene.objects[name].radio_material)]
-        if not absorbing:
-            return self
-        return self.select(np.flatnonzero(~np.isin(self.paths.objects, absorbing).any(axis=1)))
+        """The paths without gain zero: no absorber of the ``sionna.rt.Scene``, no mirror where all is scattered."""
+        materials = [scene.objects[name].radio_material for name in self.paths.object_names]
+        all_scattered = {name for name, share in scattering_coefficients(scene).items() if share == 1}
+        absorbing, rough = (
+            np.isin(self.paths.objects, [number for number, material in enumerate(materials) if is_one(material)])
+            for is_one in (absorbs, lambda material: material.name in all_scattered)
+        )
+        lost = (absorbing | (rough & (self.paths.interactions == SPECULAR))).any(axis=1)
+        return self.select(np.flatnonzero(~lost)) if lost.any() else self
 
     def of_transmitters(self, which: IntArray) -> TraceResult:
         """The trace of the transmitters of indices ``which`` [n], in their order; an index may repeat."""
@@ -154,20 +177,26 @@ def gains_of_receivers(
     return by_carrier(carriers_hz[receiver], at_carrier)
 
 
+def recomputed_gains(traced: TraceResult, scene: Any) -> NDArray[np.complex128]:
+    """Gains [p] of paths with the scene's present materials and frequency; arguments and errors of `recompute`."""
+    surfaces = scene_surfaces(scene)
+    with scattering_materials(scene, traced.options):
+        legs = traced.legs(surfaces)
+        receiver = legs.source if traced.from_receivers else legs.target
+        return gains_of_receivers(scene, surfaces, legs, traced.ends(), traced.rays, traced.receivers, receiver)
+
+
 def recompute(traced: TraceResult, scene: Any) -> TraceResult:
     """Recompute the gains of paths with the scene's present materials and frequency, without tracing again.
+
+    Paths whose gain is not a number are left out (`TraceResult.with_gains`).
 
     Args:
         traced: from `wrf_mi.tracing.trace_paths` or `load_trace`, perhaps with other antennas.
         scene: a ``sionna.rt.Scene`` of the same geometry; `InputError` where it lacks an object that a path meets.
     """
-    surfaces = scene_surfaces(scene)
-    with scattering_materials(scene, traced.options):
-        legs = traced.legs(surfaces)
-        receiver = legs.source if traced.from_receivers else legs.target
-        gain = gains_of_receivers(scene, surfaces, legs, traced.ends(), traced.rays, traced.receivers, receiver)
-    paths, hz = replace(traced.paths, gain=gain), float(scene.frequency[0])
-    return replace(traced, paths=paths, frequency_hz=hz, carriers_hz=None)
+    changed = replace(traced, frequency_hz=float(scene.frequency[0]), carriers_hz=None)
+    return changed.with_gains(recomputed_gains(traced, scene))
 
 
 def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
@@ -190,6 +219,7 @@ def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
         probability=joined("probability")[order],
         wedge={name: np.concatenate([part.wedge[name] for part in parts])[order] for name in first.wedge},
         carriers_hz=None if first.carriers_hz is None else joined("carriers_hz"),
+        lost=sum(part.lost for part in parts),
     )
 
 
@@ -206,6 +236,7 @@ def save_trace(file: str | Path, traced: TraceResult) -> Path:
         "frequency_hz": traced.frequency_hz,
         "tx_antenna": np.array(astuple(traced.tx_antenna)),
         **({} if traced.carriers_hz is None else {"carriers_hz": traced.carriers_hz}),
+        "lost": traced.lost,
     }
     return save_paths(file, traced.paths, extra | {f"wedge/{name}": values for name, values in traced.wedge.items()})
 
@@ -227,6 +258,7 @@ def load_trace(file: str | Path) -> TraceResult:
             float(extra["frequency_hz"]),
             Antenna(*map(str, extra["tx_antenna"])),
             extra.get("carriers_hz"),
+            int(extra.get("lost", 0)),  # files of earlier versions have no such paths
         )
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{file}: holds paths alone, not how they were traced ({error}); trace them anew") from None

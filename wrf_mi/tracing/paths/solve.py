@@ -15,13 +15,15 @@ from rich.progress import Progress
 
 from ...core import Antenna, InputError, Paths, Receiver
 from ...core.antenna import ANTENNA
+from ...core.files import listed
 from ...core.types import FloatArray, IntArray
 from ..options import DEFAULTS, MAX_RAYS, TraceOptions
 from ..search.chains import Legs, ReflectionChains, check_search, join, shoot
 from ..search.devices import before_surfaces, check_devices, from_behind
 from ..search.images import image_sources, specular_paths
 from ..search.surfaces import Surfaces, scene_surfaces
-from ..sionna.path_solver import AT_ANTENNA_M, sampled_paths, scattering_materials
+from ..sionna.path_solver import AT_ANTENNA_M, sampled_paths
+from ..sionna.scattering import scattering_coefficients, scattering_materials, scatters
 from .motion import checked_velocities, length_rates
 from .result import TraceResult, device_ends, gains_of_receivers
 
@@ -48,7 +50,7 @@ class Prepared:
         self._chains: dict[tuple[bytes, TraceOptions, int], ReflectionChains] = {}
         self._rays: dict[TraceOptions, int] = {}
         self._tables: dict[MaterialGrouping, SceneTables] = {}
-        self._checked: set[bytes] = set()
+        self._checked: set[bytes | float | None] = set()
 
     @cached_property
     def object_velocity_mps(self) -> FloatArray:
@@ -68,6 +70,20 @@ class Prepared:
                 logger.warning(text, len(moved), len(new), names[moved[0]])
             check_devices(self.surfaces, before_surfaces(self.surfaces, traced), [names[row] for row in new])
             self._checked.update(stated[row].tobytes() for row in new)
+
+    def report_scattering(self, options: TraceOptions) -> None:
+        """Log once what options of scattering replace in the scene's materials, or that none scatters."""
+        stated = options.scattering_coefficient
+        if not options.scattering or stated in self._checked:
+            return
+        self._checked.add(stated)
+        others = {name: s for name, s in scattering_coefficients(self.scene).items() if s != stated}
+        if stated is not None and others:
+            names = listed([f"{name} {s:g}" for name, s in others.items()])
+            logger.info("scattering_coefficient %g replaces those of the scene's materials: %s", stated, names)
+        elif not scatters(self.scene, options):
+            text = "scattering has no effect: no material of the scene has a scattering_coefficient; state it there"
+            logger.warning("%s, or as a setting for all", text)
 
     def placed(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, tuple[Receiver, ...]]:
         """Transmitters [n, 3] and receivers as they are traced (`wrf_mi.tracing.search.devices.from_behind`)."""
@@ -136,7 +152,7 @@ def trace_paths(
     gains: bool = True,
     tx_velocity_mps: ArrayLike | None = None,
     rx_velocity_mps: ArrayLike | None = None,
-    search_from: Literal["receivers", "transmitters"] = "receivers",
+    search_from: Literal["receivers", "transmitters"] | None = None,
 ) -> TraceResult:
     """Trace the paths from every transmitter position to every receiver.
 
@@ -164,8 +180,9 @@ def trace_paths(
             those of the scene (``SceneObject.velocity``).
         rx_velocity_mps: velocities of the receivers [n_rx, 3], m/s; None: at rest.
         search_from: side from which rays leave, a second for each position; a path and its gain are the same both ways,
-            but rays miss some that take small surfaces, others from each side. Transmitters always search with
-            diffraction, as Sionna RT's heuristic at lossy wedges is not reciprocal.
+            but rays miss some that take small surfaces, others from each side. None: receivers, but transmitters with
+            diffraction (always) or scattering, whose fields at lossy wedges, and by the angle of incidence, are not
+            reciprocal in Sionna RT.
 
     Returns:
         The paths, reproducible for a seed whatever the chunks. Lengths and directions are float64: a float32 length
@@ -181,10 +198,12 @@ def trace_paths(
     rx_mps = checked_velocities(rx_velocity_mps, len(devices), "receiver")
     if check:
         shared.check(positions, devices, first_row)
+        shared.report_scattering(options)
     # Devices are placed before the surfaces that they are on.
     positions, devices = shared.placed(positions, devices)
-    # Rays leave the receivers, as each takes a second; a heuristic of diffraction is not reciprocal.
-    swap = search_from == "receivers" and not options.diffraction
+    # Rays leave the receivers, as each takes a second, but for fields that are not reciprocal.
+    side = search_from or ("transmitters" if options.sampled else "receivers")
+    swap = side == "receivers" and not options.diffraction
     transmitters, rx_devices = device_ends(positions, devices, tx_antenna)
     ends = (rx_devices, transmitters) if swap else (transmitters, rx_devices)
     sources, targets = ends[0].position_m, ends[1].position_m
@@ -196,14 +215,16 @@ def trace_paths(
         if gains:
             receiver = legs.source if swap else legs.target
             gain = gains_of_receivers(scene, shared.surfaces, legs, ends, rays, devices, receiver)
-    # Sorted from transmitters to receivers, with each triangle's number in its object, as in a file.
-    paths, legs = _paths(legs.reverse() if swap else legs, gain, shared.surfaces, positions, rx_devices.position_m)
-    rate = length_rates(paths, positions, rx_devices.position_m, tx_mps, rx_mps, shared.object_velocity_mps)
-    paths = replace(paths, length_rate_mps=rate)
-    primitives = np.where(legs.face >= 0, legs.face - shared.surfaces.first_face[paths.objects], -1).astype(np.int32)
-    hz, arrays = float(scene.frequency[0]), (primitives, legs.probability, legs.wedge)
-    traced = TraceResult(paths, positions, devices, *arrays, options, int(rays), swap, hz, tx_antenna)
-    traced = traced.unabsorbed(scene)
+        # Sorted from transmitters to receivers, with each triangle's number in its object, as in a file.
+        paths, legs = _paths(legs.reverse() if swap else legs, gain, shared.surfaces, positions, rx_devices.position_m)
+        rate = length_rates(paths, positions, rx_devices.position_m, tx_mps, rx_mps, shared.object_velocity_mps)
+        paths = replace(paths, length_rate_mps=rate)
+        primitives = np.where(legs.face >= 0, legs.face - shared.surfaces.first_face[paths.objects], -1)
+        hz, arrays = float(scene.frequency[0]), (primitives.astype(np.int32), legs.probability, legs.wedge)
+        traced = TraceResult(paths, positions, devices, *arrays, options, int(rays), swap, hz, tx_antenna)
+        traced = traced.unabsorbed(scene)
+        if gains:
+            traced = traced.with_gains(traced.paths.gain)
     if check:
         _warn_of_silence(traced.paths, positions, devices, first_row)
     return traced

@@ -29,6 +29,7 @@ MARGIN_M = 1e-3  # slack of the bounds of planes
 BESIDE = 1e-5
 """Slack of the sides of planes, as a share of `Surfaces.scale_m`: points of reflection that coincide in an edge, as
 displaced by `wrf_mi.tracing.search.images`."""
+MOST_CODES = 1 << 62  # most numbers of a 64-bit integer that stand for chains
 MOST_KEPT = 1 << 27  # bytes of chains that a process keeps
 SECONDS_PER_HIT = 1.2e-7  # of each surface that a ray meets, on two cores; most of it finds duplicates (docs/scenes.md)
 WARN_S, MOST_S = 10.0, 3600.0  # durations from which a search is announced, and refused
@@ -131,11 +132,11 @@ def _chains(
     if not len(surfaces.plane) or not reflections:
         return chains[0]
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-    for reflecting in patterns(options.surfaces_met, reflections, options.transmission):
-        for start in range(0, rays, RAYS_PER_CHUNK):
-            stop = min(start + RAYS_PER_CHUNK, rays)
+    for start in range(0, rays, RAYS_PER_CHUNK):
+        stop = min(start + RAYS_PER_CHUNK, rays)
+        directions = turn @ lattice(start, stop, rays)  # for all patterns: sines take as long as the rays
+        for reflecting in patterns(options.surfaces_met, reflections, options.transmission):
             sequence = np.full((stop - start, reflections), -1, np.int64)
-            directions = turn @ lattice(start, stop, rays)
             hits = _shoot(scene, surfaces, directions, source_m, options.surfaces_met, reflecting)
             sequence[:, : len(reflecting)] = hits[list(reflecting)].T
             chains.append(unique_chains(sequence))  # chunk by chunk: most rays find the same few chains
@@ -207,10 +208,14 @@ def unique_chains(sequence: IntArray) -> IntArray:
 
 
 def _unique_rows(rows: IntArray) -> IntArray:
-    """Distinct rows in lexical order, several times faster than `numpy.unique(axis=0)`."""
-    ordered = rows[np.lexsort(rows.T[::-1])]
-    repeated = (ordered[1:] == ordered[:-1]).all(axis=1)
-    return ordered[np.flatnonzero(~np.append(len(rows) == 0, repeated))]
+    """Distinct rows of integers of -1 or more in lexical order, many times faster than `numpy.unique(axis=0)`."""
+    # One number for each row, in the rows' order: numbers are sorted in a fifth of the time of rows.
+    base, codes, code = int(rows.max(initial=-1)) + 2, 1, np.zeros(len(rows), np.int64)
+    for column in rows.T:
+        if codes > MOST_CODES // base:  # of many planes and reflections: ranks in place of numbers that would overflow
+            code, codes = np.unique(code, return_inverse=True)[1].reshape(-1), len(rows)
+        code, codes = code * base + column + 1, codes * base
+    return rows[np.unique(code, return_index=True)[1]]
 
 
 def possible(

@@ -64,6 +64,19 @@ class Surfaces:
         return content_digest(self.triangles, self.first_face)
 
     @cached_property
+    def flattest(self) -> IntArray:
+        """Largest face of the same object in the same plane, for each face [f].
+
+        Its normal is that of the plane. Floors that are triangulated from an outline have slivers, whose corners are in
+        a line in single precision: a path that meets one has no normal from its corners.
+        """
+        _, part = np.unique(
+            np.stack([self.object_of(np.arange(len(self.plane))), self.plane]), axis=1, return_inverse=True
+        )
+        part = part.reshape(-1)
+        return largest_face(part, trimesh.triangles.area(self.triangles))[part]
+
+    @cached_property
     def first_by_shape(self) -> IntArray:
         """First face of each object, by the index of its mesh in Mitsuba's registry."""
         first = np.zeros(int(self.shape_ids.max(initial=0)) + 1, np.int64)
@@ -217,7 +230,7 @@ def find_planes(
     # The second step joins a wall with its slivers, whose normals are inexact.
     centre, cross = triangles.mean(axis=1), trimesh.triangles.cross(triangles)
     area = np.linalg.norm(cross, axis=1) / 2
-    # Faces without area get any normal: no ray meets them.
+    # Faces without area get any normal. Rays meet some of them where rounding gives them one: see `Surfaces.flattest`.
     normal = np.tile([0.0, 0.0, 1.0], (len(cross), 1))
     np.divide(cross, 2 * area[:, None], out=normal, where=area[:, None] > 0)
     largest = np.abs(normal).argmax(axis=1)[:, None]

@@ -31,6 +31,8 @@ def diffraction_matrix(material: Any, to_world: Any, k_in: Any, k_out: Any, si: 
     import mitsuba as mi
     from sionna.rt import utils
 
+    from ..slabs import slab_coefficients  # Dr.Jit is imported where paths are evaluated
+
     edge, faces = si.dn_du, (mi.Vector3f(0, 0, 1), si.dn_dv)
     # Angles from the face 0 in the plane across the edge, and the exterior angle n pi.
     n = 2 - utils.wedge_interior_angle(*faces) / dr.pi
@@ -58,9 +60,9 @@ def diffraction_matrix(material: Any, to_world: Any, k_in: Any, k_out: Any, si: 
     specular = dr.sqrt(1 - dr.square(material.scattering_coefficient))  # amplitude that is not scattered
     for normal, sign in zip(faces, (-1, 1), strict=True):
         cosine = dr.abs(dr.dot(k_in, normal))
-        te, tm, *_ = utils.itu_coefficients_single_layer_slab(cosine, eta, material.thickness, dr.two_pi / wavenumber)
+        slab = slab_coefficients(cosine, eta, material.thickness * wavenumber)
         share = coefficient(phi_out + phi_in, sign) * specular
-        te, tm = te * share, tm * share
+        te, tm = slab.reflected_te * share, slab.reflected_tm * share
         # The reflected field has the basis of its own direction, and keeps its components on the way from there to
         # the diffracted ray, as both are in one cone about the edge.
         mirrored = dr.normalize(k_in - 2 * dr.dot(k_in, normal) * normal)

@@ -17,6 +17,7 @@ import numpy as np
 from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONDUCTIVITY, PERFECT_THICKNESS_M, THICKNESS_M
 
 from ...core import InputError
+from ...core.files import listed
 from ...scene.materials import EXPONENT
 
 logger = logging.getLogger(__name__)
@@ -60,6 +61,14 @@ def absorbs(material: Any) -> bool:
     return isinstance(material, AbsorberRadioMaterial)
 
 
+def is_standard(material: Any) -> bool:
+    """Whether a radio material is, but for its thickness, the one that a scene folder knows by its name."""
+    if material.name == PERFECT:
+        stated = float(material.relative_permittivity[0]), float(material.conductivity[0])
+        return stated == (1.0, float(np.float32(PERFECT_CONDUCTIVITY)))
+    return bool(material.name == f"itu_{getattr(material, 'itu_type', '')}")
+
+
 CONSTANTS = ("relative_permittivity", "conductivity", "thickness")  # those in which materials differ
 # Attributes of a radio material: its constants by frequency, and those of ITU-R P.2040 where others replace them.
 CALLBACK, ITU_LAW = "_frequency_update_callback", "itu_law"
@@ -97,7 +106,7 @@ def set_frequency(
             material._frequency_update_callback = getattr(material, ITU_LAW)
     if below_range:
         text = "%g MHz is below the range of ITU-R P.2040 for %s: constant values of 1 GHz used"
-        logger.info(text, frequency_hz / 1e6, ", ".join(sorted(below_range)))
+        logger.info(text, frequency_hz / 1e6, listed(sorted(below_range)))
     for material in scene.radio_materials.values():
         if absorbs(material):
             # Sionna RT 2.2 calls this of every material when the frequency is set, and absorbers lack it.

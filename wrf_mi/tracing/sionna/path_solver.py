@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ...core import Antenna, InputError
+from ...core import Antenna
 from ...core.angles import FloatArray
 from ...core.antenna import MountedAntenna
 from ..options import TraceOptions
@@ -32,6 +33,7 @@ for an entry of the buffer, which has room for all so that no path is dropped: a
 WEDGE = ("o", "e_hat", "length", "n0", "nn", "prim0", "primn", "local_edge")  # fields of ``WedgeGeometry``
 PATHS_PER_CHUNK = 1 << 19  # paths in a chunk; the field calculator takes some 300 bytes per path and interaction
 AT_ANTENNA_M = 1e-9  # distance within which an interaction is at the antenna or its image and tells no direction
+TINY_M = 1e-30  # in place of a length of zero in a denominator
 SHORT = 1e-4
 """Distance to which coinciding points are moved apart, as a share of `Surfaces.scale_m`: single precision gives the
 direction from one to the other to 1e-3 rad."""
@@ -77,7 +79,8 @@ def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
     count, depth = legs.face.shape
     buffer: Any = PathsBuffer(count, depth, bool(legs.wedge))
     used = legs.interactions != 0
-    face = np.where(used, legs.face, 0)
+    # Sionna RT takes the normal from the corners of the triangle: that of the largest one is exact.
+    face = np.where(used, np.append(surfaces.flattest, 0)[legs.face], 0)
     object_index = surfaces.object_of(face)
     shape, primitive = np.full(face.shape, 0xFFFFFFFF, np.uint32), np.full(face.shape, 0xFFFFFFFF, np.uint32)
     shape[used] = surfaces.shape_ids[object_index[used]]
@@ -217,34 +220,61 @@ def field_of(
 
 
 _AS_SIONNA = ContextVar("diffracted fields of Sionna RT", default=False)
+_CORRECTED = ContextVar("corrected fields", default=False)
 
 
 @contextmanager
-def sionna_diffraction() -> Iterator[None]:
+def _set(variable: ContextVar[bool]) -> Iterator[None]:
+    token = variable.set(True)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
+def sionna_diffraction() -> AbstractContextManager[None]:
     """Diffracted fields of Sionna RT 2.2 while the block lasts: data that were made with them stay as they are."""
-    token = _AS_SIONNA.set(True)
-    try:
-        yield
-    finally:
-        _AS_SIONNA.reset(token)
+    return _set(_AS_SIONNA)
 
 
-@contextmanager
-def corrected() -> Iterator[None]:
-    """Correct Sionna RT's fields while the block lasts: diffraction, and square roots of complex permittivities."""
+def corrected() -> AbstractContextManager[None]:
+    """Correct Sionna RT's fields while the block lasts: diffraction, and coefficients of slabs.
+
+    In this thread alone: other threads may trace at the same time, and use Sionna RT as it is.
+    """
+    _correctable()
+    return _set(_CORRECTED)
+
+
+@cache
+def _correctable() -> None:
+    """Replace functions of Sionna RT, once, by functions that are corrected within `corrected`."""
+    from sionna.rt.radio_materials import radio_material
+
+    # They are never restored: a thread that does so takes the correction from another one that is in its block. Two
+    # threads that come first at the same time replace them twice, to the same effect.
+    module: Any = radio_material
+    material: Any = module.RadioMaterial
+    stated_slab, stated_matrix = module.itu_coefficients_single_layer_slab, material._diffraction_matrix
+
+    def slab(*arguments: Any, **named: Any) -> Any:
+        return (_slab if _CORRECTED.get() else stated_slab)(*arguments, **named)
+
+    def matrix(*arguments: Any) -> Any:
+        ours = _CORRECTED.get() and not _AS_SIONNA.get()
+        return (diffraction_matrix if ours else stated_matrix)(*arguments)
+
+    module.itu_coefficients_single_layer_slab, material._diffraction_matrix = slab, matrix
+
+
+def _slab(cosine: Any, eta: Any, thickness_m: Any, wavelength_m: Any) -> tuple[Any, Any, Any, Any]:
+    """Coefficients of a slab, with the arguments of Sionna RT's ``itu_coefficients_single_layer_slab``."""
     import drjit as dr
-    from sionna.rt import RadioMaterial
-    from sionna.rt.utils import electromagnetics
 
-    # Sionna RT 2.2 takes the imaginary part, the attenuation in a slab, from the difference of modulus and real part:
-    # of 6.31 - 0.0026j single precision leaves it 35 % off. Dr.Jit's root has no such difference.
-    stated: Any = electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix
-    diffracted = stated[1] if _AS_SIONNA.get() else diffraction_matrix
-    electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix = dr.sqrt, diffracted
-    try:
-        yield
-    finally:
-        electromagnetics.complex_sqrt, RadioMaterial._diffraction_matrix = stated
+    from ..slabs import slab_coefficients
+
+    c = slab_coefficients(cosine, eta, thickness_m * (dr.two_pi / wavelength_m))
+    return c.reflected_te, c.reflected_tm, c.transmitted_te, c.transmitted_tm
 
 
 def _pattern(devices: Devices, index: Any, receives: bool = False) -> Any:
@@ -302,7 +332,7 @@ def sionna_pattern(antenna: Antenna, receives: bool = False) -> Any:
 
 
 def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int) -> NDArray[np.complex128]:
-    """Complex gains [p] of paths, without the phase exp(-j k length); `InputError` where one is not a number."""
+    """Complex gains [p] of paths, without the phase exp(-j k length); NaN where single precision has none."""
     import drjit as dr
 
     gain, legs = np.zeros(len(legs), np.complex128), apart(legs, surfaces, ends)
@@ -312,8 +342,6 @@ def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int
         real, imaginary = field_of(scene, buffer, ends, rays)
         dr.eval(real, imaginary)  # in one kernel, not in one for each part
         gain[part] = real.numpy() + 1j * imaginary.numpy()
-    if not np.isfinite(gain).all():
-        raise InputError("gains that are not numbers: give materials constants that single precision can hold")
     return gain
 
 
@@ -325,7 +353,9 @@ def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
     points = np.pad(points, ((0, 0), (0, 1), (0, 0)))
     points[np.arange(len(legs)), count + 1] = ends[1].position_m[legs.target]
     used = np.arange(points.shape[1] - 1) <= count[:, None]
-    short = used & (np.linalg.norm(np.diff(points, axis=1), axis=2) < SHORT * surfaces.scale_m)
+    way = np.diff(points, axis=1)
+    length = np.linalg.norm(way, axis=2)
+    short = used & (length < SHORT * surfaces.scale_m)
     specular = np.isin(legs.interactions, (0, SPECULAR, TRANSMISSION)).all(axis=1)
     row = np.flatnonzero(short.any(axis=1) & specular & (count > 0))
     if not len(row):
@@ -336,34 +366,22 @@ def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
     image = image_sources(surfaces.normal, surfaces.offset, plane, points[row, 0])
     direction = points[row, 1:] - image
     size = np.linalg.norm(direction, axis=2, keepdims=True)
-    direction /= np.maximum(size, 1e-30)
+    direction /= np.maximum(size, TINY_M)
     # An antenna within a sheet that its path passes is at its first point: that leg takes the next one's direction.
     for leg in reversed(range(direction.shape[1] - 1)):
         at_image = size[:, leg] < AT_ANTENNA_M
         direction[:, leg] = np.where(at_image, direction[:, leg + 1], direction[:, leg])
-    moved = np.zeros_like(points[row])
-    for leg in range(short.shape[1]):  # forwards from a point that stays
-        step = (moved[:, leg] + SHORT * surfaces.scale_m * direction[:, leg]) * short[row, leg, None]
-        moved[:, leg + 1] = step
-    at_target = np.arange(len(row)), count[row] + 1
-    overshoot, together = moved[at_target], np.ones(len(row), bool)
-    for leg in reversed(range(short.shape[1])):  # the target stays, too: points before it are moved backwards
-        together &= short[row, leg] | (leg > count[row])
-        moved[:, leg] -= overshoot * (together & (leg > 0) & (leg <= count[row]))[:, None]
+    # Each short leg becomes longer, and the longest one shorter: the points before it move forwards from the source,
+    # which stays, those after it backwards from the target, and all other legs keep their directions.
+    longest = np.arange(len(row)), np.where(used[row], length[row], -1).argmax(axis=1)
+    change = np.where(short[row, :, None], SHORT * surfaces.scale_m * direction - way[row], 0)
+    change[longest] = 0
+    # By half of the longest leg at most, which keeps its direction then where both antennas are as near.
+    largest = np.maximum(np.linalg.norm(change, axis=2).sum(axis=1), TINY_M)
+    change *= np.minimum(1, length[row][longest] / 2 / largest)[:, None, None]
+    moved = np.pad(np.cumsum(change, axis=1), ((0, 0), (1, 0), (0, 0)))
+    after = np.arange(moved.shape[1]) > longest[1][:, None]
+    moved -= after[..., None] * moved[:, -1:]
     vertices = legs.vertices_m.copy()
     vertices[row] += moved[:, 1:-1]
     return replace(legs, vertices_m=vertices)
-
-
-@contextmanager
-def scattering_materials(scene: Any, options: TraceOptions) -> Iterator[None]:
-    """Set the scattering coefficient of all materials while the block lasts, if scattering is on."""
-    able = [m for m in scene.radio_materials.values() if options.scattering and hasattr(m, "scattering_coefficient")]
-    stated = [material.scattering_coefficient for material in able]
-    for material in able:
-        material.scattering_coefficient = options.scattering_coefficient
-    try:
-        yield
-    finally:
-        for material, coefficient in zip(able, stated, strict=True):
-            material.scattering_coefficient = coefficient

@@ -26,7 +26,7 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT, THICKNESS_M
 from ... import backend
 from ...core import InputError
 from ...core.angles import FloatArray
-from ...core.files import one_line
+from ...core.files import listed, one_line
 from ...core.yaml_files import read_yaml
 from ...scene.coordinates import require_near, warn_of_up
 from ...scene.folder import FACTS_FILE, read_scene_folder, scene_file
@@ -34,8 +34,10 @@ from ...scene.materials import FILE as MATERIALS_FILE
 from ...scene.materials import Materials, thicknesses
 from ...scene.mesh.files import mesh_parts
 from ...scene.mesh.surfaces import sampled
-from ...scene.xml_file import FILES, named_shapes, read_scene_xml
+from ...scene.scattering import take_scattering
+from ...scene.xml_file import FILES, OVERRULED, make_files_absolute, named_shapes, overruled, read_scene_xml
 from .materials import CONSTANTS, perfect_reflector, set_frequency
+from .scattering import set_scattering
 
 logger = logging.getLogger(__name__)
 
@@ -79,9 +81,7 @@ def replace_shapes(root: Element, path: Path, folder: Path) -> None:
         InputError: naming the file, the shape, and the remedy: a shape without triangles or with a parameter that
             Mitsuba does not know, or a mesh that cannot be read.
     """
-    for text in root.iter("string"):
-        if text.get("name") in FILES:
-            text.set("value", str((path.parent / text.get("value", "")).absolute()))
+    make_files_absolute(root, path)
     for number, (name, shape) in enumerate(named_shapes(root)):
         plugin = shape.get("type", "")
         try:
@@ -235,13 +235,18 @@ def plain_ply(mesh: trimesh.Trimesh) -> bytes:
 
 
 def check_materials(root: Element, path: Path) -> None:
-    """Refuse (`InputError`) a BSDF, in a shape or beside the shapes, without the id by which Sionna RT knows it."""
+    """Refuse (`InputError`) a BSDF, in a shape or beside the shapes, without the id by which Sionna RT knows it.
+
+    And one with constants whose id makes it a material of ITU-R P.2040, for which Sionna RT leaves them out.
+    """
     materials = [(f"<bsdf> {number}", bsdf) for number, bsdf in enumerate(root.findall("bsdf"), start=1)]
     materials += [(f"{name}: its <bsdf>", bsdf) for name, shape in named_shapes(root) for bsdf in shape.findall("bsdf")]
     for where, bsdf in materials:
         if not bsdf.get("id"):
             remedy = 'give it one of its own, such as id="mat-my_material"'
             raise InputError(f"{path}: {where} ({bsdf.get('type')}) has no id; {remedy}")
+        if overruled(bsdf):
+            raise InputError(f"{path}: {where} {OVERRULED}")
 
 
 def load_checked(root: Element, path: Path, folder: Path) -> Any:
@@ -287,7 +292,7 @@ def reason(error: Exception) -> str:
         if text.endswith("Pattern() takes no arguments"):  # which gets every property that the material does not know
             text = f"a radio material has an unknown property; known are {', '.join(PROPERTIES)}"
     elif unknown := re.findall(r'^\s*- (\w+ "[^"]*")', text, re.MULTILINE):
-        text = f"unknown property {', '.join(unknown)}"
+        text = f"unknown property {listed(unknown)}"
     return one_line(PLACE.sub("", text))
 
 
@@ -340,6 +345,7 @@ def load_scene(
         scene = _checked(path, source, material)
     except InputError as error:
         raise InputError(f"{error} (wrf-mi check {source} names every fault)") from None
+    set_scattering(scene, stated.scattering)
     for name, velocity_mps in stated.velocities_mps.items():
         scene.objects[name].velocity = list(velocity_mps)
     return scene, dict(stated.thickness_m), stated.laws
@@ -375,9 +381,12 @@ def _folder(folder: Path) -> tuple[Path, Materials]:
 def _from_xml(path: Path) -> Any:
     root = read_scene_xml(path)
     check_materials(root, path)
+    scattering = take_scattering(root, path)
     with tempfile.TemporaryDirectory() as folder:
         replace_shapes(root, path, Path(folder))
-        return load_checked(root, path, Path(folder))
+        scene = load_checked(root, path, Path(folder))
+    set_scattering(scene, scattering)
+    return scene
 
 
 def _from_mesh(path: Path, material: str) -> Any:

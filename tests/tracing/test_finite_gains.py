@@ -1,0 +1,215 @@
+"""Gains of paths are numbers, wherever antennas are and whatever surfaces are made of."""
+
+import logging
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import product
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from traced_rooms import FREQUENCY_HZ, HEIGHT, LENGTH, PARTITION, SHOEBOX, THICKNESS_M, WIDTH, receiver, write_xml
+
+from wrf_mi.core import InputError
+from wrf_mi.core.antenna import ANTENNA
+from wrf_mi.scene.materials import SINGLE_MAX
+from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
+from wrf_mi.tracing.paths import result as result_module
+from wrf_mi.tracing.search.chains import TRANSMISSION, Legs
+from wrf_mi.tracing.search.surfaces import scene_surfaces
+from wrf_mi.tracing.sionna.materials import CONSTANTS, at_frequency
+from wrf_mi.tracing.sionna.path_solver import SHORT, Devices, apart
+from wrf_mi.tracing.slabs import slab
+
+Float64 = dr.float64_array_t(mi.Float)
+ROUNDING = {mi.Float: 1e-5, Float64: 1e-12}  # of a power: some ten operations on numbers of about 1
+SINGLE = 2e-4  # of coefficients in single precision: the phase across up to three wavelengths
+
+DIRECTION_RAD = 2e-3  # of legs as short as `SHORT`, whose ends are single precision
+SLIVER = 3  # number of the triangle of the building's floor that has no area
+
+X = (0, 3, LENGTH, 2.4, 1e-9, 3 + 1e-7, -30, 1e4)  # corners, the partition, inside, beside a wall, far outside
+Y = (0, 4, WIDTH, 1.1, 1e-8, -2, 1e4)
+Z = (0, 2.5, HEIGHT, 1.3, 1e-7, 1e4)  # the floor, the partition's upper edge, the ceiling
+ENDS = ((4, 2, 1.5), (3, 2, 1.5), (0, 0, 0), (1.5, 3.5, 1))  # inside, on the partition, in a corner, on the block
+KINDS = {
+    "specular": TraceOptions(depth=3, rays=1 << 12),
+    "diffraction": TraceOptions(depth=2, diffraction=True, rays=1 << 9),
+    "scattering": TraceOptions(depth=2, scattering=True, rays=1 << 8),
+}
+SLABS = {  # relative permittivity, conductivity, thickness
+    "as air": (1.0, 0.0, 0.1),
+    "almost as air": (1 + 1e-6, 1e-12, 0.1),
+    "film": (2.7, 0.01, 1e-9),
+    "conducting film": (1.0, 1e7, 1e-9),
+    "no thickness": (2.7, 0.01, 0.0),
+    "thick": (5.0, 0.1, 1e4),
+    "thick without loss": (5.0, 0.0, 1e8),
+    "largest": (SINGLE_MAX, SINGLE_MAX, SINGLE_MAX),
+}
+
+
+def coefficients(constants, kind):
+    """Reflection of TE and TM, then transmission [4, p], of slabs' constants by column: cosine, ..., carrier."""
+    c = slab(*map(kind, constants))
+    parts = c.reflected_te, c.reflected_tm, c.transmitted_te, c.transmitted_tm
+    return np.stack([part.real.numpy() + 1j * part.imag.numpy().astype(complex) for part in parts])
+
+
+positive = st.floats(-12, 38).map(lambda exponent: float(10.0**exponent))
+CONSTANTS_OF_ANY = st.tuples(
+    st.floats(0, 1) | st.floats(-12, 0).map(lambda exponent: 10.0**exponent),
+    st.just(1.0) | positive.map(lambda more: 1 + more),
+    st.just(0.0) | positive,
+    st.just(0.0) | positive,
+    st.floats(8, 12).map(lambda exponent: 10.0**exponent),
+)
+
+
+@pytest.mark.parametrize("kind", [mi.Float, Float64])
+@given(constants=CONSTANTS_OF_ANY)
+@settings(deadline=None, max_examples=200)
+def test_slab_sends_on_no_more_power_than_it_receives(kind, constants):
+    reflected, transmitted = np.split(np.abs(coefficients([[value] for value in constants], kind)) ** 2, 2)
+    assert (reflected + transmitted <= 1 + ROUNDING[kind]).all()  # NaN is not, either
+
+
+def test_thin_slab_of_single_precision_is_that_of_double_at_grazing_incidence():
+    """The equations of ITU-R P.2040 as they stand give up to 2.2 there, and 0 / 0."""
+    rng = np.random.default_rng(0)
+    exponents = rng.uniform([-7, -6, -12, -9, 8], [0, 1, 7, -3, 10], (4000, 5)).T
+    constants = (10**exponents + np.array([0, 1, 0, 0, 0])[:, None]).astype(np.float32)
+    single, double = (coefficients(constants, kind) for kind in (mi.Float, Float64))
+    np.testing.assert_allclose(single, double, atol=SINGLE, rtol=0)
+
+
+def test_wave_passes_a_slab_of_air_at_any_angle():
+    """Along the slab, too, where its Fresnel coefficients are 0 / 0."""
+    cosine = np.array([0.0, 1e-12, 1e-4, 0.5, 1.0])
+    for kind in (mi.Float, Float64):
+        c = coefficients([cosine, *(np.full(5, value) for value in (1.0, 0.0, 0.2, FREQUENCY_HZ))], kind)
+        np.testing.assert_allclose(np.abs(c), [[0] * 5] * 2 + [[1] * 5] * 2, atol=ROUNDING[mi.Float])
+
+
+@pytest.fixture(scope="module")
+def building(tmp_path_factory):
+    """The shoebox with a partition and a solid block; its floor has a triangle whose corners are in a line."""
+    block = trimesh.creation.box((1, 1, 1))
+    block.apply_translation((1.5, 3.5, 0.5))
+    corners = [[0, 0, 0], [LENGTH, 0, 0], [LENGTH, WIDTH, 0], [0, WIDTH, 0], [LENGTH / 2, WIDTH / 2, 0]]
+    # As a triangulation of an outline with a corner in line: the sliver lies on the diagonal of the floor.
+    floor = trimesh.Trimesh(corners, [[0, 1, 2], [0, 4, 3], [4, 2, 3], [0, 2, 4]], process=False)
+    parts = {**SHOEBOX, **PARTITION, "block": ("itu_concrete", block), "floor": ("itu_concrete", floor)}
+    return open_scene(write_xml(tmp_path_factory.mktemp("building"), parts), FREQUENCY_HZ, THICKNESS_M)
+
+
+@contextmanager
+def made_of(scene, constants):
+    """All surfaces of one slab while the block lasts."""
+    stated = [(m, {name: getattr(m, name) for name in CONSTANTS}) for m in scene.radio_materials.values()]
+    for material, _ in stated:
+        for name, value in zip(CONSTANTS, constants, strict=True):
+            setattr(material, name, dr.opaque(mi.Float, value))
+    try:
+        yield
+    finally:
+        for material, values in stated:
+            for name, value in values.items():
+                setattr(material, name, value)
+
+
+def traced_everywhere(scene, options):
+    """Paths to positions in, on and around the building, among them the transmitters' own and the nearest ones."""
+    near = [np.asarray(ENDS, float) + step for step in ([0, 0, 0], [1e-9, 0, 0], [0, 1e-7, 1e-5])]
+    places = np.concatenate([*near, np.array(list(product(X, Y, Z)))])
+    receivers = [receiver(place, f"rx{number}") for number, place in enumerate(places)]
+    return trace_paths(scene, np.array(ENDS), receivers, options, check=False, search_from="transmitters")
+
+
+def assert_numbers(traced):
+    assert traced.lost == 0
+    assert len(traced.paths) > 100
+    assert np.isfinite(traced.paths.gain).all()
+    assert np.isfinite(traced.paths.length_m).all()
+    assert np.isfinite([traced.paths.departure, traced.paths.arrival]).all()
+
+
+@pytest.mark.parametrize("frequency_hz", [0.4e9, FREQUENCY_HZ, 28e9])
+@pytest.mark.parametrize("options", KINDS.values(), ids=KINDS)
+def test_gains_in_materials_of_itu_are_numbers_at_any_position(building, options, frequency_hz):
+    with at_frequency(building, frequency_hz):
+        assert_numbers(traced_everywhere(building, options))
+
+
+@pytest.mark.parametrize("constants", SLABS.values(), ids=SLABS)
+@pytest.mark.parametrize("options", KINDS.values(), ids=KINDS)
+def test_gains_in_any_slab_are_numbers_at_any_position(building, options, constants):
+    with made_of(building, constants):
+        assert_numbers(traced_everywhere(building, options))
+
+
+def test_path_that_meets_a_sliver_has_the_gain_of_its_plane(building):
+    """Sionna RT takes the normal from the corners of the triangle, which has none."""
+    options = TraceOptions(depth=1, transmission=False, rays=1 << 12)
+    traced = trace_paths(building, [[1.0, 1.0, 1.0]], receiver([2.5, 2.5, 1.5]), options)
+    on_floor = traced.paths.objects == traced.paths.object_names.index("floor")
+    assert on_floor.any()
+    met = replace(traced, primitives=np.where(on_floor, SLIVER, traced.primitives))
+    again = recompute(met, building)
+    np.testing.assert_array_equal(again.paths.gain, traced.paths.gain)
+    assert again.lost == 0
+
+
+@given(gaps_m=st.lists(st.floats(0, 4e-3), min_size=1, max_size=3), seed=st.integers(0, 2**16))
+@settings(deadline=None, max_examples=200)
+def test_short_legs_become_longer_and_keep_all_directions(building, gaps_m, seed):
+    """Legs of a straight path through sheets, in single precision."""
+    surfaces, rng = scene_surfaces(building), np.random.default_rng(seed)
+    source, target = rng.uniform(0.2, [[2, 2, 2], [6, 5, 3]])
+    direction = (target - source) / np.linalg.norm(target - source)
+    vertices = source + np.cumsum([rng.uniform(0, 4e-3), *gaps_m])[:, None] * direction
+    types = np.full((1, len(vertices)), TRANSMISSION, np.uint8)
+    met = types, np.zeros(types.shape, np.int64), vertices[None], np.ones(types.shape, np.float32), {}
+    ends = tuple(Devices(end[None], (ANTENNA.mounted(),)) for end in (source, target))
+    moved = apart(Legs(np.zeros(1, int), np.zeros(1, int), *met), surfaces, ends)
+    legs = np.diff(np.concatenate([source[None], moved.vertices_m[0], target[None]]).astype(np.float32), axis=0)
+    length = np.linalg.norm(legs, axis=1)
+    assert length.min() > 0.99 * SHORT * surfaces.scale_m
+    assert np.linalg.norm(legs / length[:, None] - direction, axis=1).max() < DIRECTION_RAD
+
+
+def losing(monkeypatch, lost):
+    """Let the field calculator find no number for paths of some numbers."""
+    gains = result_module.path_gains
+
+    def broken(*arguments):
+        gain = gains(*arguments)
+        gain[lost] = np.nan
+        return gain
+
+    monkeypatch.setattr(result_module, "path_gains", broken)
+
+
+def test_paths_without_a_gain_are_left_out_and_counted(building, monkeypatch, caplog):
+    places, rx = [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]], receiver(ENDS[0])
+    options = KINDS["specular"]
+    whole = trace_paths(building, places, rx, options)
+    losing(monkeypatch, [0, 3])
+    with caplog.at_level(logging.WARNING):
+        traced = trace_paths(building, places, rx, options)
+        again = recompute(whole, building)
+    count = len(whole.paths)
+    for part in (traced, again):
+        assert (part.lost, len(part.paths)) == (2, count - 2)
+        assert np.isfinite(part.paths.gain).all()
+    assert caplog.text.count(f"2 of {count} paths are left out: their gains are not numbers") == 2
+
+
+def test_trace_without_any_gain_is_refused(building, monkeypatch):
+    losing(monkeypatch, slice(None))
+    with pytest.raises(InputError, match="gains that are not numbers"):
+        trace_paths(building, [[1.0, 1.0, 1.0]], receiver(ENDS[0]), KINDS["specular"])

@@ -1,0 +1,123 @@
+"""Gaussian processes of several receivers that share part of their mean.
+
+    y_r(x) = phi_r(x) . beta + f_r(x) + e,    beta ~ N(0, diag(sd^2)),  f_r ~ GP(0, k),  e ~ Student-t
+
+beta is common to all receivers and learned from all of them; the fields f_r are independent, so that the exact
+posterior needs one Cholesky factor for each receiver (`wrf_mi.models.interpolation.kriging_equations`). The noise's
+heavy tails are reached by reweighting: a row with a large residual has a larger variance.
+
+Source: Rasmussen and Williams, "Gaussian Processes for Machine Learning" (2006), sections 2.2 and 2.7 (mean with
+explicit basis functions); Lange, Little and Taylor, "Robust statistical modeling using the t distribution" (1989),
+JASA 84 (the weights).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ...core.angles import FloatArray
+from ...parallel.threads import on_threads
+from .kriging_equations import KrigingSystem
+
+Result = TypeVar("Result")
+Kernel = Callable[[Any, Any], FloatArray]
+"""Covariance [n, m] of the field between two sets of inputs."""
+
+THREADED_ROWS = 1000  # rows of all receivers from which these are computed on threads
+JITTER = 1e-9  # noise added to coincident inputs, as a share of the field's variance
+DEGREES = 4.0  # degrees of freedom of the noise's Student-t distribution: fades are deep
+
+
+def of_each(work: Callable[[Any], Result], parts: Sequence[Any], rows: int) -> list[Result]:
+    """Results of ``work(part)``, on threads where so many rows take longer than to start these."""
+    return on_threads(work, parts) if rows > THREADED_ROWS else [work(part) for part in parts]
+
+
+@dataclass(frozen=True)
+class ReceiverObservations:
+    """Observations of one receiver: inputs of the kernel, phi [n, k], y [n], variance of the noise [n]."""
+
+    inputs: Any
+    basis: FloatArray
+    value: FloatArray
+    variance: FloatArray
+
+
+class PooledProcess:
+    """The posterior of all receivers.
+
+    ``parts`` are the observations of each receiver, possibly without rows; ``prior_sd`` [k] the standard deviations of
+    beta, above zero; ``point_variance`` is k(x, x); ``rounds`` reweight rows for Student-t noise; ``beta`` [k] is the
+    posterior mean of the shared coefficients.
+
+    Raises:
+        numpy.linalg.LinAlgError: a covariance that is not positive definite.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[ReceiverObservations],
+        kernel: Kernel,
+        prior_sd: FloatArray,
+        point_variance: float,
+        rounds: int = 0,
+    ) -> None:
+        self._kernel, self._prior_sd, self._point_variance = kernel, prior_sd, point_variance
+        self._solve(parts)
+        for _ in range(rounds):
+            self._solve(self._reweighted([part.variance for part in parts]))
+
+    def _solve(self, parts: Sequence[ReceiverObservations]) -> None:
+        kernel, jitter, self._parts = self._kernel, JITTER * self._point_variance, parts
+
+        def system(p: ReceiverObservations) -> KrigingSystem:
+            return KrigingSystem(kernel(p.inputs, p.inputs), p.variance + jitter, p.basis)
+
+        self._systems = of_each(system, parts, sum(len(p.value) for p in parts))
+        pairs = list(zip(self._systems, parts, strict=True))
+        # Receivers are independent given beta: their information adds up to the prior's (equation 2.41).
+        self._information = np.diag(1 / np.square(self._prior_sd)) + sum(system.information for system in self._systems)
+        self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
+        self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
+
+    @property
+    def cost(self) -> float:
+        """Minus twice the logarithm of the marginal likelihood of the observations, up to a constant."""
+        # y ~ N(0, K + B S B^T), by the lemmas of inversion and determinants: rows of receivers share beta alone.
+        pairs = list(zip(self._systems, self._parts, strict=True))
+        square = sum(float(part.value @ system.solve(part.value)) for system, part in pairs)
+        square -= float(self.beta @ self._information @ self.beta)
+        volume = float(np.linalg.slogdet(self._information)[1] + 2 * np.log(self._prior_sd).sum())
+        return square + volume + sum(system.log_determinant for system in self._systems)
+
+    def predict(self, receiver: int, inputs: Any, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis`` [m, k]."""
+        cross = self._kernel(inputs, self._parts[receiver].inputs)
+        mean = basis @ self.beta + cross @ self._weights[receiver]
+        return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self._information)
+
+    def weights(self, receiver: int) -> tuple[Any, FloatArray]:
+        """Inputs of a receiver's observations, and weights [n] of the field's covariances with them in a mean."""
+        return self._parts[receiver].inputs, self._weights[receiver]
+
+    def _reweighted(self, variance: Sequence[FloatArray]) -> list[ReceiverObservations]:
+        """Parts with the noise variances that their residuals imply for Student-t noise.
+
+        The expected squared residual, posterior variance of the field included, is compared with the squared scale
+        ``variance`` of each row's noise, [n] for each receiver: v = s (degrees + e^2 / s) / (degrees + 1).
+        """
+
+        def reweighted(receiver: int) -> ReceiverObservations:
+            part, system, weights = self._parts[receiver], self._systems[receiver], self._weights[receiver]
+            scale = variance[receiver]
+            # y - f = V K^-1 (y - B beta); the field's posterior variance is the diagonal of V - V K^-1 V.
+            precision = np.square(system.whiten(np.eye(len(part.value)))).sum(axis=0)
+            residual = part.variance * weights
+            square = residual**2 + np.maximum(part.variance - part.variance**2 * precision, 0)
+            return replace(part, variance=scale * (DEGREES + square / scale) / (DEGREES + 1))
+
+        return of_each(reweighted, range(len(variance)), sum(len(scale) for scale in variance))
