@@ -14,7 +14,7 @@ from small_fits import official, settings
 
 from wrf_mi.checking.rows import few_rows
 from wrf_mi.cli.data import render, summary
-from wrf_mi.core import Receiver, Record, Split
+from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.datasets import load
 from wrf_mi.datasets.observations import fitted_receivers, scorable, warn_of_left_out, warn_of_one_place
 from wrf_mi.models import ray_tracing
@@ -156,13 +156,31 @@ def test_data_without_a_received_training_row_are_refused_first(silent: Record, 
     assert stages == []
 
 
-def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(flat_folder: Path, room: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("split", ["official", "blocked"])
+def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(
+    split: str, flat_folder: Path, room: Path, tmp_path: Path
+) -> None:
     """It is known only from the paths."""
     nothing = TraceOptions(line_of_sight=False, reflection=False, transmission=True, depth=1)
     (tmp_path / "run").mkdir()
     message, options = "no training row is both received and reached by a path", {"scene": room, "settings": nothing}
-    refusal(train, flat_folder, "ray-tracing", message, out=tmp_path / "run", **options)
+    refusal(train, flat_folder, "ray-tracing", message, out=tmp_path / "run", split=split, **options)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_fold_that_is_refused_leaves_the_paths_of_fitted_folds(
+    flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused_later(*values: Any) -> Any:
+        if (tmp_path / "run" / "fold0" / "model.npz").exists():
+            raise InputError("a fault; a remedy")
+        return fit_offsets(*values)
+
+    fit_offsets = ray_tracing.fit_offsets
+    monkeypatch.setattr(ray_tracing, "fit_offsets", refused_later)
+    options = {"scene": room, "settings": DIRECT, "split": "blocked"}
+    refusal(train, flat_folder, "ray-tracing", "a fault", out=tmp_path / "run", **options)
+    assert (tmp_path / "run" / "paths.npz").exists()
 
 
 @pytest.mark.parametrize(("module", "stage"), [(ray_tracing, "fit_offsets"), (runs, "score_part")])

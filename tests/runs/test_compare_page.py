@@ -64,7 +64,7 @@ def strengths(
     stated = (Path(path) / name, name, "rssi", "flat", metrics, seed, names)
     split = Split("official", seed, np.array(train, np.int64), np.zeros(0, np.int64), rows)
     idw = {"idw100": truth + idw_db}
-    return Results(*stated, rows, positions_m, prediction, truth, idw, None, None, {}, [split])
+    return Results(*stated, rows, positions_m, prediction, truth, idw, None, None, {}, splits=[split])
 
 
 def verdicts(runs: list[Results]) -> dict[tuple[str, str], str]:

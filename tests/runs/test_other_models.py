@@ -48,7 +48,7 @@ def test_predictions_of_a_run_have_its_scores_under_another_name(flat: tuple[Rec
     assert main([*again, str(tmp_path / "again")]) == 0
     assert read_config_text(tmp_path / "again") == read_config_text(copied.folder)
     table = {row["run"]: row for row in rows_of(tmp_path / "compare" / "compare.csv")}
-    constant = table["mean of each receiver's training rows, official"]
+    constant = table["median of each receiver's training rows, official"]
     assert float(constant["median"]) == own["constant"]["median"]
     between = [each for each in differences(read_runs([run, copied.folder])) if each.against == "kriging"]
     assert {(each.difference, each.verdict) for each in between} == {(0.0, TIE)}

@@ -153,7 +153,7 @@ def test_a_checkpoint_of_other_arrays_is_refused(change: str, stopped: Path, tmp
 def test_infinite_predictions_are_refused(kriging: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = open_run(kriging)
     infinite = Prediction(np.full(1, np.inf, np.float32))
-    monkeypatch.setattr(run.fitted, "predict", lambda inputs, receiver: infinite)
+    monkeypatch.setattr(type(run.fitted), "predict", lambda self, inputs, receiver: infinite)
     with pytest.raises(InputError, match="predictions are infinite, as parameters are too large; train it anew"):
         run.predict(np.zeros((1, 3)), receiver=0)
 

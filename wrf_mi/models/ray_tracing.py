@@ -280,6 +280,7 @@ class RayTracing(Model):
         assert problem.scene is not None
         settings: TracingSettings = problem.settings
         tracer = RayTracer(problem.scene, _instrument(record), settings.options, problem.material)
+        stored = path.exists()
         traced = _trace_of_fit(tracer, problem, session)
         seconds = time.perf_counter() - start
         facts = {"rays": traced.rays, "paths": len(traced.paths), "trace_seconds": seconds}
@@ -290,7 +291,12 @@ class RayTracing(Model):
             reported = tracer.observe(traced)[:, known]
             if not settings.transmission:
                 _warn_of_walls(reported, record.observation[:, known])
-            offsets = fit_offsets(reported, record.observation[:, known])
+            try:
+                offsets = fit_offsets(reported, record.observation[:, known])
+            except InputError:  # a resumed fit would be refused for the same paths: no progress
+                if not stored:  # else fitted folds have them
+                    path.unlink()
+                raise
             arrays |= {"offset_db": offsets.offset_db, "floor_dbm": offsets.floor_dbm}
         fitted = FittedTracing(problem, arrays, path)
         fitted.train_seconds = 0.0
