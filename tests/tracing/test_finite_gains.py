@@ -79,7 +79,7 @@ def test_slab_sends_on_no_more_power_than_it_receives(kind, constants):
 
 
 def test_thin_slab_of_single_precision_is_that_of_double_at_grazing_incidence():
-    """The equations of ITU-R P.2040 as they stand give up to 2.2 there, and 0 / 0."""
+    """The equations of ITU-R P.2040 as they stand give magnitudes above 1 there, and 0 / 0."""
     rng = np.random.default_rng(0)
     exponents = rng.uniform([-7, -6, -12, -9, 8], [0, 1, 7, -3, 10], (4000, 5)).T
     constants = (10**exponents + np.array([0, 1, 0, 0, 0])[:, None]).astype(np.float32)
