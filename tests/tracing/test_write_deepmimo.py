@@ -124,7 +124,7 @@ def test_what_cannot_be_written_is_refused(traced, tmp_path):
     none = {"paths": traced.paths.select(np.zeros(len(traced.paths), bool))}
     for name, changes, message in (
         *(("Street", {}, capital), ("a:b", {}, "choose small letters")),
-        ("there", {}, "exists; remove it or choose another folder"),
+        ("there", {}, "exists; remove it, choose another folder, or give --replace"),
         ("none", none, "no path from 5 users to 2 base stations"),
         ("two", {"carriers_hz": np.array([1e9, 2e9, 1e9, 1e9, 1e9])}, "several carriers"),
     ):

@@ -161,7 +161,9 @@ def test_networks_learn_from_the_carrier(tmp_path):
     positions, carriers = np.tile(transmitters(10), (3, 1)), np.repeat(CARRIERS_HZ, 10)
     observed = (-40 - 20 * np.log10(carriers / CARRIERS_HZ[0]))[None].astype(np.float32)
     record = Record("falling", "rssi", positions, (receiver(),), observed, carriers_hz=carriers)
-    settings = (*QUICK, "steps=200", "optimiser.network=0.005")
+    # No strength depends on the place: of few octaves. At higher rates some seeds end at one strength for all carriers.
+    octaves = "encoding.tx_octaves=1", "encoding.position_octaves=2"
+    settings = (*QUICK, *octaves, "steps=200", "optimiser.network=0.002")
     run = wrf_mi.train(record, "wrf-gs+", out=tmp_path / "run", split="random", settings=settings)
     assert run.metrics["abs_error_db"]["median"] < 2  # 6 dB for the middle carrier's strength, the median
 

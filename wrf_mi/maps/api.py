@@ -234,6 +234,7 @@ def map_values(
         if scheduler is None:  # one with workers has a bar of its own
             on_progress("mapping", (part + 1) / len(rows))
 
+    run.check_inputs(conditions.inputs(positions_m[every]))  # before a line of progress
     if scheduler is None:
         on_progress("mapping", 0.0)
     opener: Any = (lambda: run) if scheduler is None else partial(open_run, run.folder, operator=run.operator)
@@ -257,7 +258,6 @@ def _of_chunk(
 ) -> dict[str, Any]:
     task, count = task_of(run.problem.record), len(positions_m)
     inputs = conditions.inputs(positions_m)
-    run.check_inputs(inputs)
     parts = fitted.decompose(inputs, receiver)
     added = conditions.transmit_dbm if task.level_kind == "gain" else 0.0
 

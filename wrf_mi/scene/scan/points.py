@@ -184,6 +184,8 @@ def _read_text(file: Path) -> list[Part]:
         table = _text_rows(rows, columns, delimiter)
     if columns is not None:
         return [(table, None)]
+    if len(table) and table.shape[1] < 3:
+        raise ValueError(f"{table.shape[1]} {'columns' if table.shape[1] > 1 else 'column'}; x y z wanted")
     whole = (table == np.round(table)).all(axis=0)
     if whole.size and whole[0] and np.count_nonzero(~whole) >= 3:
         raise ValueError(
