@@ -76,7 +76,9 @@ RECORDS: dict[str, Callable[[], Record]] = {
 TRAINED = ("strengths", "spectra of an unknown array", "channels", "channels with an uplink")
 """Records of models that train step by step, which take seconds each."""
 LOOP = ("steps=4", "batch=4", "validate_every=2", "patience=2")
-GAUSSIANS = (*LOOP, "initial.gaussians=4", "network.width=8", "network.layers=2", "view.height=3", "view.columns=6")
+ROUNDS = ("density.every=1", "density.start=0", "density.stop=1")
+SMALL = ("initial.gaussians=4", "network.width=8", "network.layers=2", "view.height=3", "view.columns=6")
+GAUSSIANS = (*LOOP, *ROUNDS, *SMALL)
 QUICK: dict[str, tuple[str, ...]] = {
     "wrf-gs": GAUSSIANS,
     "wrf-gs+": GAUSSIANS,
@@ -284,6 +286,8 @@ def test_stated_default_of_generic_kriging_chooses_it() -> None:
         ("wrf-gs+", "strengths", "loss.ssim_weight=0.2"),
         ("wrf-gs+", "strengths", "density.start=0.05"),
         ("wrf-gs+", "strengths", "view.components=6"),
+        ("wrf-gs+", "spectra of an unknown array", "density.growth_fraction=0.1 steps=50"),
+        ("wrf-gs", "spectra of an unknown array", "density.reset_every=2"),
         ("wrf-gs+", "spectra of an unknown array", "optimiser.level=0.02"),
         ("wrf-gs+", "spectra of an unknown array", "traced.depth=3"),
         ("factorised", "strengths", "encoding.position_octaves=4"),

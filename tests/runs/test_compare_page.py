@@ -23,6 +23,7 @@ from test_compare import captured, edit_metrics, make_run
 from wrf_mi.cli.main import build_parser
 from wrf_mi.cli.train import training_request
 from wrf_mi.core import Record, Split
+from wrf_mi.models import Session
 from wrf_mi.runs import figures
 from wrf_mi.runs.api import plan_run, train
 from wrf_mi.runs.compare import compare
@@ -209,6 +210,9 @@ def every_run(folder: Path, flat_folder: Path) -> list[tuple[Path, dict[str, Any
         (flat_folder, {"model": "hybrid", "antennas": antennas, **scene}),
         (flat_folder, {"model": "ray-tracing", "settings": ["depth=1", "rays=4096"], **scene}),
         (flat_folder, {"model": "wrf-gs+", "settings": ["traced.depth=1"], **scene}),
+        (folder, {"model": "wrf-gs+", "preset": "fast", "settings": ["steps=9", "validate_every=1000"]}),
+        (folder, {"model": "wrf-gs", "preset": "paper"}),
+        (flat_folder, {"model": "hybrid", "preset": "fast"}),
     ]
 
 
@@ -250,10 +254,12 @@ def test_settings_of_a_run_are_those_that_differ(folder: Path, tmp_path: Path, o
     steps = [*SMALL, "loss.ssim_weight=0.25"]
     run = train(folder, "wrf-gs+", out=tmp_path / "run", settings=steps, seed=2).folder
     changed = changed_settings(read_config(run))
-    resolved = "encoding.tx_scale_m"  # found from the data, which the command states, too
+    resolved = "encoding.tx_scale_m"  # found from the data, which the command leaves to be found again
     assert set(changed) - {resolved} == {setting.partition("=")[0] for setting in steps}
     parsed = build_parser().parse_args(shlex.split(command(read_config(run), tmp_path / "again"))[1:])
-    assert plan_run(parsed.dataset, training_request(parsed))[1] == open_run(run).config
+    problem, config, splits = plan_run(parsed.dataset, training_request(parsed))
+    settings = config.entry.prepare(problem, splits, Session(run, run))
+    assert replace(config, settings=settings) == open_run(run).config
     page = compare([run], tmp_path / "out").read_text()
     assert command(read_config(run), run) in unescape(page)
     assert "loss.ssim_weight=0.25" in page

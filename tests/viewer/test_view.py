@@ -40,7 +40,7 @@ def traced(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.fixture(scope="module")
 def joint(flat_folder: Path, room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    settings = [*SMALL, "traced.depth=1", "traced.rays=4096", "density.max_gaussians=8", "patience=0"]
+    settings = [*SMALL, "traced.depth=1", "traced.rays=4096", "patience=0"]
     return trained(flat_folder, tmp_path_factory, "wrf-gs+", scene=room, settings=settings)
 
 

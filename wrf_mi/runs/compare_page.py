@@ -255,6 +255,18 @@ def changed_settings(config: RunConfig) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if value != standard[name]}
 
 
+def _preset(config: RunConfig) -> str | None:
+    """The preset that gave values to settings that are not stated, the one with most of them; None: no preset did."""
+    entry, values, found = config.entry, dict(flat(asdict(config.settings))), dict[str, int]()
+    standard = dict(flat(asdict(default_settings(entry, (), {"model": config.model}))))
+    for name, texts in entry.presets.items() if config.stated is not None else ():
+        preset = dict(flat(asdict(default_settings(entry, texts, {"model": config.model}))))
+        given = [key for key in preset.keys() - {*(config.stated or ())} if preset[key] != standard[key]]
+        if given and all(values[key] == preset[key] for key in given):
+            found[name] = len(given)
+    return max(found, key=lambda name: found[name], default=None)
+
+
 def _options(config: RunConfig) -> dict[str, Any]:
     """Options of `train` that a run was made with; None for those that were not stated."""
     options = {"n_train": config.n_train, "scene": config.scene, "material": config.material}
@@ -283,10 +295,16 @@ def _command(run: Results) -> str:
 def command(config: RunConfig, folder: Path) -> str:
     """The line that repeats a run; data sets passed as objects are named by their folder, rows by their split."""
     entry, settings = config.entry, config.settings
-    changed = changed_settings(config)
-    if config.seed and "seed" not in entry.train_arguments and hasattr(settings, "seed"):
-        changed["seed"] = settings.seed  # --seed alone would set that of the rays, too
+    preset = _preset(config)
+    if config.stated is None:
+        changed = changed_settings(config)
+        if config.seed and "seed" not in entry.train_arguments and hasattr(settings, "seed"):
+            changed["seed"] = settings.seed  # --seed alone would set that of the rays, too
+    else:  # not those that the fit found from its data, which might be refused as without effect
+        values = dict(flat(asdict(settings)))
+        changed = {name: values[name] for name in config.stated if name not in entry.train_arguments}
     words = ["wrf-mi", "train", config.dataset, "--model", config.model, "--split", config.split]
+    words += [] if preset is None else ["--preset", preset]
     for name, value in _options(config).items():
         words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
     words += [f"--{name}" for name in ("deterministic", "intervals") if getattr(config, name)]

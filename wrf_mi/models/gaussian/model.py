@@ -197,7 +197,8 @@ def _unused_of_gaussians(plan: FitPlan, name: str) -> dict[str, str]:
         if group not in field.per_gaussian:
             unused |= {f"optimiser.{group}": f"Gaussians of {name} have no static {group}"}
     if "opacity" not in field.per_gaussian:
-        unused["initial.opacity"] = f"Gaussians of {name} have no static opacity"
+        of_opacity = ("initial.opacity", "density.reset_every")
+        unused |= dict.fromkeys(of_opacity, f"Gaussians of {name} have no static opacity")
     if name == "factorised":
         unused |= dict.fromkeys(("encoding.position_octaves", "encoding.position_scale_m"), "Gaussians are not encoded")
     else:
@@ -220,6 +221,10 @@ def _unused_of_gaussians(plan: FitPlan, name: str) -> dict[str, str]:
         unused |= {f"initial.{name}": f"Gaussians start from initial.{source}" for name in random}
     if not s.density.every:
         unused |= {f"density.{name}": "density.every=0" for name in names_of(type(s.density)) - {"every"}}
+    elif not plan.schedule.density:
+        rounds = ("growth_fraction", "max_gaussians", "reset_every")
+        text = f"no round follows within {s.steps} steps by density.every={s.density.every}, .start and .stop"
+        unused |= {f"density.{name}": text for name in rounds}
     return unused
 
 
