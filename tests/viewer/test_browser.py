@@ -115,6 +115,10 @@ def test_channels_are_drawn_over_subcarriers(browser, tmp_path):
     view.page.close()
 
 
+REDRAWN_S = 30.0
+"""Time in which a software renderer on a busy machine has drawn a scene anew."""
+
+
 def map_alone(stretch: float) -> ViewContent:
     """A map and receivers at its height, ``stretch`` times as long as the room."""
     room = made_view()
@@ -127,7 +131,9 @@ def map_alone(stretch: float) -> ViewContent:
 def test_whole_map_is_in_the_picture(browser, tmp_path, stretch):
     view = opened(browser, tmp_path, map_alone(stretch), PHONE)
     assert view.complaints == []
-    data = colourful(view.page.get_by_role("img", name="3D view").screenshot())
+    scene, end = view.page.get_by_role("img", name="3D view"), time.monotonic() + REDRAWN_S
+    while (data := colourful(scene.screenshot()))[:, 0].any() and time.monotonic() < end:
+        pass  # WebGL shows the camera's new place some frames after Plotly has set it, on a busy machine seconds
     view.page.close()
     across, along = np.flatnonzero(data.any(axis=0)), np.flatnonzero(data.any(axis=1))
     assert 0 < across.min() < across.max() < data.shape[1] - 1
