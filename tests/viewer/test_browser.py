@@ -1,6 +1,7 @@
 """Views in a browser."""
 
 import io
+import time
 from dataclasses import replace
 from pathlib import Path
 
