@@ -143,6 +143,15 @@ def with_defaults(folder: Path, defaults: str) -> Path:
     return path
 
 
+def test_cameras_of_a_scene_cause_no_warning_of_mitsuba(tmp_path, capfd):
+    path = scene_file(tmp_path, "ply")
+    camera = '<sensor type="perspective"><film type="hdrfilm"/></sensor>'
+    path.write_text(path.read_text().replace("<bsdf", f"{camera}<bsdf", 1))
+    assert alarms(check_scene(path)) == []
+    assert load_scene(path)[0].objects
+    assert "onochrome" not in "".join(capfd.readouterr())
+
+
 def test_defaults_of_a_scene_file_are_its_values(tmp_path):
     defaults = '<default name="spp" value="64"/><default name="shift" value="5"/><default name="shift" value="7"/>'
     path = with_defaults(tmp_path, defaults)

@@ -44,7 +44,7 @@ from ..scene.xml_file import make_files_absolute, parsed_xml
 from ..synthetic import load_record
 from ..tracing.sionna.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ, in_itu_range
 from ..tracing.sionna.scenes import HIGHEST_M as HIGHEST_SCENE_M
-from ..tracing.sionna.scenes import REFUSALS, reason
+from ..tracing.sionna.scenes import REFUSALS, quiet_mitsuba, reason
 from .building import device_findings
 from .scene_findings import Finding, SceneReport
 from .scene_geometry import ShapePart, between_parts, mesh_file_parts, part_findings, scene_parts
@@ -255,7 +255,8 @@ def opened(path: Path) -> Iterator[Finding]:
         ElementTree(root).write(file := Path(folder) / path.name)
         for merged in (True, False):
             try:
-                rt.load_scene(str(file), merge_shapes=merged)
+                with quiet_mitsuba():  # films of cameras warn of the monochrome variant
+                    rt.load_scene(str(file), merge_shapes=merged)
             except (*REFUSALS, OSError) as error:
                 text = f"Sionna RT: {reason(error) if isinstance(error, REFUSALS) else one_line(error)}"
                 yield Finding("not-opened", path, "", text, "correct the scene")

@@ -132,7 +132,7 @@ def triangles_by_mitsuba(file: Path, plugin: str) -> NDArray[np.float32]:
     import mitsuba as mi
 
     try:
-        with _quiet_mitsuba():
+        with quiet_mitsuba():
             # Normals of vertices are not needed, and cannot be computed for every file.
             mesh: Any = mi.load_dict({"type": plugin, "filename": str(file), "face_normals": True})
     except RuntimeError:
@@ -142,7 +142,7 @@ def triangles_by_mitsuba(file: Path, plugin: str) -> NDArray[np.float32]:
 
 
 @contextmanager
-def _quiet_mitsuba() -> Iterator[None]:
+def quiet_mitsuba() -> Iterator[None]:
     """Without warnings, which loading of the scene repeats where they concern it."""
     import mitsuba as mi
 
@@ -187,7 +187,7 @@ def placed_mesh(shape: Element, version: str) -> trimesh.Trimesh | None:
     stated = SubElement(alone, "shape", type=plugin)
     stated.extend([child for child in shape if child.tag in VALUES])
     try:
-        with _quiet_mitsuba():
+        with quiet_mitsuba():
             loaded: Any = mi.load_string(ElementTree.tostring(alone, encoding="unicode"))
         parameters = mi.traverse(loaded.shapes()[0])
         if "to_world" in parameters:
@@ -279,7 +279,10 @@ def load_checked(root: Element, path: Path, folder: Path) -> Any:
 def _load(root: Element, file: Path) -> Any:
     from sionna import rt
 
-    ElementTree.ElementTree(root).write(file)
+    # Cameras of pictures are not traced, and their films warn of the monochrome variant.
+    traced = Element("scene", root.attrib)
+    traced.extend([element for element in root if element.tag != "sensor"])
+    ElementTree.ElementTree(traced).write(file)
     # Merged shapes, and with them the paths, have a random order.
     return rt.load_scene(str(file), merge_shapes=False)
 
