@@ -28,11 +28,11 @@ from wrf_mi.datasets import make_splits
 from wrf_mi.maps.plan import greedy
 from wrf_mi.models import Inputs
 from wrf_mi.models.error_prior import ErrorPrior
-from wrf_mi.models.hybrid.strengths import SMOOTH_M, SPACING_M, TRACE
 from wrf_mi.models.interpolation.kriging import Kriging
 from wrf_mi.models.interpolation.strengths import fit_strengths
 from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.scene.make import make_scene
+from wrf_mi.stages.strengths import SMOOTH_M, SPACING_M, TRACE
 from wrf_mi.synthetic.stored import SCAN
 from wrf_mi.tasks import task_of
 from wrf_mi.tasks.scores import bootstrap

@@ -183,7 +183,7 @@ def test_digest_ignores_comments_and_docstrings():
 
 def test_source_of_a_result_has_what_its_module_imports_and_the_models_that_it_names():
     files = needed_files(*modules_of("stages"))
-    assert {"wrf_mi_bench/stages.py", "wrf_mi/core/files.py", "wrf_mi/models/hybrid/model.py"} <= files.keys()
+    assert {"wrf_mi_bench/stages.py", "wrf_mi/core/files.py", "wrf_mi/stages/hybrid.py"} <= files.keys()
     assert "wrf_mi/gaussians/blend.py" in needed_files(*modules_of("elsewhere"))  # of its child process
     assert "wrf_mi_bench/bench.py" not in files  # a new benchmark makes no other one stale
     rows = [

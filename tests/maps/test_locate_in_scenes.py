@@ -20,20 +20,20 @@ from wrf_mi.maps.grid import candidates_of
 from wrf_mi.maps.locate import locate
 from wrf_mi.maps.locate_calibration import FILE, FOLDER, predict_candidates
 from wrf_mi.models import Inputs
-from wrf_mi.models.hybrid import strengths as of_strengths
 from wrf_mi.receivers.instruments import PowerInstrument
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.run import Run
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import Materials
 from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.stages import strengths as of_strengths
 from wrf_mi.tracing import TraceOptions, power_map
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi.training.session import Interrupted, quiet
 
 HZ = np.array([2.44e9])
 PLAIN = TraceOptions(transmission=True, depth=1, rays=1 << 12)
-"""Options of the truth and of the fits, in place of those of `wrf_mi.models.hybrid.strengths`, which take seconds."""
+"""Options of the truth and of the fits, in place of those of `wrf_mi.stages.strengths`, which take seconds."""
 FLOOR_M = 4.0  # the plan has a floor from 0 to here along x
 HEIGHT_M = 1.3
 ROWS, TRAINED = 60, 44

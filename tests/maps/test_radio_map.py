@@ -26,9 +26,9 @@ from wrf_mi.maps.api import radio_map
 from wrf_mi.maps.coverage import coverage_probability, reliability, reliability_figure, run_reliability
 from wrf_mi.maps.dataset import write_map
 from wrf_mi.models import Inputs
-from wrf_mi.models.hybrid.model import FittedHybrid
 from wrf_mi.runs.api import train
 from wrf_mi.runs.run import Run
+from wrf_mi.stages.hybrid import FittedHybrid
 from wrf_mi.training.by_distance import Mixture
 from wrf_mi.training.selection import RowDistance
 

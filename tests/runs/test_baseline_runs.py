@@ -17,10 +17,10 @@ from wrf_mi.core import InputError, Record
 from wrf_mi.core.array_files import CHECKSUM
 from wrf_mi.datasets import load, make_splits, write_nerf2_csi
 from wrf_mi.models import Session
-from wrf_mi.models.hybrid.scene_side import inside
 from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
+from wrf_mi.stages.scene_side import inside
 from wrf_mi.training.checkpoint import read_checkpoint
 from wrf_mi.training.loop import Progress
 

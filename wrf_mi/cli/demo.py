@@ -115,8 +115,8 @@ class Demo:
     def _fitted(
         self, dataset: str, scene: Path, prefix: str, tracing: tuple[str, ...] = (), **options: Any
     ) -> list[Run]:
-        from ..models.hybrid.scene_side import FAST
         from ..runs.api import train
+        from ..stages.scene_side import FAST
 
         settings = {"hybrid": (f"stages={','.join(FAST)}",), "ray-tracing": tracing}
         runs = []

@@ -277,8 +277,8 @@ def error_priors(run: Run, receivers: Sequence[int], positions_m: FloatArray) ->
 
 def _scene_problem(run: Run) -> Problem:
     """The problem with the scene of the fit: the one that it corrected, where there is one."""
-    from ..models.hybrid.fitted import PATHS
-    from ..models.hybrid.scene_side import in_scene
+    from ..stages.fitted import PATHS
+    from ..stages.scene_side import in_scene
 
     return in_scene(run.problem, run.folder / "parts" / PATHS)
 
@@ -287,7 +287,7 @@ def _shares(
     problem: Problem, receivers: Sequence[int], priors: Sequence[ErrorPrior], positions_m: FloatArray
 ) -> tuple[FloatArray, Losses, FloatArray]:
     """Positions, also those of training rows, and derivatives at them by the losses at surfaces that matter."""
-    from ..models.hybrid.strengths import TRACE
+    from ..stages.strengths import TRACE
     from ..tasks.conditions import scene_carrier
     from ..tracing.surface_shares import surface_shares
 

@@ -18,23 +18,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...backend.device import release_memory
-from ...core import InputError, Prediction, Record, Split
-from ...core.files import write_atomically
-from ...core.settings import with_settings
-from ...correction import Correction, correct_scene, default_options, write_page
-from ...correction.options import FRAME, HIDDEN, PLANES
-from ...scene.correction_data import FILE as CORRECTION
-from ...tasks import instrument_of, task_of
-from ...tracing import TraceOptions
-from ...tracing.tracer import RayTracer, fit_offsets
-from ...training.config import TrainConfig, calibration_config, task_settings
-from ...training.selection import HeldOut, hold_out_groups
-from .. import model
-from ..error_prior import ErrorPrior
-from ..gaussian.model import WRF_GS_PLUS, FittedField
-from ..held_out import HeldOutPrediction, as_unseen, labelled
-from ..model import Arrays, Decomposition, Fitted, Inputs, Model, PredictAll, Problem, Session
+from ..backend.device import release_memory
+from ..core import InputError, Prediction, Record, Split
+from ..core.files import write_atomically
+from ..core.settings import with_settings
+from ..correction import Correction, correct_scene, default_options, write_page
+from ..correction.options import FRAME, HIDDEN, PLANES
+from ..models import model
+from ..models.error_prior import ErrorPrior
+from ..models.gaussian.model import WRF_GS_PLUS, FittedField
+from ..models.held_out import HeldOutPrediction, as_unseen, labelled
+from ..models.model import Arrays, Decomposition, Fitted, Inputs, Model, PredictAll, Problem, Session
+from ..scene.correction_data import FILE as CORRECTION
+from ..tasks import instrument_of, task_of
+from ..tracing import TraceOptions
+from ..tracing.tracer import RayTracer, fit_offsets
+from ..training.config import TrainConfig, calibration_config, task_settings
+from ..training.selection import HeldOut, hold_out_groups
 
 logger = logging.getLogger(__name__)
 

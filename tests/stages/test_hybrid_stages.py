@@ -16,8 +16,8 @@ from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import write_spectrum_folder
-from wrf_mi.models.hybrid import scene_side
-from wrf_mi.models.hybrid.scene_side import STAGES
+from wrf_mi.stages import scene_side
+from wrf_mi.stages.scene_side import STAGES
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.training.session import Interrupted

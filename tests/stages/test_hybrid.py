@@ -11,8 +11,8 @@ import wrf_mi
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.datasets import make_splits
 from wrf_mi.models import Problem
-from wrf_mi.models.hybrid.model import HybridSettings, parts_of
 from wrf_mi.runs.api import evaluate_run
+from wrf_mi.stages.hybrid import HybridSettings, parts_of
 from wrf_mi.tasks.scores import cea_db
 from wrf_mi.training.selection import HeldOut, hold_out
 
@@ -52,7 +52,7 @@ def test_field_alone_is_a_part_where_it_is_named(folder: Path, tmp_path: Path):
 
 def test_hybrid_mixes_models_from_positions_and_from_the_uplink(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Without the networks, whose training takes a minute."""
-    monkeypatch.setattr("wrf_mi.models.hybrid.model.UPLINK_PARTS", ("r2f2", "linear"))
+    monkeypatch.setattr("wrf_mi.stages.hybrid.UPLINK_PARTS", ("r2f2", "linear"))
     record = channels()
     run = wrf_mi.train(record, out=tmp_path / "run")
     accuracy = run.metrics["held_out"]

@@ -5,13 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ...core import InputError, Split
-from ...training.session import FitSession
-from ..model import Arrays, Fitted, Model, Problem, known_positions
-from .diffuse import ChannelKriging
-from .kriging import GENERIC_ONLY, GenericKriging, KrigingSettings, asks_generic
-from .spectra import SpectrumKriging, SpectrumKrigingSettings
-from .strengths import EXACT, POOLED_ONLY, Strengths, StrengthSettings, fit_strengths, unused_of_pooled
+from ..core import InputError, Split
+from ..models.interpolation.diffuse import ChannelKriging
+from ..models.interpolation.kriging import GENERIC_ONLY, GenericKriging, KrigingSettings, asks_generic
+from ..models.interpolation.spectra import SpectrumKriging, SpectrumKrigingSettings
+from ..models.interpolation.strengths import (
+    EXACT,
+    POOLED_ONLY,
+    Strengths,
+    StrengthSettings,
+    fit_strengths,
+    unused_of_pooled,
+)
+from ..models.model import Arrays, Fitted, Model, Problem, known_positions
+from ..training.session import FitSession
 
 STOPS = "stop.value_dbm"
 """Array of pooled strengths, which generic kriging has not: readings, NaN where a receiver did not report at a stop."""

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Prediction, Record, Split
-from ...core.angles import FloatArray
-from ...core.array_files import keyed, under
-from ...core.types import IntArray
-from ...tasks import task_of
-from ...training.by_distance import LEAST, Intervals, Mixture, expected_size
-from ...training.selection import HeldOut, RowDistance, rows_at_receiver
-from ..error_prior import ErrorPrior
-from ..held_out import predicted_rows
-from ..interpolation.kriging import Kriged, Kriging
-from ..model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays
-from ..reception import Reception
+from ..core import InputError, Prediction, Record, Split
+from ..core.angles import FloatArray
+from ..core.array_files import keyed, under
+from ..core.types import IntArray
+from ..models.error_prior import ErrorPrior
+from ..models.held_out import predicted_rows
+from ..models.interpolation.kriging import Kriged, Kriging
+from ..models.model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays
+from ..models.reception import Reception
+from ..tasks import task_of
+from ..training.by_distance import LEAST, Intervals, Mixture, expected_size
+from ..training.selection import HeldOut, RowDistance, rows_at_receiver
 from .scene_side import SceneSide, by_stage
 
 LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated

@@ -18,22 +18,22 @@ from typing import Any
 
 import numpy as np
 
-from ...core import InputError, Receiver, Record, Split
-from ...core.files import write_atomically
-from ...core.types import IntArray
-from ...correction.options import STRENGTHS
-from ...scene.correction_data import read_correction_data
-from ...tasks import task_of
-from ...tracing.options import TraceOptions
-from ...tracing.paths.solve import Prepared
-from ...tracing.power_map import PowerMap, TracedPower, Tracer, power_tracer, trace_map
-from ...tracing.tracer import check_polarization
-from ...training.by_distance import unit_means
-from ...training.selection import HeldOut, hold_out
-from ..held_out import HeldOutPrediction, held_out_predictions
-from ..interpolation.by_task import StrengthKriging
-from ..interpolation.strengths import Strengths, StrengthSettings, fit_strengths
-from ..model import Arrays, Model, Problem, Session
+from ..core import InputError, Receiver, Record, Split
+from ..core.files import write_atomically
+from ..core.types import IntArray
+from ..correction.options import STRENGTHS
+from ..models.held_out import HeldOutPrediction, held_out_predictions
+from ..models.interpolation.strengths import Strengths, StrengthSettings, fit_strengths
+from ..models.model import Arrays, Model, Problem, Session
+from ..scene.correction_data import read_correction_data
+from ..tasks import task_of
+from ..tracing.options import TraceOptions
+from ..tracing.paths.solve import Prepared
+from ..tracing.power_map import PowerMap, TracedPower, Tracer, power_tracer, trace_map
+from ..tracing.tracer import check_polarization
+from ..training.by_distance import unit_means
+from ..training.selection import HeldOut, hold_out
+from .kriging import StrengthKriging
 from .scene_side import MEAN, SCENE, SceneSide, corrected, in_scene, inside, write_reports
 
 SPACING_M, SMOOTH_M = 0.25, 0.3

@@ -1,6 +1,6 @@
 """The model ``hybrid``: one fit in stages, from a scene's paths to interpolation of what they leave.
 
-Stages 1 to 5 (`wrf_mi.models.hybrid.scene_side`) predict from the scene, the last one interpolates: their residuals and
+Stages 1 to 5 (`wrf_mi.stages.scene_side`) predict from the scene, the last one interpolates: their residuals and
 the observations themselves, weighted by the distance to the nearest training row. One hold-out
 (`wrf_mi.training.selection.hold_out`) chooses stages, weights and standard deviations.
 
@@ -22,19 +22,19 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from ...core import InputError, Prediction, Record, Split
-from ...core.array_files import under
-from ...core.settings import CheckedSettings
-from ...tasks import task_of
-from ...training import by_distance
-from ...training.by_distance import Intervals, Mixture
-from ...training.selection import HeldOut, hold_out
-from .. import MODELS
-from ..checks import check_held_receivers, check_record
-from ..few_rows import with_few_rows
-from ..held_out import HeldOutPrediction, fit_model, held_out_predictions, labelled
-from ..model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions
-from ..reception import Reception
+from ..core import InputError, Prediction, Record, Split
+from ..core.array_files import under
+from ..core.settings import CheckedSettings
+from ..models import MODELS
+from ..models.checks import check_held_receivers, check_record
+from ..models.few_rows import with_few_rows
+from ..models.held_out import HeldOutPrediction, fit_model, held_out_predictions, labelled
+from ..models.model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions
+from ..models.reception import Reception
+from ..tasks import task_of
+from ..training import by_distance
+from ..training.by_distance import Intervals, Mixture
+from ..training.selection import HeldOut, hold_out
 from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
 from .scene_side import (
     FAST,

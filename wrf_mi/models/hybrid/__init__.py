@@ -1,1 +1,0 @@
-"""Mixtures of other models, weighted by the distance to the nearest training row."""
