@@ -66,7 +66,6 @@ def downlink() -> Record:
 RECORDS: dict[str, Callable[[], Record]] = {
     "strengths, turning": lambda: strengths(turning=True),
     "strengths": strengths,
-    "strengths over an area": lambda: strengths(200.0),
     "strengths of one receiver, carrier unknown": lambda: replace(strengths(receivers=1), frequencies_hz=None),
     "spectra": lambda: wave_record(24, 6),
     "spectra of an unknown array": lambda: without_array(wave_record(24, 6, receivers=1)),
@@ -97,7 +96,12 @@ CHEAP = ("idw", "kriging", "trees", "mri", "linear")
 """Models that are fitted anew with every setting changed."""
 OTHER = {"kernel": ["matern32"], "trend": ["constant", "log-distance"], "trend_fit": ["ols", "gls"], "noise": ["0.3"]}
 OTHER |= {"transmit_dbm": ["20"], "penalty": ["0.3"], "softening_m": ["0.5"], "length_m": ["0.8"], "lever_m": ["0.5"]}
-OTHER |= {"heading_length": ["0.4"], "cone_deg": ["40"], "search_rows": ["20"], "likelihood_rows": ["8", "4"]}
+OTHER |= {
+    "heading_length": ["0.4"],
+    "cone_deg": ["40"],
+    "lengths": ["searched", "likelihood"],
+    "likelihood_rows": ["8", "4"],
+}
 OTHER |= {"neighbours": ["2"]}
 """Other values than the default, of settings that are words or null."""
 OPPOSITE = {"true": "false", "false": "true"}
@@ -236,7 +240,7 @@ def test_accepted_setting_changes_the_fit(model: str, name: str, tmp_path: Any) 
 def test_stated_hyperparameters_hold_beside_those_that_are_chosen(
     stated: dict[str, float], extent_m: float, tmp_path: Any
 ) -> None:
-    record, search = strengths(extent_m), {"search_rows": 20} if extent_m < 40 else {}
+    record, search = strengths(extent_m), {"lengths": "searched" if extent_m < 40 else "likelihood"}
     run = train(record, "kriging", settings=stated | search, out=tmp_path / "run", split="official")
     fitted = run.metrics["fitted"]
     assert {name: fitted[name] for name in stated} == stated
@@ -292,7 +296,6 @@ def test_stated_default_of_generic_kriging_chooses_it() -> None:
         ("wrf-gs+", "spectra of an unknown array", "traced.depth=3"),
         ("factorised", "strengths", "encoding.position_octaves=4"),
         ("kriging", "strengths", "body_m=1.5"),
-        ("kriging", "strengths over an area", "search_rows=500"),
         ("trees", "strengths", "heading=true"),
     ],
 )

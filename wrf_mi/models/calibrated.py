@@ -119,9 +119,11 @@ class WithIntervals(Model):
         fitted = self.model.fit(problem, split, session)
         fold = _fold(self.model, problem, split)
         held_out = HeldOut.of(record, fold, problem.seed)
-        place = replace(session, folder=session.folder / "held_out")
-        predicted = held_out_predictions(self.model, problem, fold, held_out, place, self.name)
-        session.discarded.append(place.folder)
+        predicted = fitted.unseen
+        if predicted is None:
+            place = replace(session, folder=session.folder / "held_out")
+            predicted = held_out_predictions(self.model, problem, fold, held_out, place, self.name)
+            session.discarded.append(place.folder)
         size = expected_size(task_of(record), predicted)
         intervals = fit_intervals(predicted.mean, held_out.observed(record), size, held_out.distance_m, held_out.row)
         reception, every, rows = None, predicted.every, problem.rows(split)

@@ -235,6 +235,10 @@ class WithFewRows(Model):
         of_model = {key: values for key, values in arrays.items() if not key.startswith(FEW)}
         return FittedWithFew(self.model.load(of_model, self._part(problem, numbers), folder), numbers, law)
 
+    def selects(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """As the model, of all receivers: the law of the others chooses nothing."""
+        return self.model.selects(problem, splits) and not len(self._numbers(problem, splits)[1])
+
     def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
         """Whether the model does, or receivers have few rows, of which the law of distance needs the places of all."""
         return self.model.uses_places(problem, splits) or bool(len(few_rows(problem.record, splits)))

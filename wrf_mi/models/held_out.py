@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,17 +17,10 @@ from ..datasets.observations import fitted_receivers
 from ..scene.correction_data import read_correction_data
 from ..tasks import task_of
 from ..training.selection import HeldOut
-from .model import Arrays, Fitted, Model, Problem, Session, inputs_of
+from .model import Arrays, Fitted, HeldOutPrediction, Model, Problem, Session, inputs_of
 from .receiver_places import placed_problem
 
 EVERY = "every/"  # prefix of the arrays of `HeldOut.every`
-
-
-@dataclass(frozen=True)
-class HeldOutPrediction(Prediction):
-    """Predictions of held-out observations, and of all pairs of `HeldOut.every`; None: of no pairs."""
-
-    every: Prediction | None = None
 
 
 def labelled(session: Session, label: str) -> Session:
@@ -45,13 +39,20 @@ def fit_model(entry: Model, problem: Problem, split: Split, session: Session) ->
     return entry.fit(problem, split, session), problem
 
 
-def fit_fold(entry: Model, problem: Problem, fold: Split, session: Session) -> tuple[Fitted, IntArray]:
-    """A model fitted to a fold of the training rows, and the numbers of the receivers with enough, ascending."""
+def fold_of(entry: Model, problem: Problem, fold: Split, session: Session) -> tuple[Problem, Split, IntArray]:
+    """What a fit to a fold of the training rows may see: problem and split of the receivers with enough rows, their
+    numbers, ascending.
+    """
     numbers, left_out = fitted_receivers(problem.record, [fold])
     if left_out:
         problem = replace(problem, dataset=problem.record.at_receivers(numbers), antennas=AS_STATED)
         fold = fold.at_receivers(numbers)
-    problem = placed_problem(problem.seen(fold), fold, entry, session.report)
+    return placed_problem(problem.seen(fold), fold, entry, session.report), fold, numbers
+
+
+def fit_fold(entry: Model, problem: Problem, fold: Split, session: Session) -> tuple[Fitted, IntArray]:
+    """A model fitted to a fold of the training rows, and the numbers of the receivers with enough, ascending."""
+    problem, fold, numbers = fold_of(entry, problem, fold, session)
     return fit_model(entry, problem, fold, session)[0], numbers
 
 
@@ -83,14 +84,24 @@ def held_out_predictions(
     Raises:
         InputError: rows that the model cannot be fitted to.
     """
-    record, path = problem.record, session.folder / "held_out.npz"
+    path = session.folder / "held_out.npz"
     if not path.exists():
         session.folder.mkdir(parents=True, exist_ok=True)
         fitted, numbers = fit_fold(entry, problem, fold, labelled(session, f"{name}, held-out rows"))
-        arrays = _of_pairs(fitted, record, numbers, held_out.receiver, held_out.row)
-        if len(held_out.every):
-            arrays |= keyed(EVERY, _of_pairs(fitted, record, numbers, *held_out.every.T))
-        write_arrays(path, arrays)
+        write_arrays(path, arrays_of_held_out(fitted, problem.record, numbers, held_out))
+    return stored_held_out(path, problem, held_out)
+
+
+def arrays_of_held_out(fitted: Fitted, record: Record, numbers: IntArray, held_out: HeldOut) -> Arrays:
+    """Arrays of the predictions of held-out observations by a model of the receivers of some numbers."""
+    arrays = _of_pairs(fitted, record, numbers, held_out.receiver, held_out.row)
+    if len(held_out.every):
+        arrays |= keyed(EVERY, _of_pairs(fitted, record, numbers, *held_out.every.T))
+    return arrays
+
+
+def stored_held_out(path: Path, problem: Problem, held_out: HeldOut) -> HeldOutPrediction:
+    """Predictions of a file of `arrays_of_held_out`."""
     arrays = stored_arrays(path)
     every = under(EVERY, arrays)
     pairs = Prediction(every["mean"], every.get("std")) if every else None

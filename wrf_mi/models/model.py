@@ -112,6 +112,13 @@ class Session(FitSession):
 
 
 @dataclass(frozen=True)
+class HeldOutPrediction(Prediction):
+    """Predictions of held-out observations, and of all pairs of `HeldOut.every`; None: of no pairs."""
+
+    every: Prediction | None = None
+
+
+@dataclass(frozen=True)
 class Decomposition:
     """A prediction for m transmitters and what it is made of."""
 
@@ -136,6 +143,9 @@ class Fitted(ABC):
     uses_heading: bool | None = None  #: whether `predict` takes headings; None: as `Model.headings`
     #: carriers of the rows that it was fitted to, Hz, none for a single one; None: those of the record
     carriers_hz: FloatArray | None = None
+    #: of a fit that chose by held-out rows, not stored: predictions of `wrf_mi.training.selection.HeldOut` without them
+    unseen: HeldOutPrediction | None = None
+    options: Sequence[Mapping[str, Any]] = ()  #: of such a fit, reports of what it chose from
 
     @abstractmethod
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
@@ -297,6 +307,10 @@ class Model(ABC):
 
     def pools_receivers(self, problem: Problem) -> bool:
         """Whether it predicts signal strengths of receivers with few training rows, or none, from the others."""
+        return False
+
+    def selects(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Whether its fits choose by held-out rows and leave their predictions (`Fitted.unseen`)."""
         return False
 
     def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:

@@ -28,8 +28,18 @@ from ..core.settings import CheckedSettings
 from ..models import MODELS
 from ..models.checks import check_held_receivers, check_record
 from ..models.few_rows import with_few_rows
-from ..models.held_out import HeldOutPrediction, fit_model, held_out_predictions, labelled
-from ..models.model import Arrays, Fitted, Model, Problem, Session, default_settings, from_field_arrays, known_positions
+from ..models.held_out import fit_model, held_out_predictions, labelled
+from ..models.model import (
+    Arrays,
+    Fitted,
+    HeldOutPrediction,
+    Model,
+    Problem,
+    Session,
+    default_settings,
+    from_field_arrays,
+    known_positions,
+)
 from ..models.reception import Reception
 from ..tasks import task_of
 from ..training import by_distance
@@ -50,7 +60,7 @@ from .scene_side import (
     inside,
     stated_reports,
 )
-from .strengths import StrengthsInScene, TracedStrengths
+from .strengths import TracedStrengths
 
 logger = logging.getLogger(__name__)
 
@@ -79,11 +89,9 @@ class HybridSettings(CheckedSettings):
         return STAGES if self.stages is None else tuple(stage.strip() for stage in self.stages.split(","))
 
 
-def scene_side(record: Record) -> tuple[Model, Model]:
-    """Entries of the scene's side with and without its correction; a map of strengths is traced at one carrier."""
-    if task_of(record).in_decibel and record.frequencies_hz is not None:
-        return TracedStrengths(), StrengthsInScene()
-    return TracedStages(), InScene()
+def scene_side(record: Record) -> Model:
+    """Entry of the scene's side; a map of strengths is traced at one carrier."""
+    return TracedStrengths() if task_of(record).in_decibel and record.frequencies_hz is not None else TracedStages()
 
 
 def _stages_of(problem: Problem) -> dict[str, str]:
@@ -93,7 +101,7 @@ def _stages_of(problem: Problem) -> dict[str, str]:
         return dict.fromkeys(set(STAGES) - {MEAN, RESIDUAL}, "data with an uplink have mean and residual alone")
     if problem.scene is None:
         return dict.fromkeys(set(STAGES) - {FIELD, RESIDUAL}, "it is of a scene; give --scene")
-    if isinstance(scene_side(record)[0], TracedStrengths):
+    if isinstance(scene_side(record), TracedStrengths):
         return dict.fromkeys((SURFACES, FIELD), "strengths are kriged about the local mean of traced power")
     return {}
 
@@ -126,7 +134,7 @@ def _means(problem: Problem) -> list[tuple[str, bool]]:
 def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
     """Entry and problem of a part, with or without the scene."""
     if name == PATHS:
-        return scene_side(problem.record)[0], problem
+        return scene_side(problem.record), problem
     model = {FIELD: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
     entry = MODELS[model].serving(problem.record.task, scene)
     arguments = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
@@ -194,6 +202,8 @@ class _Fit:
             for distance, row in zip(mixture.distance_m, mixture.weights, strict=True)
         ]
         stated = {"stages": stated_reports(self.reports), **chosen, "weights": weights}
+        options = [{"part": name, **report} for name in self.fitted for report in self.fitted[name].options]
+        stated |= {"options": options} if options else {}
         parts = {name: self._part(name) for name in used if name != RESIDUAL}
         residuals = self.residuals if RESIDUAL in used else None
         rows = self.problem.rows(self.split)
@@ -224,15 +234,17 @@ class _Fit:
     def _judge(self, name: str) -> None:
         """Predict the held-out rows by a part, and by the residuals of the scene's side."""
         model, problem = self.parts[name]
-        unseen = None
+        unseen: HeldOutPrediction | None = None
         if name == PATHS:
             # Its stages are chosen by the held-out rows, which it predicts on the way.
             side = self._part(name)
             self.scene_seconds = time.perf_counter() - self.begun
             assert isinstance(side, SceneSide)
             self.reports += side.stages
-            model, problem = scene_side(self.record)[1], side.problem  # the scene is corrected once
+            model, problem = InScene(), side.problem  # the scene is corrected once
             unseen = None if self.held_out is None else side.held_out_at(self.held_out)
+        elif model.selects(problem, [self.split]):
+            unseen = self._part(name).unseen
         if self.fold is None or self.held_out is None:
             return
         if unseen is None:

@@ -14,11 +14,11 @@ from ..models.interpolation.strengths import (
     POOLED_ONLY,
     Strengths,
     StrengthSettings,
-    fit_strengths,
     unused_of_pooled,
 )
-from ..models.model import Arrays, Fitted, Model, Problem, known_positions
-from ..training.session import FitSession
+from ..models.model import Arrays, Fitted, Model, Problem, Session, known_positions
+from .engine import Engine
+from .residual import StrengthResidual
 
 STOPS = "stop.value_dbm"
 """Array of pooled strengths, which generic kriging has not: readings, NaN where a receiver did not report at a stop."""
@@ -37,19 +37,26 @@ class StrengthKriging(GenericKriging):
         """Pooled kriging is about the law of distance."""
         return self.pools_receivers(problem) or super().uses_places(problem, splits)
 
-    def fit(self, problem: Problem, split: Split, session: FitSession) -> Fitted:
+    def fit(self, problem: Problem, split: Split, session: Session) -> Fitted:
         """Kriging of all receivers together where they are pooled, else of each by itself."""
         if not self.pools_receivers(problem):
             return super().fit(problem, split, session)
-        rows = problem.rows(split)
-        known_positions(problem.record, rows, self.name)
-        return fit_strengths(problem.record, rows, None, problem.settings, session.report, problem.stated_settings)
+        known_positions(problem.record, problem.rows(split), self.name)
+        engine = Engine(self, [StrengthResidual(problem.settings, problem.stated_settings)], problem, split, session)
+        fitted = engine.fit().fitted
+        assert isinstance(fitted, Strengths)
+        fitted.options, fitted.unseen = engine.stated_reports(), engine.unseen
+        return fitted
+
+    def selects(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """Where receivers are pooled, by held-out rows."""
+        return self.pools_receivers(problem)
 
     def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
         """Settings of pooled receivers where each is kriged alone; of headings, and of a search that is not made."""
         unused = super().unused_settings(problem, splits)
         if self.pools_receivers(problem):
-            return {**unused, **unused_of_pooled(problem, splits)}
+            return {**unused, **unused_of_pooled(problem)}
         why = "no single carrier is known"
         if stated := sorted(GENERIC_ONLY & problem.stated_settings) or ["generic"] * problem.settings.generic:
             why = f"each receiver is kriged alone with {stated[0]}"

@@ -27,8 +27,8 @@ from ..correction.options import FRAME, HIDDEN, PLANES
 from ..models import model
 from ..models.error_prior import ErrorPrior
 from ..models.gaussian.model import WRF_GS_PLUS, FittedField
-from ..models.held_out import HeldOutPrediction, as_unseen, labelled
-from ..models.model import Arrays, Decomposition, Fitted, Inputs, Model, PredictAll, Problem, Session
+from ..models.held_out import as_unseen, labelled
+from ..models.model import Arrays, Decomposition, Fitted, HeldOutPrediction, Inputs, Model, PredictAll, Problem, Session
 from ..scene.correction_data import FILE as CORRECTION
 from ..tasks import instrument_of, task_of
 from ..tracing import TraceOptions
@@ -98,7 +98,7 @@ class SceneSide(Fitted):
 
     def held_out_at(self, held_out: HeldOut) -> HeldOutPrediction | None:
         """Predictions of held-out rows, with errors as of rows that the scene has not seen; None: not available."""
-        return None
+        return self.unseen
 
 
 def inside(session: Session, *names: str) -> Session:

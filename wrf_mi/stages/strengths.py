@@ -1,48 +1,40 @@
-"""The scene's side for signal strengths: kriging about the power traced in the corrected scene.
+"""The scene's side for signal strengths: kriging about the power traced in the stated or the calibrated scene.
 
 For a transmitter whose position is known to a decimetre, ray tracing gives the mean over some wavelengths: single
-paths, and Gaussians that change them, say nothing of the fading about it. So stages 4 and 5 are not tried, and the mean
-is local, unless power at the stated positions themselves predicts held-out rows better.
+paths, and Gaussians that change them, say nothing of the fading about it. So the stages surfaces and field are not
+tried, and the mean is local, unless power at the stated positions themselves predicts held-out rows better.
 """
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..core import InputError, Receiver, Record, Split
-from ..core.files import write_atomically
 from ..core.types import IntArray
 from ..correction.options import STRENGTHS
-from ..models.held_out import HeldOutPrediction, held_out_predictions
-from ..models.interpolation.strengths import Strengths, StrengthSettings, fit_strengths
+from ..models.interpolation.strengths import Strengths, StrengthSettings
 from ..models.model import Arrays, Model, Problem, Session
 from ..scene.correction_data import read_correction_data
-from ..tasks import task_of
 from ..tracing.options import TraceOptions
 from ..tracing.paths.solve import Prepared
 from ..tracing.power_map import PowerMap, TracedPower, Tracer, power_tracer, trace_map
 from ..tracing.tracer import check_polarization
-from ..training.by_distance import unit_means
-from ..training.selection import HeldOut, hold_out
+from .engine import Engine, OptionReport
 from .kriging import StrengthKriging
-from .scene_side import MEAN, SCENE, SceneSide, corrected, in_scene, inside, write_reports
+from .residual import StrengthResidual
+from .scene_side import CALIBRATION, CORRECTED, MEAN, SceneSide, StageReport, corrected, in_scene, too_few
+from .stage import Option, Stage, State
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
 """Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
 TRACE = TraceOptions(transmission=True, depth=STRENGTHS.depth, reflections=STRENGTHS.reflections)  # as a correction's
-DEFAULT = StrengthSettings()
-SEARCH_ROWS = 30  # least number of rows by which hyperparameters about an exact mean are searched
-HELD, TRIED = "held", "tried"  # folders of the predictions of held-out rows, and of those that choose the mean
-NEVER = 2**31  # `StrengthSettings.search_rows` above any number of rows
+AS_STATED = "scene as stated"
 ExactMean = Callable[[Sequence[Receiver]], TracedPower]
 """Power at positions themselves for some receivers of a problem; fits share what was traced."""
 
@@ -51,7 +43,6 @@ class FittedStrengths(SceneSide):
     """The scene's side for strengths: kriging about traced power."""
 
     fitted: Strengths
-    unseen: HeldOutPrediction | None = None  # predictions of held-out rows
 
     def in_scene(self, scene: str) -> FittedStrengths:
         """Kriged differences from the power traced in the stated scene, about the power traced in an edited one."""
@@ -70,47 +61,48 @@ class FittedStrengths(SceneSide):
             strengths = replace(strengths, widen=strengths.widen / data.error_ratio)
         return FittedStrengths(strengths, self.problem)
 
-    def held_out_at(self, held_out: HeldOut) -> HeldOutPrediction | None:
-        """Predictions of the rows that were held out, see `SceneSide`."""
-        return self.unseen
+
+class Calibration(Stage):
+    """Materials and gains by the measurements."""
+
+    name = CALIBRATION
+
+    def options(self, problem: Problem, split: Split) -> Sequence[Option]:
+        """The scene as it is stated, and calibrated where rows suffice and settings allow it."""
+        options = [Option(AS_STATED, lambda state, split, session: state)]
+        wanted = not {CALIBRATION, CORRECTED}.isdisjoint(problem.settings.wanted)
+        if wanted and (split.held_receivers or not too_few(problem.record, split)):
+            options.append(Option("calibrated", self._fit))
+        return options
+
+    def _fit(self, state: State, split: Split, session: Session) -> State:
+        session.folder.mkdir(parents=True, exist_ok=True)
+        return replace(state, problem=corrected(state.problem, split, session)[0])
 
 
-def _chosen(
-    stated: Problem, inner: Problem, split: Split, fold: Split, held_out: HeldOut, session: Session
-) -> dict[str, Any]:
-    """Scene, mean and hyperparameters, by rows that a fold holds out and, the last, those that it trains on."""
-    record, received = stated.record, replace(held_out, every=held_out.every[:0])
-    unit = held_out.receiver if split.held_receivers else held_out.row
+class Mean(Stage):
+    """Traced power as the mean of strengths."""
 
-    def score(problem: Problem, name: str, mean: ExactMean | None = None) -> float:
-        # Which mean is better does not depend on a search for hyperparameters.
-        model, place = StrengthsInScene(StrengthSettings(search_rows=NEVER), mean), inside(session, TRIED, name)
-        means = held_out_predictions(model, problem, fold, received, place, "mean").mean
-        of_row = task_of(record).mixtures(means[None], held_out.observed(record))
-        return float(unit_means(of_row(np.ones((len(held_out), 1)), np.arange(len(held_out))), unit).mean())
+    name = MEAN
 
-    problem, best = inner, score(inner, "corrected")
-    if inner is not stated:
-        # The correction has gained as a trace, but may add nothing to kriging, which knows the level around each row.
-        before = score(stated, "stated")
-        if before >= best:
-            problem, best = stated, before
-    mean = None
-    if record.tx_heading_rad is None and all(receiver.is_surveyed for receiver in record.receivers):
-        # Whoever turns carries the antenna beside the stated position; elsewhere, positions may be exact, unless
-        # receivers' are estimates, which each hold-out makes anew.
-        exact = _traced(problem)
-        mean = exact if score(problem, "exact", exact) > best else None
-    judged = _Remembering(_searched(mean), mean)
-    shutil.rmtree(session.folder / HELD, ignore_errors=True)  # of a stopped fit
-    held_out_predictions(judged, problem, fold, held_out, inside(session, HELD), "paths")
-    hyperparameters = asdict(judged.last.fitted.field.hyperparameters)
-    return {"corrected": problem is not stated, "exact": mean is not None, "hyperparameters": hyperparameters}
+    def options(self, problem: Problem, split: Split) -> Sequence[Option]:
+        """Local means, and where positions may be exact the power there.
 
+        Whoever turns carries the antenna beside the stated position, and receivers whose places are estimates are
+        estimated anew by each hold-out.
+        """
+        options = [Option("local", self._local)]
+        if problem.record.tx_heading_rad is None and all(each.is_surveyed for each in problem.record.receivers):
+            options.append(Option("exact", self._exact))
+        return options
 
-def _searched(mean: ExactMean | None) -> StrengthSettings:
-    """Settings of a search: it starts from hyperparameters of fading, which an exact mean has not."""
-    return DEFAULT if mean is None else StrengthSettings(search_rows=SEARCH_ROWS)
+    def _local(self, state: State, split: Split, session: Session) -> State:
+        session.report("tracing a map", 0.0)
+        return replace(state, mean=_local_mean(state.problem))
+
+    def _exact(self, state: State, split: Split, session: Session) -> State:
+        session.report("tracing a map", 0.0)
+        return replace(state, mean=_traced(state.problem)(state.problem.record.receivers))
 
 
 def _traced(problem: Problem) -> ExactMean:
@@ -127,32 +119,31 @@ def _local_mean(problem: Problem) -> PowerMap:
     return trace_map(problem.opened_scene, problem.record, SPACING_M, SMOOTH_M, TRACE)
 
 
-class StrengthsInScene(Model):
-    """Kriging about power traced in a scene that is corrected already: no name of the registry.
-
-    Args:
-        search: settings of the kriging.
-        mean: mean of all receivers; None: the local mean.
-    """
+class TracedStrengths(Model):
+    """The scene's side for strengths: no name of the registry."""
 
     name, source, settings = "strengths", StrengthKriging.source, object
     tasks, gaps = ("rssi",), StrengthKriging.gaps
     scene, uplink, headings = "required", "optional", True
     several_carriers, new_receivers = True, True
 
-    def __init__(self, search: StrengthSettings = DEFAULT, mean: ExactMean | None = None) -> None:
-        self.search, self.mean = search, mean
-
     def fit(self, problem: Problem, split: Split, session: Session) -> FittedStrengths:
-        """Trace a map, and fit kriging about it."""
-        session.report("tracing a map", 0.0)
-        record = problem.record
-        power = _local_mean(problem) if self.mean is None else self.mean(record.receivers)
-        fitted = fit_strengths(record, problem.rows(split), power, self.search, session.report, stated=())
-        if power.exact:
-            field = fitted.field
-            field.prior = replace(field.prior, traced=power.of_predictions(field.stops.poses.position_m))
-        return FittedStrengths(fitted, problem)
+        """Calibrate the scene, trace its mean, and fit kriging about it."""
+        stages = Calibration(), Mean(), StrengthResidual(StrengthSettings())
+        engine = Engine(self, stages, problem, split, session)
+        state = engine.fit()
+        strengths = state.fitted
+        assert isinstance(strengths, Strengths)
+        field, traced = strengths.field, strengths.field.prior.traced
+        if traced is not None and traced.exact:
+            field.prior = replace(field.prior, traced=traced.of_predictions(field.stops.poses.position_m))
+        fitted = FittedStrengths(strengths, state.problem, _stage_reports(engine.reports))
+        fitted.unseen, fitted.options = engine.unseen, engine.stated_reports()
+        return fitted
+
+    def selects(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """By held-out rows."""
+        return True
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedStrengths:
         """The kriging that `FittedStrengths.arrays` described."""
@@ -178,40 +169,14 @@ class StrengthsInScene(Model):
         check_polarization(problem.opened_scene, record.tx_pos_m, record.receivers, record.tx_antenna)
 
 
-class _Remembering(StrengthsInScene):
-    """Keeps its last fit, whose hyperparameters the final one starts from."""
-
-    last: FittedStrengths
-
-    def fit(self, problem: Problem, split: Split, session: Session) -> FittedStrengths:
-        self.last = super().fit(problem, split, session)
-        return self.last
-
-
-class TracedStrengths(StrengthsInScene):
-    """The scene's side for strengths."""
-
-    def fit(self, problem: Problem, split: Split, session: Session) -> FittedStrengths:
-        """Correct the scene, trace a map in it, and fit kriging about it."""
-        inner, reports = corrected(problem, split, session)
-        fold = hold_out(problem.record, split)
-        if fold is None:
-            fitted = StrengthsInScene().fit(inner, split, session)
-        else:
-            held_out, path = HeldOut.of(problem.record, fold, problem.seed), session.folder / "mean.json"
-            if not path.exists():
-                write_atomically(path, json.dumps(_chosen(problem, inner, split, fold, held_out, session)) + "\n")
-            session.discarded.append(session.folder / TRIED)
-            choice = json.loads(path.read_text())
-            if inner is not problem and not choice["corrected"]:
-                inner, reports = problem, [replace(report, kept=report.stage == MEAN) for report in reports]
-                write_reports(session.folder, reports)  # for a resumed fit, which no longer finds the scene
-                shutil.rmtree(session.folder / SCENE)
-            mean = _traced(inner) if choice["exact"] else None
-            # The search goes on from what was found without the held-out rows.
-            settings = replace(_searched(mean), **choice["hyperparameters"])
-            fitted = StrengthsInScene(settings, mean).fit(inner, split, session)
-            place = inside(session, HELD)  # where the choice left these predictions
-            fitted.unseen = held_out_predictions(StrengthsInScene(), inner, fold, held_out, place, "paths")
-        fitted.stages = tuple(reports)
-        return fitted
+def _stage_reports(options: Sequence[OptionReport]) -> list[StageReport]:
+    """Reports of the mean, and of the calibration where it was tried: whether it was taken, and its score."""
+    reports = list[StageReport]()
+    for stage in (MEAN, CALIBRATION):
+        of_stage = [option for option in options if option.stage == stage]
+        taken = next(option for option in of_stage if option.taken)
+        if stage == MEAN or len(of_stage) > 1:
+            judged = taken if stage == MEAN else of_stage[-1]
+            seconds = sum(option.seconds or 0.0 for option in of_stage)
+            reports.append(StageReport(stage, taken.option != AS_STATED, judged.held_out, seconds))
+    return reports

@@ -39,6 +39,7 @@ number of groups of held-out observations."""
 MOST_OBSERVATIONS, MOST_VALUES = (200, 600), 20_000
 """Largest number of held-out observations that weights and intervals are chosen from: 600 single numbers, fewer of many
 values, but 200."""
+FINEST = 7  # times that the number of clusters is doubled, whose distances then fall to an eighth in the plane
 MOST_PAIRS = 3000  # largest number of held-out pairs of a receiver and a row, received or not
 
 
@@ -88,22 +89,25 @@ def clusters(positions_m: FloatArray, count: int, rng: np.random.Generator) -> I
         return np.asarray(kmeans2(positions_m, count, iter=50, minit="++", missing="warn", rng=rng)[1], np.int64)
 
 
-def hold_out_groups(split: Split, tx_pos_m: FloatArray) -> Split:
+def hold_out_groups(split: Split, tx_pos_m: FloatArray, groups: int = GROUPS) -> Split:
     """The split with clusters of its training rows moved to the validation rows, seeded by the split.
 
     Args:
         split: split of a record.
         tx_pos_m: positions of all rows [n, 3], metres.
+        groups: largest number of clusters; of more than `GROUPS` the smallest are single places.
 
     Returns:
         A split with validation rows near training rows and far from them; ``split`` itself if its rows are too few.
     """
     rows: IntArray = split.train
-    count = min(GROUPS, len(rows) // ROWS_OF_GROUP, len(np.unique(tx_pos_m[rows], axis=0)))
+    places, place = np.unique(tx_pos_m[rows], axis=0, return_inverse=True)
+    count = min(groups, len(places)) if groups > GROUPS else min(GROUPS, len(rows) // ROWS_OF_GROUP, len(places))
     if count < 2:
         return split
     rng = np.random.default_rng([split.seed, 3])
-    labels, out = clusters(tx_pos_m[rows], count, rng), np.zeros(len(rows), bool)
+    out = np.zeros(len(rows), bool)
+    labels = place.reshape(-1) if count == len(places) else clusters(tx_pos_m[rows], count, rng)
     for group in rng.permutation(count):
         more = out | (labels == group)
         # The first cluster may be larger than the share: without any, nothing could be chosen.
@@ -139,18 +143,45 @@ def hold_out(record: Record, split: Split) -> Split | None:
     carriers = record.carriers_hz
     if carriers is not None and len(split.test) and not np.isin(carriers[split.test], carriers[rows]).any():
         return _without_carrier(record.tx_pos_m, carriers, split)
-    out = _clusters_or_farthest(split, record.tx_pos_m)
+    out = _clusters_or_farthest(split, record.tx_pos_m, task_of(record).in_decibel)
     fold = _fold(split, out, out)
     return fold if rows_received(record, fold.all_train).max() >= LEAST_ROWS else None
 
 
-def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray) -> IntArray:
-    groups, rows = hold_out_groups(split, tx_pos_m), split.all_train
+def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray, as_tested: bool) -> IntArray:
+    groups, rows = (_as_far_as_tested if as_tested else hold_out_groups)(split, tx_pos_m), split.all_train
     if groups is not split and len(groups.validation) >= 2:
         return groups.validation
     # Where rows are sparsest, as far from the others as rows to be predicted may be.
     distance, _ = cKDTree(tx_pos_m[rows]).query(tx_pos_m[rows], k=2)
     return np.sort(rows[np.argsort(-distance[:, 1], kind="stable")[: 2 if len(rows) > 3 else 1]])
+
+
+def _as_far_as_tested(split: Split, tx_pos_m: FloatArray) -> Split:
+    """`hold_out_groups` of as many clusters that held-out rows are as far from the others as rows that are tested.
+
+    Without test positions, or with those of training rows, clusters are the largest: rows are predicted anywhere.
+    """
+    rows = split.all_train
+    coarse = hold_out_groups(split, tx_pos_m)
+    if coarse is split or not len(split.test):
+        return coarse
+
+    def away_m(test: IntArray, known: IntArray) -> float:
+        return float(np.median(cKDTree(tx_pos_m[known]).query(tx_pos_m[test])[0]))
+
+    wanted, most = away_m(split.test, rows), len(np.unique(tx_pos_m[split.train], axis=0))
+    best, nearest = coarse, away_m(coarse.validation, coarse.train)
+    counts = [count for count in (GROUPS * 2 ** np.arange(1, FINEST + 1)).tolist() if count < most] + [most]
+    for count in counts:
+        # Distances fall with the number of clusters.
+        if nearest <= wanted:
+            break
+        fine = hold_out_groups(split, tx_pos_m, count)
+        away = away_m(fine.validation, fine.train)
+        if abs(np.log(away / wanted)) < abs(np.log(nearest / wanted)):
+            best, nearest = fine, away
+    return best
 
 
 def _fold(split: Split, gone: IntArray, test: IntArray) -> Split:

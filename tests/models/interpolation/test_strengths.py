@@ -228,7 +228,7 @@ def test_model_is_restored_from_arrays() -> None:
 def test_search_lowers_the_held_out_error() -> None:
     record = made(120, noise_db=1.0, body_db=3.0)
     wrong = replace(DEFAULTS, shadow_db=12.0, shadow_m=0.2)
-    settings = wrong, replace(wrong, search_rows=50)
+    settings = wrong, replace(wrong, lengths="searched")
     before, after = (fit_strengths(record, np.arange(120), None, one, stated=()).facts()["fitted"] for one in settings)
     assert after["held_out_db"] < before["held_out_db"] - 0.1
     assert after["shadow_db"] < 12
@@ -240,7 +240,7 @@ def test_an_antenna_ahead_of_its_stated_position_is_found() -> None:
     turn = record.tx_heading_rad[:, None]
     np.testing.assert_allclose(ahead - record.tx_pos_m, 0.4 * np.hstack([np.cos(turn), np.sin(turn), 0 * turn]))
     stated = replace(record, tx_pos_m=2 * record.tx_pos_m - ahead)  # the antenna is 0.4 m ahead of that
-    model = fit_strengths(stated, np.arange(120), settings=replace(DEFAULTS, search_rows=50, noise_db=1.0))
+    model = fit_strengths(stated, np.arange(120), settings=replace(DEFAULTS, lengths="searched", noise_db=1.0))
     assert model.facts()["fitted"]["lever_m"] == pytest.approx(0.4, abs=0.15)  # steps of the search
 
 
@@ -254,11 +254,29 @@ def test_stops_are_thinned_where_factors_would_fill_the_memory(turning, monkeypa
 def test_folds_exclude_neighbours_in_time() -> None:
     count = 700
     held = np.zeros(count, int)
-    for train, out in folds(count):
+    for train, out in folds(np.arange(count)[:, None] * [[1.0, 0.0, 0.0]]):
         held[out] += 1
         nearest = np.abs(train[:, None] - out[None]).min()
         assert nearest > 12  # a quarter of a stretch of 50
     assert (held == 1).all()
+
+
+@pytest.mark.parametrize("visits", ["in turn", "again"])
+def test_folds_hold_all_readings_of_a_place_out(visits: str) -> None:
+    """As in a corridor where a phone reads three times at each place, or passes three times."""
+    places = np.repeat(np.arange(40), 3) if visits == "in turn" else np.tile(np.arange(40), 3)
+    held = np.zeros(len(places), int)
+    for train, out in folds(places[:, None] * [[0.5, 0.0, 0.0]]):
+        held[out] += 1
+        assert not {*places[train]} & {*places[out]}
+    assert (held == 1).all()
+
+
+def test_rows_of_one_place_hold_nothing_out_and_keep_the_start_of_a_search() -> None:
+    assert list(folds(np.zeros((30, 3)))) == []
+    record = replace(made(30, 1.0), tx_pos_m=np.ones((30, 3)))
+    fitted = fit_strengths(record, np.arange(30), settings=replace(DEFAULTS, lengths="searched"))
+    assert fitted.field.hyperparameters == DEFAULTS.hyperparameters
 
 
 def test_skewed_residuals_shift_and_widen() -> None:

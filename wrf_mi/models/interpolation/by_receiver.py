@@ -17,9 +17,9 @@ from ...core.array_files import keyed, under
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
 from ...datasets.observations import LEAST_ROWS, rows_received
-from ...training.session import FitSession, OnProgress
+from ...training.session import OnProgress
 from ..error_prior import ErrorPrior
-from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions
+from ..model import Arrays, Fitted, Inputs, Model, Problem, Session, known_positions
 
 # Keys of the arrays: whether headings are used; of several carriers, these and the numbers of models that are missing.
 HEADING, CARRIERS, WITHOUT = "heading", "carriers_hz", "without"
@@ -212,7 +212,7 @@ class ByReceiverModel(Model):
         """Most interpolate over the transmitter's positions, whatever the receiver's."""
         return False
 
-    def fit(self, problem: Problem, split: Split, session: FitSession) -> Fitted:
+    def fit(self, problem: Problem, split: Split, session: Session) -> Fitted:
         """Models of all receivers, and of all carriers.
 
         Raises:

@@ -28,6 +28,7 @@ FREE_SPACE = 2.0  # exponent of the distance in free space
 FOLDS = 7
 STRETCH = (4, 150)
 """Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
+PLACE_M = 0.1  # grid whose cells are places: readings at a stop differ by what positions are known to
 BUFFER = 0.25  # share of a stretch that is left out on either side of it, as consecutive rows share noise
 SEARCHED, SEARCHED_OF_HEADINGS = ("shadow_db", "shadow_m", *PARTS_OF_NOISE), ("body_db", "body_m", "lever_m")
 """Hyperparameters that the search may change, the latter where headings count."""
@@ -36,9 +37,6 @@ MOST_STEPS = 5  # steps of one parameter in one direction
 TRUST = 500.0  # number of held-out values that weigh as much as the prior in estimates from their distribution
 SKEW_TRUST = 2000.0  # the same number for the middle of their narrowest half, which is less certain than a mean
 RATIO = (0.5, 2.0)  # bounds of the ratio of a receiver's noise to that of all
-AREA_M = 40.0
-"""Extent of the training rows from which their spacing and likelihood state lengths: beyond that of a flat or floor, to
-whose rooms the default hyperparameters belong."""
 AREA_SHADOW_DB, AREA_NOISE_DB = 6.0, 2.0  # shadowing of areas a priori, and both parts of the noise
 LIKELIHOOD_STOPS, LIKELIHOOD_RECEIVERS, LIKELIHOOD_STEPS = 400, 12, 80
 """Largest numbers of stops and receivers in the likelihood, those with most rows, and of its evaluations."""
@@ -145,7 +143,7 @@ class StrengthPosterior:
 def by_likelihood(
     prior: PriorMean, stops: Stops, start: Hyperparameters, stated: Collection[str] = ()
 ) -> tuple[PriorMean, Hyperparameters]:
-    """Mean and hyperparameters over an area larger than the rooms that ``start`` is for.
+    """Mean and hyperparameters by the likelihood of the stops, for areas of any extent.
 
     Shadowing, noise and the deviation of the receivers' patterns, which may be sectors, have the greatest posterior
     density. The length is a priori the geometric mean of the stops' spacing and half of their extent, uncertain by a
@@ -158,7 +156,8 @@ def by_likelihood(
         few = replace(prior, receivers_m=prior.receivers_m[most])
         stops = replace(stops, value_dbm=stops.value_dbm[most], count=stops.count[most])
     spacing_m, extent_m = scales(stops.poses.position_m)
-    middle = np.log([AREA_SHADOW_DB, np.sqrt(spacing_m * extent_m / 2), AREA_NOISE_DB, prior.rx_sd_db])
+    length_m = max(np.sqrt(spacing_m * extent_m / 2), NEAREST_M)  # rows may all be at one place
+    middle = np.log([AREA_SHADOW_DB, length_m, AREA_NOISE_DB, prior.rx_sd_db])
     deviation = np.array([0.5, 1.0, 0.5, 1.0])
     ratio = np.ones(len(few.receivers_m))
 
@@ -205,22 +204,27 @@ def scales(position_m: FloatArray) -> tuple[float, float]:
     return spacing_m, extent_m
 
 
-def folds(count: int) -> Iterator[tuple[IntArray, IntArray]]:
-    """Training rows and held-out rows of each fold, as indices below ``count``.
+def folds(position_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Training rows and held-out rows of each fold, as indices of positions [n, 3] in metres.
 
     Stretches of the record's order are held out. Where that is the order of time, as along a path, a stretch is
-    predicted like another run: from other visits, not from the preceding row.
+    predicted like another run: from other visits, not from the preceding row. All readings of a place are in the
+    stretch of the first: lengths that other readings of the same place choose fit those, and no place in between.
     """
+    count = len(position_m)
+    _, first, place = np.unique(np.round(position_m / PLACE_M), axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first[place.reshape(-1)], kind="stable")
+    begins = np.searchsorted(first[place.reshape(-1)][order], first[place.reshape(-1)][order])
     stretch = int(np.clip(count // (2 * FOLDS), *STRETCH))
-    number = np.arange(count) // stretch
+    number = begins // stretch
     for fold in range(min(FOLDS, int(number[-1]) + 1)):
         out = number % FOLDS == fold
         near = out.copy()
         for step in range(1, int(stretch * BUFFER) + 1):
             near[step:] |= out[:-step]
             near[:-step] |= out[step:]
-        if not near.all():
-            yield np.flatnonzero(~near), np.flatnonzero(out)
+        if out.any() and not near.all():
+            yield np.sort(order[~near]), np.sort(order[out])
 
 
 class Fit:
@@ -230,7 +234,7 @@ class Fit:
         self._prior, self._measured = prior, measured
         self.ratio = np.ones(len(prior.receivers_m))
         self.spread: Hyperparameters | None = None
-        self._folds = [(join(measured.take(train)), held_out) for train, held_out in folds(len(measured.rows))]
+        self._folds = [(join(measured.take(train)), held_out) for train, held_out in folds(measured.poses.position_m)]
 
     def held_out(
         self, hyperparameters: Hyperparameters, rounds: int = 0, unheard: bool = False
@@ -280,8 +284,11 @@ class Fit:
     ) -> Hyperparameters:
         """Change one parameter at a time while that lowers the mean absolute held-out error by `LEAST_GAIN_DB`.
 
-        One pass through all parameters that are not ``stated``; ``on_progress`` takes the fraction done.
+        One pass through all parameters that are not ``stated``; ``on_progress`` takes the fraction done. Rows that are
+        all at one place hold nothing out and choose nothing.
         """
+        if not self._folds:
+            return hyperparameters
 
         def error_db(candidate: Hyperparameters) -> float:
             return float(np.nanmean(np.abs(self._residual(candidate))))

@@ -7,16 +7,17 @@ held-out stretches of the training rows (`strength_fit`). Terms that all receive
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Prediction, Record, Split
+from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray
 from ...core.settings import changed, names_of
 from ...core.types import IntArray
@@ -29,15 +30,11 @@ from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_ar
 from .by_receiver import finite_positions
 from .kriging import KrigingSettings
 from .strength_fit import (
-    AREA_M,
-    SEARCHED,
-    SEARCHED_OF_HEADINGS,
     Fit,
     PriorMean,
     StrengthPosterior,
     by_likelihood,
     likely_deviations,
-    scales,
     shift_of,
     widening,
 )
@@ -62,6 +59,10 @@ EXPONENT_SD = (1.0, 0.3)
 TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
 BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
+Lengths = Literal["default", "searched", "likelihood"]
+LENGTHS: tuple[Lengths, ...] = ("default", "searched", "likelihood")
+DEFAULT, SEARCHED_LENGTHS, LIKELIHOOD = LENGTHS
+"""Origins of hyperparameters, see `StrengthSettings.lengths`."""
 EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
 
 
@@ -74,13 +75,15 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
     Attributes:
         transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
             or 0 dBm without any.
-        search_rows: least number of training rows with which held-out rows choose hyperparameters.
+        lengths: where hyperparameters come from: ``default``, ``searched`` by stretches that are held out, or
+            ``likelihood``; null: the one whose predictions of held-out rows have the smallest error.
     """
 
     transmit_dbm: float | None = None
-    search_rows: int = 500
+    lengths: Lengths | None = None
     FIXED: ClassVar[Mapping[str, float]] = {
         "receiver_sd_db": RECEIVER_SD_DB,
+        "search_rows": 500,
         "stop_m": STOP_M,
         "stop_rad": STOP_RAD,
         "stop_rows": STOP_ROWS,
@@ -96,18 +99,12 @@ POOLED_ONLY = names_of(StrengthSettings) - names_of(KrigingSettings)
 """Settings that kriging of each receiver alone lacks."""
 
 
-def unused_of_pooled(problem: Problem, splits: Sequence[Split]) -> dict[str, str]:
-    """Settings without effect on pooled strengths: of headings that do not count, and of a search that is not made."""
-    s, record, unused = problem.settings, problem.record, dict[str, str]()
-    turns = s.heading and record.tx_heading_rad is not None
-    if not turns:
-        unused = dict.fromkeys(OF_HEADINGS, "heading=false" if not s.heading else "the data have no headings")
-    searched = [*SEARCHED, *(SEARCHED_OF_HEADINGS if turns else ())]
-    if problem.stated_settings.issuperset(searched):
-        unused["search_rows"] = "all hyperparameters of the search are stated"
-    elif all(scales(record.tx_pos_m[split.all_train])[1] > AREA_M for split in splits):
-        unused["search_rows"] = f"rows extend over more than {AREA_M:g} m, where no search chooses hyperparameters"
-    return unused
+def unused_of_pooled(problem: Problem) -> dict[str, str]:
+    """Settings without effect on pooled strengths: of headings that do not count."""
+    s, record = problem.settings, problem.record
+    if s.heading and record.tx_heading_rad is not None:
+        return {}
+    return dict.fromkeys(OF_HEADINGS, "heading=false" if not s.heading else "the data have no headings")
 
 
 @dataclass(eq=False, repr=False)
@@ -118,6 +115,8 @@ class Strengths(Fitted):
     shift_db: float
     widen: FloatArray  # factor of each receiver's standard deviations [n_rx]
     fit_facts: dict[str, float]  # numbers of the fit for `facts`
+    lengths: str = DEFAULT  # where hyperparameters come from, see `StrengthSettings`
+    options: Sequence[Mapping[str, Any]] = ()  # reports of what held-out rows chose from
 
     def __post_init__(self) -> None:
         """Headings count where the training rows had them."""
@@ -221,6 +220,8 @@ class Strengths(Fitted):
             "rounds": field.rounds,
             "shift_db": self.shift_db,
             "widen": self.widen,
+            "lengths": self.lengths,
+            "options": json.dumps(list(self.options)),
             "fact.name": np.array(list(self.fit_facts)),
             "fact.value": np.array(list(self.fit_facts.values()), float),
             **field_arrays(field.hyperparameters, "knob."),
@@ -257,7 +258,9 @@ class Strengths(Fitted):
             spread = from_field_arrays(Hyperparameters, arrays, "spread.")
         field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]), spread)
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
-        return cls(field, float(arrays["shift_db"]), arrays["widen"], facts)
+        lengths = str(arrays.get("lengths", DEFAULT))
+        options = json.loads(str(arrays.get("options", "[]")))
+        return cls(field, float(arrays["shift_db"]), arrays["widen"], facts, lengths, options)
 
     def facts(self) -> dict[str, Any]:
         """Hyperparameters, calibration, and error on held-out rows."""
@@ -266,6 +269,7 @@ class Strengths(Fitted):
             "traced": self.field.prior.traced is not None,
             "headings": self.field.headings,
             "transmit_dbm": self.field.prior.transmit_dbm,
+            "lengths": self.lengths,
             **asdict(self.field.hyperparameters),
             "noise_ratio": [float(ratio) for ratio in self.field.ratio],
             "shift_db": self.shift_db,
@@ -275,7 +279,7 @@ class Strengths(Fitted):
             ],
             **self.fit_facts,
         }
-        return {"fitted": fitted}
+        return {"fitted": fitted} | ({"options": list(self.options)} if self.options else {})
 
 
 def fit_strengths(
@@ -285,6 +289,7 @@ def fit_strengths(
     settings: StrengthSettings = StrengthSettings(),
     on_progress: OnProgress = quiet,
     stated: Collection[str] | None = None,
+    calibrate: bool = True,
 ) -> Strengths:
     """Fit signal strengths to some rows of a record; nothing is drawn, so there is no seed.
 
@@ -292,10 +297,11 @@ def fit_strengths(
         record: signal strengths with a single, known carrier.
         rows: numbers of training rows, in the order of time (`wrf_mi.models.interpolation.strength_fit.folds`).
         power_map: traced power, a local mean or at positions themselves; None: free space is expected.
-        settings: settings.
+        settings: settings; lengths that they leave open are the default ones.
         on_progress: progress callback.
         stated: names of the hyperparameters that hold, whatever a search or likelihood chooses for the others; None:
             those that differ from their defaults.
+        calibrate: whether deviations, shift and the receivers' noise come from held-out stretches, see `calibrated`.
 
     Raises:
         InputError: a record of another task or without its carrier, or neither rows nor a map.
@@ -304,46 +310,60 @@ def fit_strengths(
     if record.frequencies_hz is None:
         raise InputError(f"{record.name}: carrier frequency unknown; state it in the data")
     measured = _measured(record, rows, settings.heading)
-    rows, values = measured.rows, measured.value_dbm
-    if not len(rows) and power_map is None:
+    if not len(measured.rows) and power_map is None:
         raise InputError(f"{record.name}: neither a training row that was received nor a scene; give one of them")
     prior = _prior(record, measured, power_map, settings)
     hyperparameters, stated = settings.hyperparameters, changed(settings) if stated is None else stated
-    ratio, widen = np.ones((2, len(values)))
-    spread: Hyperparameters | None = None
+    lengths = settings.lengths or DEFAULT
+    if len(measured.rows) > 1 and lengths == LIKELIHOOD:
+        prior, hyperparameters = by_likelihood(prior, _stops(measured), hyperparameters, stated)
+    elif len(measured.rows) > 1 and lengths == SEARCHED_LENGTHS:
+        search = Fit(prior, measured, partial(_stops, factor=WIDER))
+        search.set_ratio(hyperparameters)
+        hyperparameters = search.search(
+            hyperparameters, stated, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
+        )
+    ones = np.ones(len(measured.value_dbm))
+    field = StrengthPosterior(prior, hyperparameters, ones, _stops(measured), ROBUST_ROUNDS)
     # Traces at exact positions have no fades left in what they do not predict.
-    skew_db = 0.0 if power_map is not None and power_map.exact else SKEW_DB
-    shift, facts = skew_db, {"rows": float(len(rows))}
-    if len(rows) > 1:
-        over_area = scales(measured.poses.position_m)[1] > AREA_M
-        if over_area:
-            prior, hyperparameters = by_likelihood(prior, _stops(measured), hyperparameters, stated)
-        elif len(rows) >= settings.search_rows:
-            search = Fit(prior, measured, partial(_stops, factor=WIDER))
-            search.set_ratio(hyperparameters)
-            hyperparameters = search.search(
-                hyperparameters, stated, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
-            )
-        fit = Fit(prior, measured, _stops)
-        fit.set_ratio(hyperparameters)
-        if not over_area:  # there the hyperparameters are those of a likelihood
-            fit.spread = spread = likely_deviations(prior, _stops(measured), hyperparameters, stated)
-        on_progress("strengths: held-out rows", 0.8)
-        mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
-        residual = values - mean
-        shift, ratio = shift_of(residual, skew_db), fit.ratio
-        widen = widening(residual - shift, std)
-        few = np.isfinite(values).sum(axis=1) < FEW_ROWS
-        if few.any() and len(few) - few.sum() >= LEAST_HEARD:
-            # At receivers without rows nearby errors are those of the common terms, as at others that are left out.
-            mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS, unheard=True)
-            widen[few] = np.maximum(widen, widening(values - mean - shift, std))[few]
-        if np.isfinite(residual).any():
-            facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
+    shift = 0.0 if power_map is not None and power_map.exact else SKEW_DB
+    strengths = Strengths(field, shift, ones, {"rows": float(len(measured.rows))}, lengths)
+    return calibrated(strengths, record, rows, on_progress, stated) if calibrate else strengths
+
+
+def calibrated(
+    strengths: Strengths, record: Record, rows: IntArray, on_progress: OnProgress = quiet, stated: Collection[str] = ()
+) -> Strengths:
+    """The fit to some rows with their shift, deviations and noise of each receiver by stretches that are held out.
+
+    Deviations of hyperparameters that are not ``stated`` are by likelihood.
+    """
+    field, facts = strengths.field, dict(strengths.fit_facts)
+    prior, hyperparameters = field.prior, field.hyperparameters
+    measured = _measured(record, rows, field.headings)
+    values, widen = measured.value_dbm, strengths.widen.copy()
+    if len(measured.rows) < 2:
+        return strengths
+    fit = Fit(prior, measured, _stops)
+    fit.set_ratio(hyperparameters)
+    if strengths.lengths != LIKELIHOOD:  # whose hyperparameters are those of a likelihood already
+        fit.spread = likely_deviations(prior, field.stops, hyperparameters, stated)
+    on_progress("strengths: held-out rows", 0.8)
+    mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
+    residual = values - mean
+    shift = shift_of(residual, strengths.shift_db)
+    widen = widening(residual - shift, std)
+    few = np.isfinite(values).sum(axis=1) < FEW_ROWS
+    if few.any() and len(few) - few.sum() >= LEAST_HEARD:
+        # At receivers without rows nearby errors are those of the common terms, as at others that are left out.
+        mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS, unheard=True)
+        widen[few] = np.maximum(widen, widening(values - mean - shift, std))[few]
+    if np.isfinite(residual).any():
+        facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
     on_progress("strengths: all rows", 0.9)
-    field = StrengthPosterior(prior, hyperparameters, ratio, _stops(measured), ROBUST_ROUNDS, spread)
+    field = StrengthPosterior(prior, hyperparameters, fit.ratio, field.stops, ROBUST_ROUNDS, fit.spread)
     on_progress("strengths: all rows", 1.0)
-    return Strengths(field, shift, widen, facts)
+    return replace(strengths, field=field, shift_db=shift, widen=widen, fit_facts=facts)
 
 
 def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:

@@ -1,0 +1,67 @@
+"""The stage *residual* of signal strengths: kriging about their mean, pooled over receivers."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+
+from ..core import Split
+from ..models.interpolation.strength_fit import SEARCHED
+from ..models.interpolation.strengths import (
+    DEFAULT,
+    LENGTHS,
+    SEARCHED_LENGTHS,
+    Strengths,
+    StrengthSettings,
+    calibrated,
+    fit_strengths,
+)
+from ..models.model import Problem, Session
+from .stage import Option, Stage, State
+
+
+@dataclass(frozen=True)
+class StrengthResidual(Stage):
+    """Kriging of signal strengths, by default, searched or likely lengths of shadowing.
+
+    Hyperparameters of the settings that are ``stated`` hold.
+    """
+
+    settings: StrengthSettings
+    stated: Collection[str] = ()
+    name = "residual"
+
+    def options(self, problem: Problem, split: Split) -> Sequence[Option]:
+        """Origins of the lengths, or the one that the settings state."""
+        names = LENGTHS
+        if self.settings.lengths is not None:
+            names = (self.settings.lengths,)
+        elif {*SEARCHED} <= {*self.stated}:
+            names = (DEFAULT,)
+        return [Option(name, partial(self._fit, replace(self.settings, lengths=name))) for name in names]
+
+    def _fit(self, settings: StrengthSettings, state: State, split: Split, session: Session) -> State:
+        record, rows = state.problem.record, split.all_train
+        fitted = fit_strengths(record, rows, state.mean, settings, session.report, self.stated, calibrate=False)
+        return replace(state, fitted=fitted)
+
+    def continued(self, option: Option, chosen: State) -> Option:
+        """Lengths that were searched hold for all rows, too, of which those of a search would be much the same."""
+        if option.name != SEARCHED_LENGTHS:
+            return option
+        assert isinstance(chosen.fitted, Strengths)
+        found = replace(self.settings, lengths=DEFAULT, **asdict(chosen.fitted.field.hyperparameters))
+
+        def fit(state: State, split: Split, session: Session) -> State:
+            state = self._fit(found, state, split, session)
+            assert isinstance(state.fitted, Strengths)
+            return replace(state, fitted=replace(state.fitted, lengths=SEARCHED_LENGTHS))
+
+        return option._replace(fit=fit)
+
+    def finish(self, state: State, split: Split, session: Session) -> State:
+        """Deviations, shift and noise of each receiver, by stretches that are held out."""
+        assert isinstance(state.fitted, Strengths)
+        fitted = calibrated(state.fitted, state.problem.record, split.all_train, session.report, self.stated)
+        return replace(state, fitted=fitted)
