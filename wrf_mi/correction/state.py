@@ -131,7 +131,10 @@ class State:
         derivative = near(misfit, self.vector).jacobian(self.vector, free)
         prior = self.posterior.prior(self.mean, free)
         covariance = posterior_covariance(derivative, residual, prior, self.noise)
-        return np.sqrt(np.diag(covariance)), left_out_residuals(derivative, residual, covariance, self.noise)
+        # Rounding makes variances that the data leave nothing of negative.
+        return np.sqrt(np.maximum(np.diag(covariance), 0)), left_out_residuals(
+            derivative, residual, covariance, self.noise
+        )
 
 
 def _met_most(count: IntArray) -> IntArray:

@@ -228,13 +228,14 @@ def folds(position_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
 
 
 class Fit:
-    """Choices by held-out stretches of the training rows; ``join`` makes stops of rows."""
+    """Choices by held-out stretches of the training rows, of one fold in ``every``; ``join`` makes stops of rows."""
 
-    def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops]) -> None:
+    def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops], every: int = 1) -> None:
         self._prior, self._measured = prior, measured
         self.ratio = np.ones(len(prior.receivers_m))
         self.spread: Hyperparameters | None = None
-        self._folds = [(join(measured.take(train)), held_out) for train, held_out in folds(measured.poses.position_m)]
+        used = [*folds(measured.poses.position_m)][::every]
+        self._folds = [(join(measured.take(train)), held_out) for train, held_out in used]
 
     def held_out(
         self, hyperparameters: Hyperparameters, rounds: int = 0, unheard: bool = False

@@ -318,7 +318,7 @@ def fit_strengths(
     if len(measured.rows) > 1 and lengths == LIKELIHOOD:
         prior, hyperparameters = by_likelihood(prior, _stops(measured), hyperparameters, stated)
     elif len(measured.rows) > 1 and lengths == SEARCHED_LENGTHS:
-        search = Fit(prior, measured, partial(_stops, factor=WIDER))
+        search = Fit(prior, measured, partial(_stops, factor=WIDER), every=2)
         search.set_ratio(hyperparameters)
         hyperparameters = search.search(
             hyperparameters, stated, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
