@@ -7,6 +7,7 @@ import math
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
@@ -55,6 +56,8 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
     print(summary_table(f"{task.label} on {metrics['n_test']} test rows", blocks, 3))
     if metrics.get("stages"):
         _show_stages(metrics["stages"], task.label, metrics.get("held_out", {}))
+    if metrics.get("options"):
+        _show_options(metrics["options"], task.label)
     _show_receivers(metrics)
     if "inside_90" in metrics:
         share = f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals"
@@ -125,6 +128,20 @@ def _show_stages(reports: list[dict[str, Any]], label: str, weighed: dict[str, f
         print("not kept: no clear gain on held-out rows, by itself or under the stages that follow")
 
 
+def _show_options(reports: list[dict[str, Any]], label: str) -> None:
+    """Print what held-out training rows chose from, stage by stage; stages without a choice are left out."""
+    print(f"{'options, mean ' + label:<49}{'held-out rows':>15}{'seconds':>15}")
+    stages = Counter((report.get("part"), report["stage"]) for report in reports)
+    for report in reports:
+        if stages[report.get("part"), report["stage"]] == 1 and report["held_out"] is None and report["taken"]:
+            continue
+        place = " ".join(filter(None, (report.get("part"), report["stage"])))
+        cells = [f"{report[key]:{form}}" if report[key] is not None else "" for key, form in OPTION_COLUMNS]
+        words = "taken" if report["taken"] else f"not taken: {report['why']}"
+        print(f"{place + ': ' + report['option']:<49}" + "".join(f"{cell:>15}" for cell in cells) + f"  {words}")
+
+
+OPTION_COLUMNS = ("held_out", ".3f"), ("seconds", ".1f")
 ENDING = signal.SIGINT, signal.SIGTERM  # signals of Ctrl-C, and of batch systems and ``kill``
 LOG_S = 5.0  # least time between lines of progress within a part of the work, where no bar is shown
 
