@@ -1,6 +1,7 @@
 """Gains of paths are numbers, wherever antennas are and whatever surfaces are made of."""
 
 import logging
+import re
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import product
@@ -19,6 +20,8 @@ from wrf_mi.core.antenna import ANTENNA
 from wrf_mi.scene.materials import SINGLE_MAX
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.paths import result as result_module
+from wrf_mi.tracing.paths import traced_field as traced_field_module
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.search.chains import TRANSMISSION, Legs
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.sionna.materials import CONSTANTS, at_frequency
@@ -213,3 +216,39 @@ def test_trace_without_any_gain_is_refused(building, monkeypatch):
     losing(monkeypatch, slice(None))
     with pytest.raises(InputError, match="gains that are not numbers"):
         trace_paths(building, [[1.0, 1.0, 1.0]], receiver(ENDS[0]), KINDS["specular"])
+
+
+@pytest.mark.parametrize("faint", [0.0, 1e-3])
+def test_differentiable_paths_without_a_gain_are_left_out_and_counted(building, faint, monkeypatch, caplog):
+    options = TracedOptions(KINDS["specular"], faint=faint)
+    of_near = building, [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]], receiver(ENDS[0]), options
+    whole, evaluate = TracedField(*of_near), traced_field_module.evaluate_paths
+
+    def broken(chains, *more):
+        """No number for the paths of the first transmitter whose last interaction is a reflection."""
+        (real, imaginary), *other = evaluate(chains, *more)
+        lost = chains.levels[-1].reflects & (chains.source_m[0] == 1) & (chains.exists > 0)
+        return (dr.select(lost, np.nan, real), imaginary), *other
+
+    reflected = whole.chains.levels[-1].reflects.numpy() & (whole.chains.source_m[0].numpy() == 1) & whole.exists
+    assert 0 < reflected.sum() < whole.exists.sum()
+    monkeypatch.setattr(traced_field_module, "evaluate_paths", broken)
+    with caplog.at_level(logging.WARNING):
+        traced = TracedField(*of_near)
+    lost = int(re.search(r"(\d+) of \d+ paths are left out: their gains are not numbers", caplog.text)[1])
+    assert lost >= reflected.sum()
+    if not faint:
+        assert (lost, traced.exists.sum()) == (reflected.sum(), whole.exists.sum() - reflected.sum())
+    assert np.isfinite([part.numpy() for part in traced({}).gain]).all()
+
+
+def test_differentiable_paths_without_any_gain_are_refused(building, monkeypatch):
+    evaluate = traced_field_module.evaluate_paths
+
+    def broken(*arguments):
+        (real, imaginary), *other = evaluate(*arguments)
+        return (real * np.nan, imaginary), *other
+
+    monkeypatch.setattr(traced_field_module, "evaluate_paths", broken)
+    with pytest.raises(InputError, match="gains that are not numbers"):
+        TracedField(building, [[1.0, 1.0, 1.0]], receiver(ENDS[0]), TracedOptions(KINDS["specular"]))
