@@ -29,6 +29,7 @@ from wrf_mi.tracing.sionna.path_solver import SHORT, Devices, apart
 from wrf_mi.tracing.slabs import slab
 
 Float64 = dr.float64_array_t(mi.Float)
+Tensor64 = dr.tensor_t(Float64)
 ROUNDING = {mi.Float: 1e-5, Float64: 1e-12}  # of a power: some ten operations on numbers of about 1
 SINGLE = 2e-4  # of coefficients in single precision: the phase across up to three wavelengths
 
@@ -38,7 +39,8 @@ SLIVER = 3  # number of the triangle of the building's floor that has no area
 X = (0, 3, LENGTH, 2.4, 1e-9, 3 + 1e-7, -30, 1e4)  # corners, the partition, inside, beside a wall, far outside
 Y = (0, 4, WIDTH, 1.1, 1e-8, -2, 1e4)
 Z = (0, 2.5, HEIGHT, 1.3, 1e-7, 1e4)  # the floor, the partition's upper edge, the ceiling
-ENDS = ((4, 2, 1.5), (3, 2, 1.5), (0, 0, 0), (1.5, 3.5, 1))  # inside, on the partition, in a corner, on the block
+# Inside, on the partition, in a corner, on the block, and where numbers of single precision are 1 mm apart.
+ENDS = ((4, 2, 1.5), (3, 2, 1.5), (0, 0, 0), (1.5, 3.5, 1), (1e4, 1e4, 1e4))
 KINDS = {
     "specular": TraceOptions(depth=3, rays=1 << 12),
     "diffraction": TraceOptions(depth=2, diffraction=True, rays=1 << 9),
@@ -153,6 +155,17 @@ def test_gains_in_materials_of_itu_are_numbers_at_any_position(building, options
 def test_gains_in_any_slab_are_numbers_at_any_position(building, options, constants):
     with made_of(building, constants):
         assert_numbers(traced_everywhere(building, options))
+
+
+def test_derivatives_are_numbers_for_a_transmitter_at_the_receiver(building):
+    """It has fewer paths than others, and its place holders have no direction."""
+    traced = TracedField(building, ENDS[:4], receiver(ENDS[0]), TracedOptions(KINDS["specular"]))
+    parameters = {name: Tensor64(np.asarray(value, float)) for name, value in traced.parameters().items()}
+    dr.enable_grad(*parameters.values())
+    paths = traced(parameters)
+    dr.backward(sum(dr.sum(dr.square(part)) for part in (*paths.gain, paths.length_m)))
+    for values in (*paths.gain, paths.length_m, *paths.arrival, *map(dr.grad, parameters.values())):
+        assert np.isfinite(values.numpy()).all()
 
 
 def test_path_that_meets_a_sliver_has_the_gain_of_its_plane(building):

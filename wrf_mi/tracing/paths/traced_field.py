@@ -275,7 +275,7 @@ class TracedField:
         self._path_of_met = np.broadcast_to(entry[:, None], types.shape)[met]
         if self._gaussians is not None:
             self.attach(self._gaussians)
-        # Place holders have a transmitter, too: lengths of zero have no direction.
+        # Place holders have a transmitter, too: its heading is a rotation.
         sources = columns_on_device(self._source_columns(np.repeat(np.arange(len(self)), each)), Float64)
         # Uncertain phases of n reflections add as squares: their root is a factor (`TracedField.bounces_of`).
         bounces = np.zeros(len(place))
