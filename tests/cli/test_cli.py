@@ -276,7 +276,7 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.Capt
         watch.on_progress("training", 0.5, progress(step=20, validation_score=0.5))
         of_rows = {"validation_rows": 9, "validation_m": 0.05, "test_m": 0.17}
         watch.on_progress("fold0", 0.5, progress(step=20, validation_score=0.95, **of_rows))
-        watch.on_progress("paths", 0.5, progress(step=20, validation_score=0.95, **of_rows, far_score=0.79))
+        watch.on_progress("paths", 0.5, progress(step=20, validation_score=0.95, **of_rows, far_score=0.79, far_rows=4))
         watch.on_progress("fold1", 0.5, progress(step=20, validation_score=0.75, held_out=False))
         watch.on_progress("fold2", 0.5, progress(step=20, validation_score=float("nan")))
         watch.on_progress("vae", 0.5, progress(step=20, validation_score=0.5, gaussians=0))
@@ -286,8 +286,8 @@ def test_watch_prints_plain_lines_where_there_is_no_terminal(capsys: pytest.Capt
         "training 20/40  loss 0.2500  SSIM 0.500 (validation rows)  8 Gaussians  1:01 left",
         "fold0 20/40  loss 0.2500  SSIM 0.950 (9 validation rows, median 0.05 m from training rows, test rows 0.17 m)"
         "  8 Gaussians  1:01 left",
-        "paths 20/40  loss 0.2500  SSIM 0.950 (9 validation rows, median 0.05 m from training rows, test rows 0.17 m; "
-        "0.790 of those as far as test rows)  8 Gaussians  1:01 left",
+        "paths 20/40  loss 0.2500  SSIM 0.790 (4 validation rows as far from training rows as test rows, 0.17 m; "
+        "0.950 of all 9)  8 Gaussians  1:01 left",
         "fold1 20/40  loss 0.2500  SSIM 0.750 (validation rows, now trained on)  8 Gaussians  1:01 left",
         "fold2 20/40  loss 0.2500    8 Gaussians  1:01 left",
         "vae 20/40  loss 0.2500  SSIM 0.500 (validation rows)  1:01 left",

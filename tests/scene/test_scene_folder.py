@@ -1,5 +1,6 @@
 """Scene folders: written whole, opened by both tracers, materials that follow one file; pictures of scenes."""
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,15 @@ from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from wrf_mi import backend
+from wrf_mi.checking import check_scene
 from wrf_mi.core import InputError
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.paths import Paths
 from wrf_mi.scene.folder import read_scene_folder, write_scene
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.materials import Materials, read_materials
-from wrf_mi.scene.mesh.surfaces import Surface, number_names
+from wrf_mi.scene.mesh.files import mesh_parts
+from wrf_mi.scene.mesh.surfaces import Surface, number_names, with_area
 from wrf_mi.scene.plan.storey import plan_surfaces
 from wrf_mi.scene.preview import GaussianCloud, draw_scene
 from wrf_mi.scene.scan import simulate_scan
@@ -174,6 +177,31 @@ def test_a_mesh_and_a_layout_become_folders(tmp_path):
     scene = open_scene(layout.folder, FREQUENCY_HZ).mi_scene
     np.testing.assert_allclose(bounds(scene), [[0, 0, 1], [5, 4, 3.5]], atol=1e-6)
     assert number_names(["wall", "floor", "wall"]) == ["wall_01", "floor", "wall_02"]
+
+
+def test_triangles_that_lose_their_area_in_single_precision_are_not_written(tmp_path, caplog):
+    """A floor with a corner 4 um off its side has a sliver there, 300 m from the origin a line."""
+    plan = ((0, 300), (4, 300), (4, 303), (0, 303), (2, 300 + 4e-6))
+    corners = [(x, y, z) for z in (0.0, 2.5) for x, y in plan]
+    floor = [(0, 4, 3), (4, 2, 3), (4, 1, 2), (0, 1, 4)]
+    faces = [(5, 6, 7), (5, 7, 8)] + [(k, (k + 1) % 4, (k + 1) % 4 + 5) for k in range(4)]
+    faces += [(k, (k + 1) % 4 + 5, k + 5) for k in range(4)]
+    lines = ["v {:.9f} {:.9f} {:.9f}".format(*corner) for corner in corners]
+    lines += ["f {} {} {}".format(*np.add(face, 1)) for face in floor + faces]
+    (tmp_path / "room.obj").write_text("\n".join(lines))
+    with caplog.at_level(logging.WARNING):
+        made = make_scene(tmp_path / "room.obj", tmp_path / "room")
+    assert "room.obj: 1 of 14 triangles have no area and are left out" in caplog.text
+    assert made.counts == {"surfaces": 6, "faces": 13}
+    (written,) = mesh_parts(made.folder / "meshes" / "floor.ply")
+    assert written.area == pytest.approx(12.0, rel=1e-6)
+    assert "zero-area" not in {finding.kind for finding in check_scene(made.folder).findings}
+
+
+def test_surface_of_lines_is_left_out():
+    corners = np.array([[0, 0, 0], [2, 0, 0], [4, 0, 0], [0, 1, 0.0]])
+    sound, line = Surface("a", "other", corners, np.array([[0, 1, 3]])), np.array([[0, 1, 2], [1, 1, 3]])
+    assert [part.name for part in with_area([sound, Surface("b", "other", corners, line)], "test")] == ["a"]
 
 
 def bounds(scene):

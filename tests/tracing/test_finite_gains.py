@@ -1,6 +1,7 @@
 """Gains of paths are numbers, wherever antennas are and whatever surfaces are made of."""
 
 import logging
+import re
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import product
@@ -19,6 +20,8 @@ from wrf_mi.core.antenna import ANTENNA
 from wrf_mi.scene.materials import SINGLE_MAX
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.paths import result as result_module
+from wrf_mi.tracing.paths import traced_field as traced_field_module
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.search.chains import TRANSMISSION, Legs
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.sionna.materials import CONSTANTS, at_frequency
@@ -26,6 +29,7 @@ from wrf_mi.tracing.sionna.path_solver import SHORT, Devices, apart
 from wrf_mi.tracing.slabs import slab
 
 Float64 = dr.float64_array_t(mi.Float)
+Tensor64 = dr.tensor_t(Float64)
 ROUNDING = {mi.Float: 1e-5, Float64: 1e-12}  # of a power: some ten operations on numbers of about 1
 SINGLE = 2e-4  # of coefficients in single precision: the phase across up to three wavelengths
 
@@ -35,7 +39,8 @@ SLIVER = 3  # number of the triangle of the building's floor that has no area
 X = (0, 3, LENGTH, 2.4, 1e-9, 3 + 1e-7, -30, 1e4)  # corners, the partition, inside, beside a wall, far outside
 Y = (0, 4, WIDTH, 1.1, 1e-8, -2, 1e4)
 Z = (0, 2.5, HEIGHT, 1.3, 1e-7, 1e4)  # the floor, the partition's upper edge, the ceiling
-ENDS = ((4, 2, 1.5), (3, 2, 1.5), (0, 0, 0), (1.5, 3.5, 1))  # inside, on the partition, in a corner, on the block
+# Inside, on the partition, in a corner, on the block, and where numbers of single precision are 1 mm apart.
+ENDS = ((4, 2, 1.5), (3, 2, 1.5), (0, 0, 0), (1.5, 3.5, 1), (1e4, 1e4, 1e4))
 KINDS = {
     "specular": TraceOptions(depth=3, rays=1 << 12),
     "diffraction": TraceOptions(depth=2, diffraction=True, rays=1 << 9),
@@ -152,6 +157,17 @@ def test_gains_in_any_slab_are_numbers_at_any_position(building, options, consta
         assert_numbers(traced_everywhere(building, options))
 
 
+def test_derivatives_are_numbers_for_a_transmitter_at_the_receiver(building):
+    """It has fewer paths than others, and its place holders have no direction."""
+    traced = TracedField(building, ENDS[:4], receiver(ENDS[0]), TracedOptions(KINDS["specular"]))
+    parameters = {name: Tensor64(np.asarray(value, float)) for name, value in traced.parameters().items()}
+    dr.enable_grad(*parameters.values())
+    paths = traced(parameters)
+    dr.backward(sum(dr.sum(dr.square(part)) for part in (*paths.gain, paths.length_m)))
+    for values in (*paths.gain, paths.length_m, *paths.arrival, *map(dr.grad, parameters.values())):
+        assert np.isfinite(values.numpy()).all()
+
+
 def test_path_that_meets_a_sliver_has_the_gain_of_its_plane(building):
     """Sionna RT takes the normal from the corners of the triangle, which has none."""
     options = TraceOptions(depth=1, transmission=False, rays=1 << 12)
@@ -213,3 +229,39 @@ def test_trace_without_any_gain_is_refused(building, monkeypatch):
     losing(monkeypatch, slice(None))
     with pytest.raises(InputError, match="gains that are not numbers"):
         trace_paths(building, [[1.0, 1.0, 1.0]], receiver(ENDS[0]), KINDS["specular"])
+
+
+@pytest.mark.parametrize("faint", [0.0, 1e-3])
+def test_differentiable_paths_without_a_gain_are_left_out_and_counted(building, faint, monkeypatch, caplog):
+    options = TracedOptions(KINDS["specular"], faint=faint)
+    of_near = building, [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]], receiver(ENDS[0]), options
+    whole, evaluate = TracedField(*of_near), traced_field_module.evaluate_paths
+
+    def broken(chains, *more):
+        """No number for the paths of the first transmitter whose last interaction is a reflection."""
+        (real, imaginary), *other = evaluate(chains, *more)
+        lost = chains.levels[-1].reflects & (chains.source_m[0] == 1) & (chains.exists > 0)
+        return (dr.select(lost, np.nan, real), imaginary), *other
+
+    reflected = whole.chains.levels[-1].reflects.numpy() & (whole.chains.source_m[0].numpy() == 1) & whole.exists
+    assert 0 < reflected.sum() < whole.exists.sum()
+    monkeypatch.setattr(traced_field_module, "evaluate_paths", broken)
+    with caplog.at_level(logging.WARNING):
+        traced = TracedField(*of_near)
+    lost = int(re.search(r"(\d+) of \d+ paths are left out: their gains are not numbers", caplog.text)[1])
+    assert lost >= reflected.sum()
+    if not faint:
+        assert (lost, traced.exists.sum()) == (reflected.sum(), whole.exists.sum() - reflected.sum())
+    assert np.isfinite([part.numpy() for part in traced({}).gain]).all()
+
+
+def test_differentiable_paths_without_any_gain_are_refused(building, monkeypatch):
+    evaluate = traced_field_module.evaluate_paths
+
+    def broken(*arguments):
+        (real, imaginary), *other = evaluate(*arguments)
+        return (real * np.nan, imaginary), *other
+
+    monkeypatch.setattr(traced_field_module, "evaluate_paths", broken)
+    with pytest.raises(InputError, match="gains that are not numbers"):
+        TracedField(building, [[1.0, 1.0, 1.0]], receiver(ENDS[0]), TracedOptions(KINDS["specular"]))

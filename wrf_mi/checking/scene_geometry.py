@@ -18,11 +18,11 @@ from ..core.memory import require_memory
 from ..core.types import IntArray
 from ..scene.mesh.files import POLYGON_READERS, mesh_parts, triangles_of
 from ..scene.mesh.polygon_files import Polygons
-from ..scene.mesh.surfaces import bodies
+from ..scene.mesh.surfaces import bodies, without_area
 from ..tracing.sionna.scenes import placed_mesh, same_triangles, triangles_by_mitsuba
 from .scene_findings import Finding
 from .scene_xml_faults import PARAMETERS, SceneXml, number, similar_file
-from .triangle_faults import copies, double_sheets, is_flat, open_solids, without_area, wound_both_ways
+from .triangle_faults import copies, double_sheets, is_flat, open_solids, wound_both_ways
 
 MEMORY = {".obj": 30}  # bytes of memory for each byte of a mesh file; others take `MEMORY_BINARY`
 MEMORY_BINARY = 12

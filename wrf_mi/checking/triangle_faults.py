@@ -13,8 +13,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..scene.mesh.files import SMALLEST_FACE_M2
-from ..scene.mesh.surfaces import Body, shared_edges
+from ..scene.mesh.surfaces import SMALLEST_FACE_M2, Body, shared_edges
 
 NEAREST_M, FARTHEST_M = 3e-6, 3e-3
 """Distances of parallel sheets between which a path that passes both is lost.
@@ -27,16 +26,6 @@ SIDE = np.array([0.9, 0.41, 0.17])
 """Direction by which one of both normals of a plane is chosen; hardly a wall is parallel to it."""
 MOST_OPEN = 0.1  # largest share of open edges of a body that counts as a solid with a hole
 FLAT = 1e-3  # largest ratio of the extents across and along a sheet
-
-
-def areas(corners_m: FloatArray) -> FloatArray:
-    """Areas [f] of triangles [f, 3, 3]."""
-    return np.asarray(trimesh.triangles.area(corners_m), float)
-
-
-def without_area(corners_m: FloatArray) -> NDArray[np.bool_]:
-    """Which triangles [f, 3, 3] are degenerate: nothing reflects from them, and their normals are noise."""
-    return areas(corners_m) < SMALLEST_FACE_M2
 
 
 def copies(corners_m: FloatArray) -> NDArray[np.bool_]:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..scene.coordinates import FARTHEST_M
-from ..scene.mesh.surfaces import bodies
+from ..scene.mesh.surfaces import bodies, without_area
 from .scene_geometry import ShapePart, materials_of
-from .triangle_faults import copies, double_sheets, is_flat, without_area, wound_both_ways, wound_one_way
+from .triangle_faults import copies, double_sheets, is_flat, wound_both_ways, wound_one_way
 
 ORIGIN_STEP_M = 100.0  # origins are whole multiples, and axes near zero stay
 NEAR_ZERO_M = 1000.0

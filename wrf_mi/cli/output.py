@@ -225,21 +225,23 @@ class Watch:
 
     def _text(self, p: FitProgress) -> str:
         if p.validation_score is not None and not math.isnan(p.validation_score):  # NaN without validation rows
-            self._score = f"{p.label} {p.validation_score:.3f} ({_validation_text(p)})"
+            score = p.far_score if p.held_out and p.far_score is not None else p.validation_score
+            self._score = f"{p.label} {score:.3f} ({_validation_text(p)})"
         gaussians = f"{p.gaussians} Gaussians  " if p.gaussians else ""
         return f"loss {p.loss:.4f}  {self._score}  {gaussians}{_minutes(p.left_s)}"
 
 
 def _validation_text(p: FitProgress) -> str:
-    """The rows that are scored in training, and how far from training rows they and the test rows are."""
+    """The rows whose score is shown in training, and how far from training rows they and the test rows are."""
     text = f"{p.validation_rows or ''} validation rows".strip()
     if not p.held_out:
         return f"{text}, now trained on"
+    if p.far_score is not None:  # only these are like test rows
+        alike = f"{p.far_rows} validation rows as far from training rows as test rows, {p.test_m:.2g} m"
+        return f"{alike}; {p.validation_score:.3f} of all {p.validation_rows}"
     if p.validation_m is not None:
         text += f", median {p.validation_m:.2g} m from training rows"
-    if p.test_m is not None:
-        text += f", test rows {p.test_m:.2g} m"
-    return text if p.far_score is None else f"{text}; {p.far_score:.3f} of those as far as test rows"
+    return text if p.test_m is None else f"{text}, test rows {p.test_m:.2g} m"
 
 
 def _minutes(left_s: float) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -45,6 +46,7 @@ WIDE = 0.95  # probability of the quantile by which the widths of distributions 
 MOST_ROWS = 300  # most held-out rows that are located
 LEVEL = 0.9  # probability of a region by default, and of those whose held-out coverage is stated
 TOGETHER = 512  # candidates that are predicted together
+TIMED = 64  # most candidates whose predictions are timed at once, before all are predicted
 FOLDS = 3  # hold-outs with other seeds: one alone has few positions, near each other
 FOLDER, FILE = "locate", "locate.json"  # folder of finished folds in the run folder, and file of the choice
 
@@ -85,6 +87,26 @@ def predict_candidates(
                 predicted[:, number, place, part] = prediction.mean, prediction.std
         report(part.stop / len(positions))
     return predicted
+
+
+def seconds_to_predict(fitted: Fitted, receivers: IntArray, headings: int, candidates: Candidates) -> float:
+    """Estimated duration of `predict_candidates` in seconds, from predictions at a few of the candidates."""
+    count = len(candidates.positions_m)
+    many = min(max(count // 4, 1), TIMED)
+    few = max(many // 8, 1)
+    timed_m = candidates.positions_m[np.linspace(0, count - 1, 2 * many + few).astype(int)]
+
+    def seconds(places_m: FloatArray) -> float:
+        begun, turned = time.perf_counter(), np.zeros(len(places_m)) if headings > 1 else None
+        for receiver in receivers:
+            fitted.predict(Inputs(places_m, turned), int(receiver))
+        return time.perf_counter() - begun
+
+    seconds(timed_m[:many])  # the first prediction opens the scene and compiles kernels, which later ones do not
+    # A call takes a time of its own and one for each position: two calls of different sizes determine both.
+    short, long = seconds(timed_m[many:-many]), seconds(timed_m[-many:])
+    each = max(long - short, 0.0) / max(many - few, 1)
+    return headings * (len(slices(count, TOGETHER)) * max(short - few * each, 0.0) + count * each)
 
 
 def headings_of(run: Run) -> int:

@@ -26,7 +26,7 @@ from .mesh.facets import planes_of_mesh
 from .mesh.files import SUFFIXES, read_mesh
 from .mesh.measured import is_measured
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
-from .mesh.surfaces import Surface, bounds, box_of, moved, sampled
+from .mesh.surfaces import Surface, bounds, box_of, moved, sampled, with_area
 from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES
 from .plan.sources import PlanGrid, Row0, read_layout, read_plan
 from .plan.storey import layout_walls, plan_surfaces
@@ -140,7 +140,7 @@ def make_scene(
             scene = moved(with_walked_floor(surfaces, source.grid, places, unmapped=True), motion)
     write_scene(
         out,
-        scene,
+        with_area(scene, str(file)),
         frame=_frame(file, origin_m, registered),
         origin_m=origin_m,
         source=", ".join(map(str, files)),

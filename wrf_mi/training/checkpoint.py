@@ -2,7 +2,8 @@
 
 checkpoint.npz  format version, parameters, optimiser state and training time; arrays only
 log.jsonl       a line each ``log_every`` steps: step, seconds, loss, validation_score, held_out, gaussians, and of
-                scored rows validation_rows, validation_m, test_m, far_score (`wrf_mi.training.loop.Progress`)
+                scored rows validation_rows, validation_m, test_m, far_score, far_rows
+                (`wrf_mi.training.loop.Progress`)
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from ..tasks.conditions import normalised_uplink, outputs_of, placed_receivers
 from ..tracing.paths.traced_field import TracedField
 from .adam import Schedule, density_rounds, plan
 from .config import PATHS_ALONE, NetworkConfig, TrainConfig
-from .selection import hold_out_groups
+from .selection import hold_out_far, hold_out_groups
 
 BYTES_PER_NEURON, BYTES_PER_PAIR, BYTES_PER_NUMBER = 11, 1000, 24
 """Memory of a training step for each neuron, and beside networks, of each pair of a Gaussian and a transmitter, and for
@@ -277,7 +277,8 @@ class FitPlan:
         config: settings with number of steps and scale of transmitters.
         stages: names of the stages in their order.
         in_groups: whether the state is chosen on rows held out in groups, far from the training rows too.
-        choosing: split of these rows; ``split`` itself where there are none.
+        choosing: split of these rows, or, where Gaussians alone train, of validation rows as far from training rows as
+            test rows (`hold_out_far`); ``split`` itself where there are none.
         unjudged: whether the training rows do not suffice for such groups.
         known: slots of the traced sides by port: conditions that train or choose at its carrier.
 
@@ -306,6 +307,10 @@ class FitPlan:
         # always gain, whatever they do elsewhere.
         wanted = (self.graph.corrects or len(self.stages) > 1) and config.patience > 0 < config.holdout_steps_fraction
         self.choosing = hold_out_groups(split, record.tx_pos_m) if wanted else split
+        # Rows for a score alone: they choose no state, and are trained on in the end.
+        shown = not config.patience and 0 < config.holdout_steps_fraction < 1
+        if self.graph.scene is None and record.has_positions and shown:
+            self.choosing = self._with_far_rows()
         self.in_groups = wanted and (self.choosing is not split or self.graph.corrects)
         # Without rows to choose by, Gaussians are not used at all (`Trainer`): paths alone are the safe answer.
         self.unjudged = self.in_groups and self.choosing is split
@@ -334,6 +339,15 @@ class FitPlan:
         traced = self.config.traced
         more = (SURFACES,) * (traced.surface > 0) + (FIELD,) * (self.graph.field is not None)
         return (CALIBRATION, *more) if traced.alone else (more or (CALIBRATION,))[-1:]
+
+    def _with_far_rows(self) -> Split:
+        """The split of `hold_out_far`; the fit's own where a receiver would be left with less than a batch."""
+        # Scores of rows near training rows say nothing of test rows that are far from them.
+        far = hold_out_far(self.split, self.record.tx_pos_m)
+        ports = range(self.targets.ports)
+        least, least_far = (min(len(self.targets.received(p, part.train)) for p in ports) for part in (self.split, far))
+        # Batches of all receivers are as large as that of the one with the fewest rows.
+        return far if least_far >= min(self.config.batch, least) else self.split
 
     def _planned(self) -> Schedule:
         config, targets = self.config, self.targets

@@ -171,11 +171,12 @@ class Progress:
     left_s: float  # estimated seconds to the end
     label: str = "SSIM"  # name of the score
     validation_rows: int = 0  # number of rows that are scored; 0: not stated
-    # Median distance in metres of these and of the test rows from the nearest row that trains; None: unknown. Scores of
-    # rows near training rows say nothing of test rows in a region without any.
+    # Median distance in metres of these from the nearest row that trains now, and of the test rows from the nearest row
+    # that trains at all; None: unknown. Scores of rows near training rows say nothing of test rows far from any.
     validation_m: float | None = None
     test_m: float | None = None
     far_score: float | None = None  # median over those at least as far as half of the test rows; None: there are none
+    far_rows: int = 0  # number of these
 
 
 class TrainingLoop(ABC):

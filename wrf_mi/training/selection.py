@@ -33,6 +33,7 @@ GROUPS = 10  # clusters of training positions, some of which are held out togeth
 ROWS_OF_GROUP = 4  # least average number of rows of a cluster
 HELD_OUT = 0.25  # approximate share of the training rows that are held out in clusters
 MOST_HELD_OUT = 0.5  # largest share in a single cluster
+FAR_POSITIONS = 5  # least number of positions that are held out as far from training rows as test rows
 FOLDS = 5
 """Parts of rows that are left to receivers, or of positions at a held-out carrier, of which one is held out; largest
 number of groups of held-out observations."""
@@ -114,6 +115,39 @@ def hold_out_groups(split: Split, tx_pos_m: FloatArray, groups: int = GROUPS) ->
         if more.mean() <= (HELD_OUT if out.any() else MOST_HELD_OUT):
             out = more
     if not out.any():
+        return split
+    return replace(split, train=rows[~out], validation=np.sort(np.concatenate([split.validation, rows[out]])))
+
+
+def hold_out_far(split: Split, tx_pos_m: FloatArray) -> Split:
+    """The split with the rows around a position moved to the validation rows, so that some are as far as test rows.
+
+    Each test row lies at some distance from the nearest training or validation row. After the move, at least
+    `FAR_POSITIONS` positions of validation rows lie at the median of these distances, or farther, from training rows.
+
+    Args:
+        split: split of a record.
+        tx_pos_m: positions of all rows [n, 3], metres.
+
+    Returns:
+        A split with the fewest rows moved; ``split`` itself where its validation rows are as far already, there is no
+        test or validation row, or more than a share of `HELD_OUT` would have to move.
+    """
+    rows = split.train
+    places_m = np.unique(tx_pos_m[rows], axis=0)
+    if not len(split.test) or not len(split.validation) or len(places_m) <= FAR_POSITIONS:
+        return split
+    test_m = float(np.median(cKDTree(tx_pos_m[split.all_train]).query(tx_pos_m[split.test])[0]))
+    trained = cKDTree(tx_pos_m[rows])
+    far = trained.query(tx_pos_m[split.validation])[0] >= test_m
+    if len(np.unique(tx_pos_m[split.validation[far]], axis=0)) >= FAR_POSITIONS:
+        return split
+    # A position at distance d from the middle of an empty ball of radius r is at least r - d from what is outside.
+    radius_m = cKDTree(places_m).query(places_m, k=[FAR_POSITIONS])[0][:, 0] + test_m
+    middle = int(np.argmin(trained.query_ball_point(places_m, radius_m, return_length=True)))
+    out = np.zeros(len(rows), bool)
+    out[trained.query_ball_point(places_m[middle], radius_m[middle])] = True
+    if out.mean() > HELD_OUT:
         return split
     return replace(split, train=rows[~out], validation=np.sort(np.concatenate([split.validation, rows[out]])))
 

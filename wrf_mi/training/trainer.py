@@ -77,21 +77,25 @@ class StageSelection:
         elif plan.graph.scene is not None:
             each = [self._scores(predict, port, port_rows) for port, port_rows in enumerate(rows) if len(port_rows)]
         else:
-            record, validation, score = plan.record, plan.split.validation, plan.task.training_score
+            record, score, validation = plan.record, plan.task.training_score, self._split(state.chosen).validation
             receivers = range(len(record.receivers)) if len(validation) else ()
             reports = [predict.of_rows(record, validation, r) for r in receivers]
             each = [np.ravel(score(reports[r], record.observation[r, validation])) for r in receivers]
         self.scores = np.concatenate([np.zeros(0), *each])
         return float(np.nanmedian(self.scores)) if len(self.scores) else float("nan")
 
+    def _split(self, chosen: bool | int) -> Split:
+        """Split whose validation rows are scored before or after a state is ``chosen``."""
+        return self.plan.split if chosen else self.plan.choosing
+
     def _held_out(self, chosen: bool) -> list[IntArray]:
         """Conditions of each port that are held out before or after a state is ``chosen``."""
-        split = self.plan.choosing if self.plan.in_groups and not chosen else self.plan.split
+        split = self._split(chosen)
         return [self.plan.targets.received(port, split.validation) for port in range(self.plan.targets.ports)]
 
     def facts(self, chosen: bool) -> dict[str, Any]:
         """Fields of `Progress` on the rows of `scores`, before or after a state is ``chosen``."""
-        plan, split = self.plan, self.plan.choosing if self.plan.in_groups and not chosen else self.plan.split
+        plan, split = self.plan, self._split(chosen)
         record, test = plan.record, plan.split.test
         facts: dict[str, Any] = {"validation_rows": len(split.validation)}
         if not record.has_positions or not len(split.validation):
@@ -103,9 +107,14 @@ class StageSelection:
         facts["validation_m"] = float(np.median(away_m))
         if not len(test):
             return facts
-        facts["test_m"] = float(np.median(trained.query(record.tx_pos_m[test])[0]))
+        # Validation rows are compared with test rows as they are predicted: by a field that all of these rows trained.
+        known = split.all_train if plan.schedule.joined < plan.config.steps else split.train
+        facts["test_m"] = float(np.median(cKDTree(record.tx_pos_m[known]).query(record.tx_pos_m[test])[0]))
         far = (away_m >= facts["test_m"]) & np.isfinite(self.scores)
-        return facts | ({"far_score": float(np.median(self.scores[far]))} if far.any() else {})
+        if not far.any():
+            return facts
+        rows = len(np.unique(np.concatenate(scored)[far]))
+        return facts | {"far_score": float(np.median(self.scores[far])), "far_rows": rows}
 
     def _reports(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[Any]:
         """Reports of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""

@@ -24,7 +24,7 @@ from ..coordinates import FORMATS, UNITS_M, Up, check_extent, require_precise, s
 from .polygon_files import Polygons, read_obj, read_ply
 from .scene_files import USD_SUFFIXES, Beside, bare_gltf, gltf_facts, read_collada, read_usd
 from .sheets import as_sheets
-from .surfaces import Surface, number_names
+from .surfaces import Surface, number_names, without_area
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +33,6 @@ STATING_READERS = {".dae": read_collada, **dict.fromkeys(USD_SUFFIXES, read_usd)
 SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".gltf", *STATING_READERS)
 POINTS_ELSEWHERE = f"complete it, or give its points as {FORMATS}"
 """Remedy for a mesh of a format that is not read as points."""
-SMALLEST_FACE_M2 = 1e-10  # smaller faces are degenerate: nothing reflects from them, and their normals are noise
 POLYGON_READERS = {".obj": read_obj, ".ply": read_ply}
 STL_HEADER, STL_FACE = 84, 50
 """Bytes of the header of a binary STL file, whose last four are the number of triangles, and of a triangle."""
@@ -202,7 +201,7 @@ def sound_surfaces(parts: Sequence[trimesh.Trimesh], unit_m: float, name: str | 
     for part_name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
         vertices = np.asarray(part.vertices, float) * unit_m
         faces = np.asarray(part.faces, np.int64)
-        solid = faces[trimesh.triangles.area(vertices[faces]) >= SMALLEST_FACE_M2]
+        solid = faces[~without_area(vertices[faces])]
         # Copies may have other vertices: STL has no shared vertices.
         _, same = np.unique(vertices, axis=0, return_inverse=True)
         _, first = np.unique(np.sort(same.reshape(-1)[solid], axis=1), axis=0, return_index=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,14 +12,18 @@ from typing import Any, Literal, get_args
 import numpy as np
 import shapely
 import trimesh
+from numpy.typing import NDArray
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+
+logger = logging.getLogger(__name__)
 
 Kind = Literal["floor", "ceiling", "wall", "other"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 SAME_CORNER_M = 1e-4
 """Distance within which corners of faces coincide: STL has no shared vertices, and meshes that meet leave a gap."""
+SMALLEST_FACE_M2 = 1e-10  # smaller faces are degenerate: nothing reflects from them, and their normals are noise
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,24 @@ class Body:
     def bounds_m(self) -> FloatArray:
         """Lowest and highest coordinates, shape [2, 3]."""
         return bounds(self.corners_m)
+
+
+def without_area(corners_m: FloatArray) -> NDArray[np.bool_]:
+    """Which triangles [f, 3, 3] are degenerate, smaller than `SMALLEST_FACE_M2`."""
+    return np.asarray(trimesh.triangles.area(corners_m) < SMALLEST_FACE_M2)
+
+
+def with_area(surfaces: Sequence[Surface], source: str) -> list[Surface]:
+    """Surfaces without the triangles that have no area in a scene's files, which are counted and logged.
+
+    Surfaces of which nothing is left are left out. ``source`` names the surfaces, for the message.
+    """
+    # Files hold single precision, in which the corners of narrow triangles fall into a line.
+    empty = [without_area(surface.vertices_m.astype(np.float32)[surface.faces].astype(float)) for surface in surfaces]
+    if lost := sum(int(rows.sum()) for rows in empty):
+        logger.warning("%s: %d of %d triangles have no area and are left out", source, lost, sum(map(len, empty)))
+    parts = [replace(surface, faces=surface.faces[~rows]) for surface, rows in zip(surfaces, empty, strict=True)]
+    return [part for part in parts if len(part.faces)]
 
 
 def number_names(kinds: Sequence[str]) -> list[str]:

@@ -26,6 +26,7 @@ from ...core import Antenna
 from ...core.antenna import ANTENNA
 from ...core.types import FloatArray, IntArray
 from ..search.chains import SPECULAR, TRANSMISSION
+from ..search.images import COINCIDENT_M
 from ..search.surfaces import Surfaces
 from ..slabs import slab
 
@@ -101,7 +102,11 @@ def evaluate_paths(
     image = list(chains.source_m)  # three arrays [q]
     for level in chains.levels:
         image = _mirrored(image, level, level.offset_m)
-    towards = [x - p for x, p in zip(image, pose.position, strict=True)]
+    way = [x - p for x, p in zip(image, pose.position, strict=True)]
+    # Place holders of a transmitter at the receiver have a length of zero, hence no direction: any other serves, as
+    # their gain is multiplied by zero.
+    nowhere = dot(way, way) < COINCIDENT_M**2
+    towards = [dr.select(nowhere, along, part) for part, along in zip(way, (1, 0, 0), strict=True)]
     length = dr.sqrt(dot(towards, towards))
     arrival = [x / length for x in towards]
 

@@ -81,14 +81,9 @@ class TraceResult:
 
         `InputError`: no path has a gain.
         """
-        lost = int(np.count_nonzero(~np.isfinite(gain)))
-        result = replace(self, paths=replace(self.paths, gain=gain), lost=self.lost + lost)
-        if not lost:
-            return result
-        if lost == len(gain):
-            raise InputError("gains that are not numbers: give materials constants that single precision can hold")
-        logger.warning("%d of %d paths are left out: their gains are not numbers", lost, len(gain))
-        return result.select(np.flatnonzero(np.isfinite(gain)))
+        kept = paths_with_gain(gain)
+        result = replace(self, paths=replace(self.paths, gain=gain), lost=self.lost + len(gain) - len(kept))
+        return result if len(kept) == len(gain) else result.select(kept)
 
     def unabsorbed(self, scene: Any) -> TraceResult:
         """The paths without gain zero: no absorber of the ``sionna.rt.Scene``, no mirror where all is scattered."""
@@ -150,6 +145,19 @@ def device_ends(tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], tx_antenn
     antennas = tuple(receiver.antenna.mounted(receiver.orientation_xyzw) for receiver in receivers)
     rx = np.stack([receiver.position_m for receiver in receivers])
     return Devices(tx_pos_m, (tx_antenna.mounted(),)), Devices(rx, antennas)
+
+
+def paths_with_gain(gain: NDArray[np.inexact[Any]]) -> IntArray:
+    """Numbers [k] of the paths whose gains [p] (or amplitudes) are numbers; others are counted and logged.
+
+    `InputError`: no path has a gain.
+    """
+    kept = np.flatnonzero(np.isfinite(gain))
+    if len(gain) and not len(kept):
+        raise InputError("gains that are not numbers: give materials constants that single precision can hold")
+    if lost := len(gain) - len(kept):
+        logger.warning("%d of %d paths are left out: their gains are not numbers", lost, len(gain))
+    return kept
 
 
 def gains_of_receivers(

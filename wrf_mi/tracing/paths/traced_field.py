@@ -37,7 +37,7 @@ from ..search.surfaces import Surfaces
 from .corrected_scene import MovedSearch
 from .field_calculator import Chains, EvaluatedPaths, Level, chains_of, evaluate_paths, pattern_tables
 from .instrument_parameters import gain_name, instrument_parameters, moved_m, receiver_pose, spread_pose, with_antennas
-from .result import TraceResult, without_faint
+from .result import TraceResult, paths_with_gain, without_faint
 from .scene_parameters import TRAINED, MaterialGrouping, SceneTables, renumbered
 from .solve import Prepared, trace_paths
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
@@ -254,10 +254,11 @@ class TracedField:
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
         chains = chains_of(surfaces, types, face, self._slab(face), self._source_columns(tx))
-        # Weak paths cost as much as strong ones: those that hardly count are dropped before they are laid out.
-        share, strong = self.options.faint, np.arange(len(tx))
-        if share:
-            strong = np.flatnonzero(without_faint(tx, self._amplitudes(chains), share))
+        # A gain that is not a number would make sums over all paths none. Weak paths cost as much as strong ones: those
+        # that hardly count are dropped before they are laid out, too.
+        amplitude = self._amplitudes(chains)
+        strong = paths_with_gain(amplitude)
+        strong = strong[without_faint(tx[strong], amplitude[strong], self.options.faint)]
         tx, types, face, vertices_m = tx[strong], types[strong], face[strong], traced.paths.vertices_m[strong]
         # A rectangle of transmitters by paths, filled up with place holders: sums are then reductions of equal blocks.
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
@@ -274,7 +275,7 @@ class TracedField:
         self._path_of_met = np.broadcast_to(entry[:, None], types.shape)[met]
         if self._gaussians is not None:
             self.attach(self._gaussians)
-        # Place holders have a transmitter, too: lengths of zero have no direction.
+        # Place holders have a transmitter, too: its heading is a rotation.
         sources = columns_on_device(self._source_columns(np.repeat(np.arange(len(self)), each)), Float64)
         # Uncertain phases of n reflections add as squares: their root is a factor (`TracedField.bounces_of`).
         bounces = np.zeros(len(place))
@@ -298,10 +299,7 @@ class TracedField:
         with dr.suspend_grad():
             real, imaginary = self._evaluated(chains, self._present)[0]
             power = real * real + imaginary * imaginary
-        amplitude: FloatArray = np.sqrt(power.numpy())
-        if not np.isfinite(amplitude).all():
-            raise InputError("gains that are not numbers: give materials other constants")
-        return amplitude
+        return np.asarray(np.sqrt(power.numpy()))
 
     def _slab(self, face: IntArray) -> IntArray:
         """Index of the material at each interaction, 0 for none (face -1)."""

@@ -74,6 +74,8 @@ def specular_paths(
     direct = np.arange(len(sources_m) * len(targets_m) if options.line_of_sight else 0)
     source, target = np.divmod(direct, len(targets_m))
     apart = np.linalg.norm(targets_m[target] - sources_m[source], axis=1) > COINCIDENT_M
+    # Far from the origin antennas at two places have one in single precision, in which Sionna RT takes the direction.
+    apart &= (targets_m.astype(np.float32)[target] != sources_m.astype(np.float32)[source]).any(axis=1)
     # Chains (-1: none), sources and targets to test.
     columns = [(np.full(np.count_nonzero(apart), -1), source[apart], target[apart])]
     columns += [(chain, chains.source[chain], target) for chain, target in possible(surfaces, chains, targets_m)]
