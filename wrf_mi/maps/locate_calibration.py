@@ -92,7 +92,7 @@ def predict_candidates(
 def seconds_to_predict(fitted: Fitted, receivers: IntArray, headings: int, candidates: Candidates) -> float:
     """Estimated duration of `predict_candidates` in seconds, from predictions at a few of the candidates."""
     count = len(candidates.positions_m)
-    many = min(max(count // 4, 1), TIMED)
+    many = min(max(count // 4, 1), TIMED, TOGETHER)
     few = max(many // 8, 1)
     timed_m = candidates.positions_m[np.linspace(0, count - 1, 2 * many + few).astype(int)]
 
