@@ -9,9 +9,9 @@ from functools import partial
 from ..core import Split
 from ..models.interpolation.strength_fit import SEARCHED
 from ..models.interpolation.strengths import (
+    BY_SEARCH,
     DEFAULT,
-    LENGTHS,
-    SEARCHED_LENGTHS,
+    SHADOWINGS,
     Strengths,
     StrengthSettings,
     calibrated,
@@ -34,12 +34,12 @@ class StrengthResidual(Stage):
 
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
         """Origins of the lengths, or the one that the settings state."""
-        names = LENGTHS
-        if self.settings.lengths is not None:
-            names = (self.settings.lengths,)
+        names = SHADOWINGS
+        if self.settings.shadowing is not None:
+            names = (self.settings.shadowing,)
         elif {*SEARCHED} <= {*self.stated}:
             names = (DEFAULT,)
-        return [Option(name, partial(self._fit, replace(self.settings, lengths=name))) for name in names]
+        return [Option(name, partial(self._fit, replace(self.settings, shadowing=name))) for name in names]
 
     def _fit(self, settings: StrengthSettings, state: State, split: Split, session: Session) -> State:
         record, rows = state.problem.record, split.all_train
@@ -48,15 +48,15 @@ class StrengthResidual(Stage):
 
     def continued(self, option: Option, chosen: State) -> Option:
         """Lengths that were searched hold for all rows, too, of which those of a search would be much the same."""
-        if option.name != SEARCHED_LENGTHS:
+        if option.name != BY_SEARCH:
             return option
         assert isinstance(chosen.fitted, Strengths)
-        found = replace(self.settings, lengths=DEFAULT, **asdict(chosen.fitted.field.hyperparameters))
+        found = replace(self.settings, shadowing=DEFAULT, **asdict(chosen.fitted.field.hyperparameters))
 
         def fit(state: State, split: Split, session: Session) -> State:
             state = self._fit(found, state, split, session)
             assert isinstance(state.fitted, Strengths)
-            return replace(state, fitted=replace(state.fitted, lengths=SEARCHED_LENGTHS))
+            return replace(state, fitted=replace(state.fitted, shadowing=BY_SEARCH))
 
         return option._replace(fit=fit)
 

@@ -11,12 +11,12 @@ from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.datasets import load
 from wrf_mi.models import MODELS, Problem, Session
-from wrf_mi.models.interpolation.strengths import LENGTHS, Strengths, StrengthSettings, fit_strengths
+from wrf_mi.models.interpolation.strengths import SHADOWINGS, Strengths, StrengthSettings, fit_strengths
 from wrf_mi.models.model import default_settings, inputs_of
 from wrf_mi.runs.api import train
 from wrf_mi.tasks.scores import REAL_90
 
-LIKELY = StrengthSettings(lengths="likelihood")
+LIKELY = StrengthSettings(shadowing="likelihood")
 FACTOR = 2.5  # of a length by the likelihood of some hundred rows about the true one, either way
 COVERED = (0.84, 0.96)
 """Share inside 90 % of some hundred errors, which shadowing correlates: 0.9 within three standard errors of 2 %."""
@@ -112,6 +112,6 @@ UNCLEAR = 1.05
 def test_held_out_rows_choose_the_lengths(shadow_m: float, extent_m: float, receivers: int, tmp_path: Path) -> None:
     record = area(1, shadow_m, extent_m, receivers)
     chosen = errors_db(record, "kriging", tmp_path / "chosen")[0].mean()
-    of_each = [errors_db(record, "kriging", tmp_path / name, f"lengths={name}")[0].mean() for name in LENGTHS]
+    of_each = [errors_db(record, "kriging", tmp_path / name, f"shadowing={name}")[0].mean() for name in SHADOWINGS]
     assert chosen < UNCLEAR * min(of_each)
     assert max(of_each) > 1.02 * min(of_each)  # else nothing could be chosen wrongly

@@ -59,10 +59,10 @@ EXPONENT_SD = (1.0, 0.3)
 TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
 BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
-Lengths = Literal["default", "searched", "likelihood"]
-LENGTHS: tuple[Lengths, ...] = ("default", "searched", "likelihood")
-DEFAULT, SEARCHED_LENGTHS, LIKELIHOOD = LENGTHS
-"""Origins of hyperparameters, see `StrengthSettings.lengths`."""
+Shadowing = Literal["default", "searched", "likelihood"]
+SHADOWINGS: tuple[Shadowing, ...] = ("default", "searched", "likelihood")
+DEFAULT, BY_SEARCH, LIKELIHOOD = SHADOWINGS
+"""Origins of hyperparameters, see `StrengthSettings.shadowing`."""
 EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
 
 
@@ -75,12 +75,12 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
     Attributes:
         transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
             or 0 dBm without any.
-        lengths: where hyperparameters come from: ``default``, ``searched`` by stretches that are held out, or
+        shadowing: where hyperparameters come from: ``default``, ``searched`` by stretches that are held out, or
             ``likelihood``; null: the one whose predictions of held-out rows have the smallest error.
     """
 
     transmit_dbm: float | None = None
-    lengths: Lengths | None = None
+    shadowing: Shadowing | None = None
     FIXED: ClassVar[Mapping[str, float]] = {
         "receiver_sd_db": RECEIVER_SD_DB,
         "search_rows": 500,
@@ -115,7 +115,7 @@ class Strengths(Fitted):
     shift_db: float
     widen: FloatArray  # factor of each receiver's standard deviations [n_rx]
     fit_facts: dict[str, float]  # numbers of the fit for `facts`
-    lengths: str = DEFAULT  # where hyperparameters come from, see `StrengthSettings`
+    shadowing: str = DEFAULT  # where hyperparameters come from, see `StrengthSettings`
     options: Sequence[Mapping[str, Any]] = ()  # reports of what held-out rows chose from
 
     def __post_init__(self) -> None:
@@ -220,7 +220,7 @@ class Strengths(Fitted):
             "rounds": field.rounds,
             "shift_db": self.shift_db,
             "widen": self.widen,
-            "lengths": self.lengths,
+            "shadowing": self.shadowing,
             "options": json.dumps(list(self.options)),
             "fact.name": np.array(list(self.fit_facts)),
             "fact.value": np.array(list(self.fit_facts.values()), float),
@@ -258,9 +258,9 @@ class Strengths(Fitted):
             spread = from_field_arrays(Hyperparameters, arrays, "spread.")
         field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]), spread)
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
-        lengths = str(arrays.get("lengths", DEFAULT))
+        shadowing = str(arrays.get("shadowing", DEFAULT))
         options = json.loads(str(arrays.get("options", "[]")))
-        return cls(field, float(arrays["shift_db"]), arrays["widen"], facts, lengths, options)
+        return cls(field, float(arrays["shift_db"]), arrays["widen"], facts, shadowing, options)
 
     def facts(self) -> dict[str, Any]:
         """Hyperparameters, calibration, and error on held-out rows."""
@@ -269,7 +269,7 @@ class Strengths(Fitted):
             "traced": self.field.prior.traced is not None,
             "headings": self.field.headings,
             "transmit_dbm": self.field.prior.transmit_dbm,
-            "lengths": self.lengths,
+            "shadowing": self.shadowing,
             **asdict(self.field.hyperparameters),
             "noise_ratio": [float(ratio) for ratio in self.field.ratio],
             "shift_db": self.shift_db,
@@ -297,7 +297,7 @@ def fit_strengths(
         record: signal strengths with a single, known carrier.
         rows: numbers of training rows, in the order of time (`wrf_mi.models.interpolation.strength_fit.folds`).
         power_map: traced power, a local mean or at positions themselves; None: free space is expected.
-        settings: settings; lengths that they leave open are the default ones.
+        settings: settings; hyperparameters whose origin they leave open are the default ones.
         on_progress: progress callback.
         stated: names of the hyperparameters that hold, whatever a search or likelihood chooses for the others; None:
             those that differ from their defaults.
@@ -314,10 +314,10 @@ def fit_strengths(
         raise InputError(f"{record.name}: neither a training row that was received nor a scene; give one of them")
     prior = _prior(record, measured, power_map, settings)
     hyperparameters, stated = settings.hyperparameters, changed(settings) if stated is None else stated
-    lengths = settings.lengths or DEFAULT
-    if len(measured.rows) > 1 and lengths == LIKELIHOOD:
+    shadowing = settings.shadowing or DEFAULT
+    if len(measured.rows) > 1 and shadowing == LIKELIHOOD:
         prior, hyperparameters = by_likelihood(prior, _stops(measured), hyperparameters, stated)
-    elif len(measured.rows) > 1 and lengths == SEARCHED_LENGTHS:
+    elif len(measured.rows) > 1 and shadowing == BY_SEARCH:
         search = Fit(prior, measured, partial(_stops, factor=WIDER), every=2)
         search.set_ratio(hyperparameters)
         hyperparameters = search.search(
@@ -327,7 +327,7 @@ def fit_strengths(
     field = StrengthPosterior(prior, hyperparameters, ones, _stops(measured), ROBUST_ROUNDS)
     # Traces at exact positions have no fades left in what they do not predict.
     shift = 0.0 if power_map is not None and power_map.exact else SKEW_DB
-    strengths = Strengths(field, shift, ones, {"rows": float(len(measured.rows))}, lengths)
+    strengths = Strengths(field, shift, ones, {"rows": float(len(measured.rows))}, shadowing)
     return calibrated(strengths, record, rows, on_progress, stated) if calibrate else strengths
 
 
@@ -346,7 +346,7 @@ def calibrated(
         return strengths
     fit = Fit(prior, measured, _stops)
     fit.set_ratio(hyperparameters)
-    if strengths.lengths != LIKELIHOOD:  # whose hyperparameters are those of a likelihood already
+    if strengths.shadowing != LIKELIHOOD:  # whose hyperparameters are those of a likelihood already
         fit.spread = likely_deviations(prior, field.stops, hyperparameters, stated)
     on_progress("strengths: held-out rows", 0.8)
     mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
