@@ -32,7 +32,7 @@ def errors_of(errors):
 
 def chosen_of(errors, distance_m, fold, unit, trusted=None):
     scores = HeldOutScores(errors_of(errors), distance_m, unit, len(errors))
-    return choose_weights(scores, fold, lambda share: None, trusted)
+    return choose_weights(scores, fold, lambda share: None, trusted)[:2]
 
 
 def chosen(errors):
@@ -79,6 +79,16 @@ def test_a_trusted_prediction_is_left_where_rows_show_a_gain():
     form, mixture = chosen_of(errors, DISTANCE, FOLD, EACH, 1)
     assert form != "single"
     assert mixture(np.array([0.5]))[0, 1] < 0.2
+
+
+def test_weights_without_a_fold_are_not_chosen_by_its_rows():
+    """Each fold alone is best predicted by the part that is worst elsewhere: the others never choose that one."""
+    errors = np.ones((5, ROWS))
+    errors[FOLD, EACH] = 0
+    scores = HeldOutScores(errors_of(errors), DISTANCE, EACH, len(errors))
+    _, _, without = choose_weights(scores, FOLD, lambda share: None)
+    np.testing.assert_allclose(without.sum(axis=1), 1)
+    assert (without[EACH, FOLD] < 1 / 5).all()
 
 
 def test_copies_of_a_row_are_no_evidence():

@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import Field
 
 from ..core import InputError, Prediction, Record, Split
+from ..core.angles import FloatArray
 from ..core.array_files import under
 from ..core.settings import CheckedSettings
 from ..models import MODELS
@@ -220,8 +221,8 @@ class _Fit:
         if self.held_out is None or not len(self.held_out) or not self.predictions:
             chosen = {"form": "alone", "sizes": PREDICTED, "held_out": dict[str, float]()}
             return by_distance.constant(np.eye(count)[0]), None, chosen
-        form, mixture, scores = self._weights(self.held_out)
-        sizes, intervals = self._intervals(self.held_out, mixture)
+        form, mixture, without, scores = self._weights(self.held_out)
+        sizes, intervals = self._intervals(self.held_out, without)
         return mixture, intervals, {"form": form, "sizes": sizes, "held_out": scores}
 
     def _part(self, name: str) -> Fitted:
@@ -276,14 +277,14 @@ class _Fit:
         self.predictions[RESIDUAL] = HeldOutPrediction(np.clip(mean, 0, 1) if self.task.image else mean)
         self.residuals = Residuals.of(left, record, self.split, seed)
 
-    def _weights(self, held_out: HeldOut) -> tuple[str, Mixture, dict[str, float]]:
-        """Form of the weights, the weights, and mean held-out scores of the parts and of the hybrid."""
+    def _weights(self, held_out: HeldOut) -> tuple[str, Mixture, FloatArray, dict[str, float]]:
+        """Form of the weights, the weights, those of held-out rows by the others, and mean held-out scores."""
         means = np.stack([prediction.mean for prediction in self.predictions.values()])
         score, every = self.task.mixtures(means, held_out.observed(self.record)), np.arange(len(held_out))
         # Errors are independent between rows, or where receivers are held out, between these.
         unit = held_out.receiver if self.split.held_receivers else held_out.row
         scores_of = by_distance.HeldOutScores(score, held_out.distance_m, unit, len(means))
-        form, mixture = by_distance.choose_weights(
+        form, mixture, without = by_distance.choose_weights(
             scores_of, held_out.group, partial(self.session.report, "choosing weights"), trusted=0
         )
         sign = 1 if self.task.higher_is_better else -1
@@ -292,11 +293,14 @@ class _Fit:
             for name, alone in zip(self.predictions, np.eye(len(means)), strict=True)
         }
         scores["hybrid"] = sign * float(score(mixture(held_out.distance_m), every).mean())
-        return form, mixture, scores
+        return form, mixture, without, scores
 
-    def _intervals(self, held_out: HeldOut, mixture: Mixture) -> tuple[str, Intervals]:
-        """What the sizes of expected errors are (`STATED` or `PREDICTED`), and intervals calibrated by them."""
-        weights, observed = mixture(held_out.distance_m), held_out.observed(self.record)
+    def _intervals(self, held_out: HeldOut, weights: FloatArray) -> tuple[str, Intervals]:
+        """What the sizes of expected errors are (`STATED` or `PREDICTED`), and intervals calibrated by them.
+
+        ``weights`` [q, k] are those that each held-out row has not chosen: intervals are cross-fitted over the groups.
+        """
+        observed = held_out.observed(self.record)
         mean = np.einsum("qk,kq...->q...", weights, np.stack([each.mean for each in self.predictions.values()]))
         stds = [each.std for each in self.predictions.values() if each.std is not None]
         sizes, size, unit = PREDICTED, by_distance.expected_size(self.task, Prediction(mean)), np.ones((), np.float32)

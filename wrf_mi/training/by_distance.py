@@ -229,8 +229,11 @@ FORMS: Mapping[str, Callable[[HeldOutScores, IntArray], Mixture]] = {
 
 def choose_weights(
     scores: HeldOutScores, fold: IntArray, on_fold: Callable[[float], None], trusted: int | None = None
-) -> tuple[str, Mixture]:
+) -> tuple[str, Mixture, FloatArray]:
     """The form of the weights that predicts held-out scores best, fitted to all held-out observations.
+
+    The weights [q, k] of each observation by the fits of this form without its fold are returned, too: errors of other
+    rows are those of weights that these rows have not chosen.
 
     Each form is fitted without the observations of a fold and scored on them; a form with more freedom is taken where
     its mean score is better by more than the standard error of the difference over independent units: the receivers of
@@ -247,16 +250,18 @@ def choose_weights(
         forms = {SINGLE: lambda scores, rows: constant(np.eye(scores.count)[trusted])} | forms
     folds, every = np.unique(fold), np.arange(len(fold))
     of_forms = {name: np.full(len(fold), np.nan) for name in forms}
+    without = {name: np.empty((len(fold), scores.count)) for name in forms}
     for done, number in enumerate(folds):
         out = fold == number
         for name, form in forms.items():
             # A single fold cannot be left out: forms are then scored on the rows that they are fitted to.
             mixture = form(scores, every[~out] if len(folds) > 1 else every)
-            of_forms[name][out] = scores.score(mixture(scores.distance_m[out]), every[out])
+            without[name][out] = mixture(scores.distance_m[out])
+            of_forms[name][out] = scores.score(without[name][out], every[out])
         on_fold((done + 1) / len(folds))
     means = ((name, unit_means(values, scores.unit)) for name, values in of_forms.items())
     best = last_gain(means, True, {SINGLE: DOUBT})
-    return best, forms[best](scores, every)
+    return best, forms[best](scores, every), without[best]
 
 
 def unit_means(values: FloatArray, unit: IntArray) -> FloatArray:
