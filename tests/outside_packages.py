@@ -1,4 +1,4 @@
-"""Packages of others with a model, a receiver model, a benchmark, a task and a layout, and commands that find them."""
+"""Packages of others with a model, a receiver model, a benchmark, a task, a layout and a loss, and commands that find them."""
 
 import json
 import os
@@ -108,7 +108,22 @@ def read(path, name):
 
 LAYOUT = Layout("delays", TASK.name, read, files=("delays.csv",))
 """
-SOURCES = {"nearest_of_others": NEAREST, "attenuators": ATTENUATORS, "delays_of_others": DELAYS}
+HUBER = """
+import drjit as dr
+
+LIMIT = 3.0  # dB up to which errors count as squares
+
+def huber(prediction, truth, batch, *shape):
+    known = dr.isfinite(truth)
+    error = dr.abs(prediction - dr.select(known, truth, prediction))
+    return dr.mean(dr.select(error < LIMIT, dr.square(error) / 2, LIMIT * (error - LIMIT / 2)))
+"""
+SOURCES = {
+    "nearest_of_others": NEAREST,
+    "attenuators": ATTENUATORS,
+    "delays_of_others": DELAYS,
+    "losses_of_others": HUBER,
+}
 ENTRY_POINTS = """
 [wrf_mi.models]
 nearest = nearest_of_others:MODEL
@@ -120,6 +135,8 @@ attenuator = attenuators:CHECK
 delay-spread = delays_of_others:TASK
 [wrf_mi.layouts]
 delays = delays_of_others:LAYOUT
+[wrf_mi.losses]
+huber = losses_of_others:huber
 """
 CALLS = """
 import contextlib, io, json, sys

@@ -25,6 +25,7 @@ from wrf_mi.graph import receivers
 from wrf_mi.graph.receivers import RECEIVERS
 from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
+from wrf_mi.tasks import LOSSES
 
 SETTINGS = ("steps=60", "batch=8", "validate_every=20", "checkpoint_every=20", "initial.gaussians=6")
 SETTINGS += ("network.layers=2", "network.width=8", "view.height=4", "view.columns=8", "deterministic=true")
@@ -93,6 +94,48 @@ def test_registered_receiver_is_trained_resumed_evaluated_and_compared(attenuate
     assert compare([out], tmp_path / "page")
 
 
+@pytest.fixture
+def noted_loss() -> Iterator[list[int]]:
+    """A loss of the name ``noted``, the squared error, which notes the shapes that it is called with."""
+    shapes = list[tuple[int, ...]]()
+
+    def loss(prediction: Any, truth: Any, batch: int, *shape: int) -> Any:
+        shapes.append((batch, *shape))
+        return LOSSES["squared-error"](prediction, truth, batch, *shape)
+
+    LOSSES.add("noted", loss)
+    yield shapes
+    del LOSSES._known["noted"]
+
+
+def test_loss_of_a_name_is_trained_resumed_stored_and_compared(noted_loss, flat_folder: Path, tmp_path: Path) -> None:
+    asked = {"settings": SETTINGS, "loss": "noted"}
+    with pytest.raises(Interrupted):
+        train(flat_folder, "wrf-gs+", out=tmp_path / "run", **asked, stop=stop_after(2))
+    assert noted_loss
+    noted_loss.clear()
+    run = resume(tmp_path / "run")
+    assert noted_loss, "a resumed training has the loss that it began with"
+    whole = train(flat_folder, "wrf-gs+", out=tmp_path / "whole", **asked)
+    assert run.metrics["abs_error_db"] == whole.metrics["abs_error_db"] == evaluate_run(run.folder)["abs_error_db"]
+    other = train(flat_folder, "wrf-gs+", out=tmp_path / "other", settings=SETTINGS)
+    assert other.metrics["abs_error_db"] != whole.metrics["abs_error_db"]
+    squared = train(flat_folder, "wrf-gs+", out=tmp_path / "squared", settings=SETTINGS, loss="squared-error")
+    assert squared.metrics["abs_error_db"] == whole.metrics["abs_error_db"]
+    assert np.isfinite(open_run(run.folder).predict([[1.0, 2.0, 1.3]], 0).mean).all()
+    assert compare([run.folder, other.folder], tmp_path / "page")
+
+
+def test_unknown_losses_and_models_without_one_are_refused(flat_folder: Path, folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="loss 'hubber': no such loss; choose from absolute-error, squared-error"):
+        train(flat_folder, "wrf-gs+", out=tmp_path / "run", loss="hubber")
+    with pytest.raises(InputError, match=r"belongs to fields of Gaussians \(.*wrf-gs\+.*\), not to kriging"):
+        train(flat_folder, "kriging", out=tmp_path / "run", loss="squared-error")
+    with pytest.raises(InputError, match=r"loss.ssim_weight.*in whose place loss\.name is"):
+        train(folder, "wrf-gs", out=tmp_path / "run", loss="squared-error", settings=("loss.ssim_weight=0.3",))
+    assert not (tmp_path / "run").exists()
+
+
 def test_receiver_of_another_task_or_unknown_is_refused(attenuated, flat_folder: Path, tmp_path: Path) -> None:
     for name, reason in (("pixel", "pixel does not report rssi"), ("horn", "'horn': unknown")):
         with pytest.raises(InputError, match=f"receiver model {reason}; choose from power, attenuated"):
@@ -114,6 +157,7 @@ def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[
     words = [word for setting in SETTINGS for word in ("--set", setting)]
     asked = ["--model", "wrf-gs+", "--receiver-model", "attenuated", "--json", *words, "--out", folder / "attenuated"]
     nearest = ["--model", "nearest", "--set", "neighbours=1", "--json", "--out", folder / "nearest"]
+    by_loss = ["--set", "loss.name=huber", "--json", *words, "--out", folder / "huber"]
     models = ("idw", "kriging", "hybrid", *SERVED)
     results = commands(
         environment,
@@ -121,6 +165,7 @@ def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[
         | {
             "nearest": ["train", flat_folder, *nearest],
             "receiver": ["train", flat_folder, "--model", "wrf-gs+", *asked],
+            "loss": ["train", flat_folder, "--model", "wrf-gs+", *by_loss],
         },
     )
     for name in ("nearest/model.npz", "nearest/metrics.json", "nearest/predictions.npz", "idw/metrics.json"):
@@ -154,6 +199,12 @@ def test_commands_find_the_receiver_and_the_benchmark_of_an_installed_package(ou
     stored = json.loads((folder / "results" / "attenuator.json").read_text())
     assert stored["figures"]["rows"] == [{"what": "attenuation", "value": "17.0 dB", "asked": "17 dB"}]
     assert "attenuation" in (folder / "results" / "README.md").read_text()
+
+
+def test_commands_find_the_loss_of_an_installed_package(outcome: Any) -> None:
+    folder, results = outcome
+    assert results["loss"][0] == 0, results["loss"]
+    assert "name: huber" in (folder / "huber" / "config.yaml").read_text()
 
 
 def test_commands_find_the_task_and_the_layout_of_an_installed_package(outcome: Any) -> None:

@@ -21,7 +21,7 @@ from ..checking import warn_of_suspicions
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
-from ..core.settings import setting_texts, stated_values
+from ..core.settings import names_of, setting_texts, stated_values
 from ..datasets import make_splits
 from ..datasets.observations import (
     LEAST_ROWS,
@@ -66,6 +66,8 @@ if TYPE_CHECKING:
     import xarray
 
 logger = logging.getLogger(__name__)
+
+LOSS = "loss"  # setting of fields of Gaussians that names their loss
 
 
 def plan_run(
@@ -129,12 +131,14 @@ def _settings_of(model: Model, request: RunRequest) -> tuple[Any, frozenset[str]
     if is_dataclass(stated) and not isinstance(stated, type):
         if request.preset is not None:
             raise InputError(f"preset {request.preset}: the settings state all values; give one of both")
+        if request.loss is not None:
+            raise InputError(f"loss {request.loss}: the settings state all values; state it as loss.name there")
         if not issubclass(kind, type(stated)):
             raise InputError(f"settings of {model.name}: {type(stated).__name__}; give {kind.__name__}")
         settings: Any = kind(**{field.name: getattr(stated, field.name) for field in fields(stated)})
     else:
         assert isinstance(stated, Iterable)
-        texts = [*(setting_texts(stated) if isinstance(stated, Mapping) else stated)]
+        texts = [*(setting_texts(stated) if isinstance(stated, Mapping) else stated), *_loss_text(model, request.loss)]
         preset, given = _preset(model, request.preset), {name: getattr(request, name) for name in GIVEN}
         settings = default_settings(model, [*preset, *texts], given)
         names = frozenset(stated_values(settings, texts))
@@ -147,6 +151,16 @@ def _settings_of(model: Model, request: RunRequest) -> tuple[Any, frozenset[str]
     if "model" in model.train_arguments and settings.model != model.name:
         raise InputError(f"setting model: {settings.model}, where the model is {model.name}; choose it with --model")
     return settings, names
+
+
+def _loss_text(model: Model, name: str | None) -> list[str]:
+    """The setting that a loss of a name is."""
+    if name is None:
+        return []
+    if LOSS not in names_of(model.settings):
+        able = ", ".join(other.name for other in MODELS.values() if LOSS in names_of(other.settings))
+        raise InputError(f"loss {name}: belongs to fields of Gaussians ({able}), not to {model.name}")
+    return [f"{LOSS}.name={name}"]
 
 
 def _preset(model: Model, name: str | None) -> tuple[str, ...]:
@@ -213,6 +227,7 @@ def train(
     antennas: AntennaOptions = AS_STATED,
     receiver: str | None = None,
     evaluation: str | None = None,
+    loss: str | None = None,
     split: str | Split | None = None,
     n_train: int | float | None = None,
     seed: int = 0,
@@ -238,6 +253,7 @@ def train(
         antennas: patterns and polarisations that override the data set; with a scene.
         receiver: ``"pixel"``, ``"array"`` or ``"auto"``, for models that have a choice.
         evaluation: evaluation of Gaussians, ``"splatted"`` or ``"traced"`` (`wrf_mi.graph.evaluations`).
+        loss: name of a loss of the training (`wrf_mi.tasks.LOSSES`), for fields of Gaussians; None: the task's.
         split: name of a split (``blocked`` fits every fold in turn and pools the scores; ``none`` then fits all rows),
             or the rows themselves; None: ``official``, or ``none`` where the data have no split.
         n_train: number or fraction of the training rows to use; None: all.
@@ -274,7 +290,9 @@ def train(
         init("llvm", threads=1)
     place = scene.folder if isinstance(scene, Scene) else scene
     what = RunRequest(model, place, material, antennas, receiver, evaluation, split, n_train, seed, settings)
-    request = replace(what, deterministic=deterministic, intervals=intervals, min_rows=min_rows, preset=preset)
+    request = replace(
+        what, deterministic=deterministic, intervals=intervals, min_rows=min_rows, preset=preset, loss=loss
+    )
     data = data if isinstance(data, str | Path | Record) else load_record(data)
     problem, config, splits = plan_run(data, request, progress, on_progress)
     warn_of_suspicions(problem.record)

@@ -75,6 +75,7 @@ class RunRequest:
     intervals: bool = False
     min_rows: int | None = None
     preset: str | None = None
+    loss: str | None = None
 
 
 @dataclass(frozen=True)

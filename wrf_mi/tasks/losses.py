@@ -25,12 +25,15 @@ BORDER = WINDOW - 1
 LEAST_LIGHT = 1e-3  # light of a spectrum that counts as none: a quarter of one grey level of 8 bits in one pixel
 
 
-def absolute_error(prediction: Any, truth: Any) -> Any:
-    """Mean absolute difference over received observations, a Dr.Jit float of one value; 0 without any."""
+def absolute_error(prediction: Any, truth: Any, *shape: int) -> Any:
+    """Mean absolute difference over received observations, a Dr.Jit float of one value; 0 without any.
+
+    Batch and shape of an observation, which other losses need, change nothing.
+    """
     return _mean_error(dr.abs, prediction, truth)
 
 
-def squared_error(prediction: Any, truth: Any) -> Any:
+def squared_error(prediction: Any, truth: Any, *shape: int) -> Any:
     """Mean squared difference, likewise."""
     return _mean_error(dr.square, prediction, truth)
 

@@ -161,9 +161,14 @@ class DensityConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Loss of spectra: (1 - eta) D + eta (1 - SSIM), after the WRF-GS papers (`wrf_mi.tasks.losses.spectrum_loss`)."""
+    """Loss of the training.
+
+    By default that of the task, of spectra (1 - eta) D + eta (1 - SSIM), after the WRF-GS papers
+    (`wrf_mi.tasks.losses.spectrum_loss`).
+    """
 
     ssim_weight: Share = 0.2  #: eta
+    name: str | None = None  #: name of a loss (`wrf_mi.tasks.LOSSES`); null: the task's
 
 
 PATHS_ALONE = "ray-tracing"  # name of the model that trains the paths of a scene without Gaussians
@@ -184,7 +189,7 @@ class TrainConfig(LoopConfig):
         model: ``"wrf-gs"``, ``"wrf-gs+"`` or ``"factorised"``.
         seed: seed of starting values and of the order of rows.
         deterministic: bit-identical results from run to run, on one thread of the CPU.
-        loss: loss of images.
+        loss: loss of the training.
         receiver: receiver model (`wrf_mi.graph.receivers`). For spectra ``"pixel"``: magnitude at each direction (the
             papers'), ``"array"``: the Bartlett spectrum of the array's element signals, scaled as the instrument does;
             ``"auto"``: array with a scene, else pixel. For signal strengths ``"power"``, for channels ``"csi"``.

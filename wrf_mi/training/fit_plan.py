@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from ..datasets.observations import LARGEST, check_observations, computable
 from ..gaussians import FIELDS, Encoding, random_gaussians
 from ..graph.graph import Field, Graph
 from ..graph.receivers import AUTO, Form, receiver_kind
-from ..tasks import task_of
+from ..tasks import Loss, known_loss, task_of
 from ..tasks.conditions import normalised_uplink, outputs_of, placed_receivers
 from ..tracing.paths.traced_field import TracedField
 from .adam import Schedule, density_rounds, plan
@@ -280,6 +280,7 @@ class FitPlan:
         choosing: split of these rows, or, where Gaussians alone train, of validation rows as far from training rows as
             test rows (`hold_out_far`); ``split`` itself where there are none.
         unjudged: whether the training rows do not suffice for such groups.
+        loss: loss of a batch.
         known: slots of the traced sides by port: conditions that train or choose at its carrier.
 
     Raises:
@@ -290,7 +291,10 @@ class FitPlan:
         self, record: Record, split: Split, config: TrainConfig, field: Field | None = None, scene: Any | None = None
     ) -> None:
         check_rows(split, record, f"split {split.name}")
-        self.task = task_of(record)
+        self.task, name = task_of(record), config.loss.name
+        self.loss: Loss = (
+            partial(self.task.loss, ssim_weight=config.loss.ssim_weight) if name is None else known_loss(name)
+        )
         check_observations(record, split, complete=self.task.image)
         rows = split.all_train
         config = config.resolved(record.tx_pos_m[rows])

@@ -24,13 +24,12 @@ from ..core import InputError, Receiver
 from ..gaussians.tiles import TiledPlane, perception_plane
 from ..graph.graph import LEVEL, Batch, Graph, Report
 from ..graph.settings import TRACED_NAMES
+from ..tasks import Loss
 from ..tracing.paths.traced_field import TracedField
 from .adam import NonFiniteReport, Params, Schedule, ScheduledStep, guarded_step, rated_params
 from .fit_plan import FIELD, FitPlan, Targets
 from .loop import FitState
 
-Loss = Callable[..., Any]
-"""``loss(prediction, truth, batch, *shape)`` of flat arrays in the receiver's unit, a Dr.Jit float of one value."""
 StepFunction = Callable[..., tuple[Params, NonFiniteReport, Any, Any]]
 """Takes a step of an optimiser in place, by `Steps._recorded`; returns running mean, report, loss of the batch before
 the step, and norm of the gradient by each Gaussian's direction from the receiver, [n]."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from ..core.types import IntArray
 from ..gaussians import InitialGaussians
 from ..gaussians.initial import adapt, reset_opacity
 from ..graph.graph import Field, Graph
+from ..tasks import Loss
 from ..tracing.paths.traced_field import TracedField
 from .adam import NonFiniteReport
 from .by_distance import Reach, choose_reach
@@ -28,7 +28,7 @@ from .initial import starting_values
 from .loop import FitState, TrainingLoop
 from .predictor import Predictor
 from .selection import improves
-from .step import Loss, Steps
+from .step import Steps
 
 PHASE_ERRORS = (0.5, 1.0, 1.5)  # phase errors that are tried, rad: beyond, a reflection knows nothing of its phase
 
@@ -220,7 +220,7 @@ class Trainer(TrainingLoop):
         initial: starting values that replace those of ``config.initial``.
         state: state of a stopped fit, to resume from.
         loss: ``loss(prediction, truth, batch, *shape)`` of flat Dr.Jit arrays in the receiver's unit, NaN in the truth
-            where nothing was received; None: the task's loss.
+            where nothing was received; None: that of the plan.
         scene: scene of `wrf_mi.tracing.open_scene` at the record's carrier, whose paths are trained together with the
             Gaussians. None: Gaussians alone.
         plan: plan of the fit, of the arguments above; None: it is made of them.
@@ -260,7 +260,7 @@ class Trainer(TrainingLoop):
         # Traced once: the positions of training rows do not change, only what the paths meet.
         self.sides = plan.traced()
         self.selection = StageSelection(plan, self.sides)
-        self.steps = Steps(plan, self.sides, loss or partial(plan.task.loss, ssim_weight=config.loss.ssim_weight))
+        self.steps = Steps(plan, self.sides, loss or plan.loss)
         self._predictor: Predictor | None = None
         if state is None:
             plan.graph.check_polarization(record.tx_pos_m[split.all_train])

@@ -211,6 +211,8 @@ def _unused_of_gaussians(plan: FitPlan, name: str) -> dict[str, str]:
         unused |= dict.fromkeys(
             ("encoding.tx_octaves", "encoding.tx_scale_m"), "transmitters are known by their uplink"
         )
+    if s.loss.name is not None:
+        unused["loss.ssim_weight"] = f"of the loss of {task.name}, in whose place loss.name is"
     if not task.image:
         unused["loss.ssim_weight"] = f"of images, and the data hold {task.name}"
     unused |= {"view": "observations are spectra, with directions of their own"} if task.image else {}
