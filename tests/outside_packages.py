@@ -1,4 +1,4 @@
-"""Packages of others with a model, a receiver model, a benchmark, a task, a layout and a loss, and commands that find them."""
+"""Packages of others with models, receivers, benchmarks, tasks, layouts and losses, and commands that find them."""
 
 import json
 import os
