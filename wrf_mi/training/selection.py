@@ -40,7 +40,7 @@ number of groups of held-out observations."""
 MOST_OBSERVATIONS, MOST_VALUES = (200, 600), 20_000
 """Largest number of held-out observations that weights and intervals are chosen from: 600 single numbers, fewer of many
 values, but 200."""
-FINEST = 7  # times that the number of clusters is doubled, whose distances then fall to an eighth in the plane
+LEAST_AWAY_M = 1e-3  # distance below which test rows are at places of training rows
 MOST_PAIRS = 3000  # largest number of held-out pairs of a receiver and a row, received or not
 
 
@@ -90,26 +90,41 @@ def clusters(positions_m: FloatArray, count: int, rng: np.random.Generator) -> I
         return np.asarray(kmeans2(positions_m, count, iter=50, minit="++", missing="warn", rng=rng)[1], np.int64)
 
 
+def cells(places_m: FloatArray, count: int) -> IntArray:
+    """Number of the cell of each place [n, 3]: cells are halved along their widest side until there are ``count``."""
+    parts = [np.arange(len(places_m))]
+    while len(parts) < count and max(map(len, parts)) > 1:
+        halves = list[IntArray]()
+        for rows in parts:
+            order = rows[np.argsort(places_m[rows, np.ptp(places_m[rows], axis=0).argmax()], kind="stable")]
+            halves += [half for half in np.array_split(order, 2) if len(half)]
+        parts = halves
+    label = np.empty(len(places_m), np.int64)
+    for number, rows in enumerate(parts):
+        label[rows] = number
+    return label
+
+
 def hold_out_groups(split: Split, tx_pos_m: FloatArray, groups: int = GROUPS) -> Split:
     """The split with clusters of its training rows moved to the validation rows, seeded by the split.
 
     Args:
         split: split of a record.
         tx_pos_m: positions of all rows [n, 3], metres.
-        groups: largest number of clusters; of more than `GROUPS` the smallest are single places.
+        groups: number of clusters, at most; more than `GROUPS` are `cells`, the smallest of which are single places.
 
     Returns:
         A split with validation rows near training rows and far from them; ``split`` itself if its rows are too few.
     """
     rows: IntArray = split.train
-    places, place = np.unique(tx_pos_m[rows], axis=0, return_inverse=True)
-    count = min(groups, len(places)) if groups > GROUPS else min(GROUPS, len(rows) // ROWS_OF_GROUP, len(places))
+    places_m, place = np.unique(tx_pos_m[rows], axis=0, return_inverse=True)
+    count = min(groups, len(places_m)) if groups > GROUPS else min(GROUPS, len(rows) // ROWS_OF_GROUP, len(places_m))
     if count < 2:
         return split
-    rng = np.random.default_rng([split.seed, 3])
-    out = np.zeros(len(rows), bool)
-    labels = place.reshape(-1) if count == len(places) else clusters(tx_pos_m[rows], count, rng)
-    for group in rng.permutation(count):
+    rng, out = np.random.default_rng([split.seed, 3]), np.zeros(len(rows), bool)
+    fine = groups > GROUPS
+    labels = cells(places_m, count)[place.reshape(-1)] if fine else clusters(tx_pos_m[rows], count, rng)
+    for group in rng.permutation(max(count, int(labels.max()) + 1)):
         more = out | (labels == group)
         # The first cluster may be larger than the share: without any, nothing could be chosen.
         if more.mean() <= (HELD_OUT if out.any() else MOST_HELD_OUT):
@@ -196,25 +211,26 @@ def _as_far_as_tested(split: Split, tx_pos_m: FloatArray) -> Split:
 
     Without test positions, or with those of training rows, clusters are the largest: rows are predicted anywhere.
     """
-    rows = split.all_train
-    coarse = hold_out_groups(split, tx_pos_m)
-    if coarse is split or not len(split.test):
+    test, coarse = split.test[np.isfinite(tx_pos_m[split.test]).all(axis=1)], hold_out_groups(split, tx_pos_m)
+    if coarse is split or not len(test):
         return coarse
 
-    def away_m(test: IntArray, known: IntArray) -> float:
-        return float(np.median(cKDTree(tx_pos_m[known]).query(tx_pos_m[test])[0]))
+    def away_m(rows: IntArray, known: IntArray) -> float:
+        return max(float(np.median(cKDTree(tx_pos_m[known]).query(tx_pos_m[rows])[0])), np.finfo(float).tiny)
 
-    wanted, most = away_m(split.test, rows), len(np.unique(tx_pos_m[split.train], axis=0))
-    best, nearest = coarse, away_m(coarse.validation, coarse.train)
-    counts = [count for count in (GROUPS * 2 ** np.arange(1, FINEST + 1)).tolist() if count < most] + [most]
-    for count in counts:
-        # Distances fall with the number of clusters.
-        if nearest <= wanted:
-            break
+    wanted, best, most = away_m(test, split.all_train), coarse, len(np.unique(tx_pos_m[split.train], axis=0))
+    nearest, count = away_m(best.validation, best.train), GROUPS
+    if wanted < LEAST_AWAY_M:
+        return coarse
+    # Distances fall with the number of clusters.
+    while nearest > wanted and count < most:
+        count *= 2
         fine = hold_out_groups(split, tx_pos_m, count)
         away = away_m(fine.validation, fine.train)
         if abs(np.log(away / wanted)) < abs(np.log(nearest / wanted)):
             best, nearest = fine, away
+        elif away < wanted:
+            break
     return best
 
 
