@@ -17,6 +17,7 @@ from made_spectra import SIZE
 from small_fits import official, settings, stop_after
 
 from wrf_mi.backend import set_threads
+from wrf_mi.cli.main import main
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.datasets import load, load_split, make_splits, save_split, write_spectrum_folder
 from wrf_mi.runs.api import Interrupted, Run, evaluate_run, open_run, resume, train
@@ -370,3 +371,19 @@ def test_custom_split_is_trained(one_gateway: Record, tmp_path: Path) -> None:
     # Standard JSON knows no NaN.
     for name in ("log.jsonl", "metrics.json"):
         assert "NaN" not in (run.folder / name).read_text()
+
+
+def test_positions_where_predictions_are_wanted_are_kept_with_the_split(flat_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "there.csv").write_text("x,y,z\n1,2,1\n3,1,2\n")
+    words = ["train", str(flat_folder), "--model", "kriging", "--for", str(tmp_path / "there.csv")]
+    assert main([*words, "--out", str(tmp_path / "run")]) == 0
+    split = load_split(tmp_path / "run" / "split.npz")
+    np.testing.assert_array_equal(split.wanted_m, [[1, 2, 1], [3, 1, 2]])
+
+
+def test_wanted_positions_of_other_tasks_or_files_are_refused(flat_folder: Path, folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds spectrum; positions shape the hold-out of rssi"):
+        train(folder, out=tmp_path / "run", wanted=np.zeros((2, 3)))
+    with pytest.raises(InputError, match=r"positions \(0, 3\); give finite x, y, z"):
+        train(flat_folder, out=tmp_path / "run", wanted=np.zeros((0, 3)))
+    assert not (tmp_path / "run").exists()

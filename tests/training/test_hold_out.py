@@ -1,5 +1,7 @@
 """The hold-out of signal strengths: as far from the other rows as test rows are from training rows, places together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -72,3 +74,15 @@ def test_cells_are_equal_parts(places: int, count: int, seed: int) -> None:
     assert sizes.min() >= 1
     assert sizes.max() - sizes.min() <= 1 + np.log2(max(places, 2)) / 2
     assert len(sizes) >= min(count, places) or sizes.max() == 1
+
+
+def test_wanted_positions_shape_the_hold_out_in_place_of_test_rows() -> None:
+    rng = np.random.default_rng(0)
+    tx_pos_m = np.column_stack([rng.uniform(0, 40, (400, 2)), np.full(400, 1.5)])
+    rows = np.arange(400)
+    wanted_m = tx_pos_m[:50] + [0, 0, 3.0]
+    split = Split("made", 0, rows[80:], rows[:0], rows[:80])
+    fold, by_test = (hold_out(record_of(tx_pos_m), each) for each in (replace(split, wanted_m=wanted_m), split))
+    assert fold is not None
+    assert by_test is not None
+    assert away_m(tx_pos_m, fold.test, fold.all_train) > 1.5 * away_m(tx_pos_m, by_test.test, by_test.all_train)

@@ -58,6 +58,8 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
         _show_stages(metrics["stages"], task.label, metrics.get("held_out", {}))
     if metrics.get("options"):
         _show_options(metrics["options"], task.label)
+        if "hold_out" in metrics:
+            print(f"held-out training rows are {metrics['hold_out']}")
     _show_receivers(metrics)
     if "inside_90" in metrics:
         share = f"{metrics['inside_90']:.0%} of the test values lie inside the predicted 90 % intervals"

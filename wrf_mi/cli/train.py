@@ -49,6 +49,10 @@ def _add_train(commands: Any) -> None:
     add_training(parser)
     parser.add_argument("--out", metavar="RUN", help="run folder to make")
     add_replace(parser)
+    text = (
+        "CSV of positions (x,y,z in metres) where predictions are wanted: training rows as far from the others choose"
+    )
+    parser.add_argument("--for", dest="wanted", metavar="FILE", help=f"{text} (of rssi; default: as the test rows)")
     parser.add_argument("--help-settings", action="store_true", help="list all settings with their defaults, and exit")
     parser.add_argument("--resume", metavar="RUN", help="run folder of a stopped run to go on with")
 
@@ -98,6 +102,7 @@ def training_request(a: Arguments) -> RunRequest:
     settings = [*_tracing_settings(a, model), *_stages(a, model), *a.set]
     names = ("scene", "material", "evaluation", "n_train", "min_rows", "deterministic", "intervals", "preset", "split")
     request = {name: getattr(a, name) for name in names} | {"receiver": a.receiver_model, "seed": a.seed or 0}
+    request["wanted"] = getattr(a, "wanted", None)  # an option of train alone
     return RunRequest(model, settings=settings, antennas=antenna_options(a), **request)
 
 

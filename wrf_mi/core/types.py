@@ -297,7 +297,8 @@ class Split:
     With ``held_receivers``, numbers of receivers, models see no observation of these but those of ``left``, pairs of
     such a receiver and a training row [q, 2], and scores are of these receivers alone.
     ``validation`` rows are training data, kept apart from ``train`` while settings are chosen; the final fit uses both
-    (``all_train``).
+    (``all_train``). ``wanted_m`` are positions where predictions are wanted [k, 3], metres, by which held-out training
+    rows are chosen; without any those of the test rows are.
 
     >>> Split("mine", 0, train=np.array([0, 3]), validation=np.array([1]), test=np.array([2])).all_train
     array([0, 1, 3])
@@ -310,6 +311,7 @@ class Split:
     test: IntArray
     held_receivers: tuple[int, ...] = ()
     left: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    wanted_m: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def at_receivers(self, receivers: Sequence[int] | IntArray) -> Split:
         """The split of `Record.at_receivers`, for numbers of receivers in ascending order.

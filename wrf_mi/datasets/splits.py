@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,9 +163,12 @@ def save_split(path: str | Path, split: Split) -> None:
     """Write a split as an npz file of plain arrays (no pickle), atomically.
 
     Keys: ``format``, ``name``, ``seed``, ``train``, ``validation``, ``test`` (rows from 0), and of splits that hold out
-    receivers ``held_receivers`` (numbers from 0) and ``left`` (pairs of such a receiver and a row that trains).
+    receivers ``held_receivers`` (numbers from 0) and ``left`` (pairs of such a receiver and a row that trains), and
+    where they are stated ``wanted_m`` (positions where predictions are wanted, metres).
     """
-    parts = {"train": split.train, "validation": split.validation, "test": split.test}
+    parts: dict[str, NDArray[Any]] = {"train": split.train, "validation": split.validation, "test": split.test}
+    if len(split.wanted_m):
+        parts["wanted_m"] = split.wanted_m
     if split.held_receivers:
         parts["held_receivers"] = np.asarray(split.held_receivers, np.int64)
         parts["left"] = split.left
@@ -182,14 +185,16 @@ def load_split(path: str | Path) -> Split:
     remedy = "give a split.npz of a run folder"
     with readable(Path(path), f"{path}: missing; {remedy}", remedy):
         none_held_out = {"held_receivers": np.zeros(0, np.int64), "left": np.zeros((0, 2), np.int64)}
-        arrays = none_held_out | stored_arrays(Path(path))
+        arrays = none_held_out | {"wanted_m": np.zeros((0, 3))} | stored_arrays(Path(path))
         version, name, seed, *lists = (arrays[key] for key in ("format", "name", "seed", *PARTS, "left"))
     if version != SPLIT_FORMAT:
         raise InputError(f"{path}: format {version}, not {SPLIT_FORMAT}; use the version that wrote it")
     _check_rows(path, lists)
     train, validation, test, left = (part.astype(np.int64) for part in lists)
     held_receivers = np.ravel(arrays["held_receivers"]).astype(int)
-    split = Split(str(name), int(seed), train, validation, test, tuple(held_receivers.tolist()), left)
+    split = Split(
+        str(name), int(seed), train, validation, test, tuple(held_receivers.tolist()), left, arrays["wanted_m"]
+    )
     if not (np.isin(left[:, 0], held_receivers).all() and np.isin(left[:, 1], split.all_train).all()):
         raise InputError(f"{path}: leaves rows that no held-out receiver trains on; make the split again")
     return split

@@ -19,10 +19,12 @@ from threadpoolctl import threadpool_limits
 from ..backend import init
 from ..checking import warn_of_suspicions
 from ..core import AntennaOptions, InputError, Record, Split
+from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
 from ..core.settings import names_of, setting_texts, stated_values
 from ..datasets import make_splits
+from ..datasets.folder_files import read_positions
 from ..datasets.observations import (
     LEAST_ROWS,
     check_observations,
@@ -39,7 +41,7 @@ from ..models.receiver_places import check_placeable, placed_problem, tell_place
 from ..parallel import Scheduler
 from ..scene.correction_data import read_correction_data
 from ..synthetic import load_record
-from ..tasks import TASKS
+from ..tasks import TASKS, task_of
 from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
 from ..training.fit_plan import check_rows
 from ..training.session import Interrupted, OnProgress, quiet
@@ -84,6 +86,8 @@ def plan_run(
         seed, deterministic = settings.seed, settings.deterministic
     split = _split_of(record, request)
     record, splits, left_out = _split_rows(record, split, seed, request.n_train, _least_rows(record, request))
+    if request.wanted is not None:
+        splits = [replace(rows, wanted_m=_wanted_m(record, request.wanted)) for rows in splits]
     for rows in splits:
         check_held_receivers(record, rows, model, MODELS.values())
         check_observations(record, rows, model.complete, may_be_silent=TASKS[record.task].in_decibel)
@@ -99,6 +103,16 @@ def plan_run(
     check_stated(config.entry, placed, splits)
     tell_places(placed)
     return problem, config, splits
+
+
+def _wanted_m(record: Record, wanted: str | Path | FloatArray) -> FloatArray:
+    """Positions where predictions are wanted; `InputError`: none, or a task whose hold-out does not depend on them."""
+    if not task_of(record).in_decibel:
+        raise InputError(f"--for: {record.name} holds {record.task}; positions shape the hold-out of rssi; omit it")
+    positions_m = np.asarray(read_positions(Path(wanted)).positions_m if isinstance(wanted, str | Path) else wanted)
+    if positions_m.ndim != 2 or positions_m.shape[1] != 3 or not np.isfinite(positions_m).all() or not len(positions_m):
+        raise InputError(f"--for: positions {positions_m.shape}; give finite x, y, z in metres in each row")
+    return positions_m.astype(float)
 
 
 def _serving_model(record: Record, request: RunRequest) -> Model:
@@ -229,6 +243,7 @@ def train(
     evaluation: str | None = None,
     loss: str | None = None,
     split: str | Split | None = None,
+    wanted: str | Path | FloatArray | None = None,
     n_train: int | float | None = None,
     seed: int = 0,
     settings: Settings = (),
@@ -256,6 +271,9 @@ def train(
         loss: name of a loss of the training (`wrf_mi.tasks.LOSSES`), for fields of Gaussians; None: the task's.
         split: name of a split (``blocked`` fits every fold in turn and pools the scores; ``none`` then fits all rows),
             or the rows themselves; None: ``official``, or ``none`` where the data have no split.
+        wanted: positions where predictions are wanted, [k, 3] in metres or a CSV file with the columns x, y, z: the
+            training rows that are held out for the choices of a fit to signal strengths are as far from the others as
+            these are from the training rows. None: as the test rows of the split.
         n_train: number or fraction of the training rows to use; None: all.
         seed: seed of split and fit.
         settings: settings of the model: values by name, nested or dotted, ``key=value`` texts, or its dataclass, whose
@@ -291,7 +309,13 @@ def train(
     place = scene.folder if isinstance(scene, Scene) else scene
     what = RunRequest(model, place, material, antennas, receiver, evaluation, split, n_train, seed, settings)
     request = replace(
-        what, deterministic=deterministic, intervals=intervals, min_rows=min_rows, preset=preset, loss=loss
+        what,
+        deterministic=deterministic,
+        intervals=intervals,
+        min_rows=min_rows,
+        preset=preset,
+        loss=loss,
+        wanted=wanted,
     )
     data = data if isinstance(data, str | Path | Record) else load_record(data)
     problem, config, splits = plan_run(data, request, progress, on_progress)

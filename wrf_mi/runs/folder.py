@@ -30,6 +30,7 @@ import yaml
 
 from ..backend import init
 from ..core import AntennaOptions, InputError, Record, Split
+from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import LEFTOVER, readable, write_atomically
@@ -76,6 +77,7 @@ class RunRequest:
     min_rows: int | None = None
     preset: str | None = None
     loss: str | None = None
+    wanted: str | Path | FloatArray | None = None
 
 
 @dataclass(frozen=True)

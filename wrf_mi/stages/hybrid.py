@@ -45,7 +45,7 @@ from ..models.reception import Reception
 from ..tasks import task_of
 from ..training import by_distance
 from ..training.by_distance import Intervals, Mixture
-from ..training.selection import HeldOut, hold_out
+from ..training.selection import HeldOut, away_as, hold_out
 from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
 from .scene_side import (
     FAST,
@@ -204,7 +204,7 @@ class _Fit:
         ]
         stated = {"stages": stated_reports(self.reports), **chosen, "weights": weights}
         options = [{"part": name, **report} for name in self.fitted for report in self.fitted[name].options]
-        stated |= {"options": options} if options else {}
+        stated |= {"options": options, "hold_out": away_as(self.split)} if options else {}
         parts = {name: self._part(name) for name in used if name != RESIDUAL}
         residuals = self.residuals if RESIDUAL in used else None
         rows = self.problem.rows(self.split)

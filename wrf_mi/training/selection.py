@@ -197,8 +197,8 @@ def hold_out(record: Record, split: Split) -> Split | None:
     return fold if rows_received(record, fold.all_train).max() >= LEAST_ROWS else None
 
 
-def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray, as_tested: bool) -> IntArray:
-    groups, rows = (_as_far_as_tested if as_tested else hold_out_groups)(split, tx_pos_m), split.all_train
+def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray, as_wanted: bool) -> IntArray:
+    groups, rows = (_as_far_as_wanted if as_wanted else hold_out_groups)(split, tx_pos_m), split.all_train
     if groups is not split and len(groups.validation) >= 2:
         return groups.validation
     # Where rows are sparsest, as far from the others as rows to be predicted may be.
@@ -206,27 +206,36 @@ def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray, as_tested: bool) -
     return np.sort(rows[np.argsort(-distance[:, 1], kind="stable")[: 2 if len(rows) > 3 else 1]])
 
 
-def _as_far_as_tested(split: Split, tx_pos_m: FloatArray) -> Split:
-    """`hold_out_groups` of as many clusters that held-out rows are as far from the others as rows that are tested.
+def away_as(split: Split) -> str:
+    """How far from the others the rows of `hold_out` of signal strengths are, in words for a report."""
+    if len(split.wanted_m):
+        return "as far from the others as the wanted positions (transductive)"
+    return "as far from the others as the test positions (transductive)" if len(split.test) else "in large clusters"
 
-    Without test positions, or with those of training rows, clusters are the largest: rows are predicted anywhere.
+
+def _as_far_as_wanted(split: Split, tx_pos_m: FloatArray) -> Split:
+    """`hold_out_groups` of as many clusters that held-out rows are as far from the others as positions of predictions.
+
+    These are the wanted ones of the split, or else those of its test rows. Without any, or with those of training rows,
+    clusters are the largest: rows are predicted anywhere.
     """
-    test, coarse = split.test[np.isfinite(tx_pos_m[split.test]).all(axis=1)], hold_out_groups(split, tx_pos_m)
-    if coarse is split or not len(test):
+    wanted_m, coarse = split.wanted_m if len(split.wanted_m) else tx_pos_m[split.test], hold_out_groups(split, tx_pos_m)
+    wanted_m = wanted_m[np.isfinite(wanted_m).all(axis=1)]
+    if coarse is split or not len(wanted_m):
         return coarse
 
-    def away_m(rows: IntArray, known: IntArray) -> float:
-        return max(float(np.median(cKDTree(tx_pos_m[known]).query(tx_pos_m[rows])[0])), np.finfo(float).tiny)
+    def away_m(positions_m: FloatArray, known: IntArray) -> float:
+        return max(float(np.median(cKDTree(tx_pos_m[known]).query(positions_m)[0])), np.finfo(float).tiny)
 
-    wanted, best, most = away_m(test, split.all_train), coarse, len(np.unique(tx_pos_m[split.train], axis=0))
-    nearest, count = away_m(best.validation, best.train), GROUPS
+    wanted, best, most = away_m(wanted_m, split.all_train), coarse, len(np.unique(tx_pos_m[split.train], axis=0))
+    nearest, count = away_m(tx_pos_m[best.validation], best.train), GROUPS
     if wanted < LEAST_AWAY_M:
         return coarse
     # Distances fall with the number of clusters.
     while nearest > wanted and count < most:
         count *= 2
         fine = hold_out_groups(split, tx_pos_m, count)
-        away = away_m(fine.validation, fine.train)
+        away = away_m(tx_pos_m[fine.validation], fine.train)
         if abs(np.log(away / wanted)) < abs(np.log(nearest / wanted)):
             best, nearest = fine, away
         elif away < wanted:
