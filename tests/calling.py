@@ -101,3 +101,9 @@ def damaged_models_refused(run: Path, key: str, capsys: pytest.CaptureFixture[st
     refused(asked, f"model.npz: not readable .*{key.partition('/')[2]}.*; train the run anew", capsys)
     np.savez(model, **arrays | {"run/format": np.array(99)})
     refused(asked, f"model.npz: format 99, this version reads {FORMAT}; use the version that wrote it", capsys)
+
+
+def without_seconds(values: np.ndarray) -> np.ndarray:
+    """An array of a run file, in texts without the durations of reports, which no two fits share."""
+    values = np.asarray(values)
+    return np.array(re.sub(r'"seconds": [^,}]*', "", str(values))) if values.dtype.kind == "U" else values

@@ -39,6 +39,7 @@ class Levels(Stage):
 
     levels: Sequence[tuple[str, float, int]]
     fits: list[tuple[str, int]]
+    trusts_default: bool = False
     name = "level"
 
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
@@ -118,9 +119,13 @@ def test_few_rows_keep_the_defaults_and_say_so(tmp_path: Path) -> None:
     assert len(engine.unseen.mean) < LEAST_ROWS
 
 
-@pytest.mark.parametrize(("level", "taken"), [(-50.0, "first"), (-90.0, "right")])
-def test_options_of_some_rows_have_to_gain_clearly(level: float, taken: str, tmp_path: Path) -> None:
-    engine = engine_of(tmp_path, [Levels([("first", level, 0), ("right", -50.2, 0)], [])], rows=20)
+@pytest.mark.parametrize(
+    ("level", "trusted", "taken"), [(-52.0, True, "first"), (-90.0, True, "right"), (-52.0, False, "right")]
+)
+def test_few_rows_doubt_options_beside_a_trusted_default(
+    level: float, trusted: bool, taken: str, tmp_path: Path
+) -> None:
+    engine = engine_of(tmp_path, [Levels([("first", level, 0), ("right", -50.2, 0)], [], trusted)], rows=20)
     engine.fit()
     assert engine.unseen is not None
     assert LEAST_ROWS <= len(engine.unseen.mean) < FEW_ROWS

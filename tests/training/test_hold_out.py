@@ -80,7 +80,7 @@ def test_wanted_positions_shape_the_hold_out_in_place_of_test_rows() -> None:
     rng = np.random.default_rng(0)
     tx_pos_m = np.column_stack([rng.uniform(0, 40, (400, 2)), np.full(400, 1.5)])
     rows = np.arange(400)
-    wanted_m = tx_pos_m[:50] + [0, 0, 3.0]
+    wanted_m = np.add(tx_pos_m[:50], [0, 0, 3.0])
     split = Split("made", 0, rows[80:], rows[:0], rows[:80])
     fold, by_test = (hold_out(record_of(tx_pos_m), each) for each in (replace(split, wanted_m=wanted_m), split))
     assert fold is not None

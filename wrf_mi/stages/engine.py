@@ -30,8 +30,9 @@ from .stage import Option, Stage, State
 
 FOLDER, CHOSEN = "options", "chosen"  # folder of the predictions, and name of those of the chosen chain
 LEAST_ROWS, FEW_ROWS, CONFIDENCE = 3, 8, 0.95
-"""Fewest held-out rows that choose options, and number below which each option has to gain with this confidence, by
-Student's t: by the mean of four rows of a flat, the worst of three origins of lengths was taken as often as the best.
+"""Fewest held-out rows that choose options, and number below which an option has to gain with this confidence, by
+Student's t, where the stage trusts its default: by the mean of four rows of a flat, the worst of three origins of
+lengths was taken as often as the best.
 """
 Plan = tuple[str, ...]  # names of the options of the stages up to one
 
@@ -140,14 +141,14 @@ class Engine:
                         raise
                     self.reports.append(OptionReport(stage.name, option.name, False, str(error)))
             self._session.report(f"{stage.name}: chosen", 1.0)
-            best = self._best(options, scores, rows < FEW_ROWS)
+            best = self._best(options, scores, stage.trusts_default and rows < FEW_ROWS)
             self._report(stage, scores, best, plan, later)
             plan = (*plan, best)
         return plan
 
-    def _best(self, options: Sequence[Option], scores: dict[str, FloatArray], few: bool) -> str:
+    def _best(self, options: Sequence[Option], scores: dict[str, FloatArray], doubted: bool) -> str:
         """Name of the best option: the best mean of equal freedom, then the last clear gain of more freedom."""
-        if few:
+        if doubted:
             return last_gain(scores.items(), higher_is_better=True, confidence=CONFIDENCE)
         best_of = []
         judged = (option for option in options if option.name in scores)

@@ -31,6 +31,7 @@ class StrengthResidual(Stage):
     settings: StrengthSettings
     stated: Collection[str] = ()
     name = "residual"
+    trusts_default = True  # lengths of rooms are known from many
 
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
         """Origins of the lengths, or the one that the settings state."""

@@ -34,6 +34,7 @@ class Stage(ABC):
     """A stage of a fit."""
 
     name: str  # name in reports
+    trusts_default: bool = False  # whether few rows have to show a clear gain for another option than the default
 
     @abstractmethod
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
