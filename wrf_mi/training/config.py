@@ -168,7 +168,7 @@ class LossConfig:
     """
 
     ssim_weight: Share = 0.2  #: eta
-    name: str | None = None  #: name of a loss (`wrf_mi.tasks.LOSSES`); null: the task's
+    name: str = ""  #: name of a loss (`wrf_mi.tasks.LOSSES`); "": the task's
 
 
 PATHS_ALONE = "ray-tracing"  # name of the model that trains the paths of a scene without Gaussians

@@ -292,9 +292,7 @@ class FitPlan:
     ) -> None:
         check_rows(split, record, f"split {split.name}")
         self.task, name = task_of(record), config.loss.name
-        self.loss: Loss = (
-            partial(self.task.loss, ssim_weight=config.loss.ssim_weight) if name is None else known_loss(name)
-        )
+        self.loss: Loss = known_loss(name) if name else partial(self.task.loss, ssim_weight=config.loss.ssim_weight)
         check_observations(record, split, complete=self.task.image)
         rows = split.all_train
         config = config.resolved(record.tx_pos_m[rows])

@@ -211,7 +211,7 @@ def _unused_of_gaussians(plan: FitPlan, name: str) -> dict[str, str]:
         unused |= dict.fromkeys(
             ("encoding.tx_octaves", "encoding.tx_scale_m"), "transmitters are known by their uplink"
         )
-    if s.loss.name is not None:
+    if s.loss.name:
         unused["loss.ssim_weight"] = f"of the loss of {task.name}, in whose place loss.name is"
     if not task.image:
         unused["loss.ssim_weight"] = f"of images, and the data hold {task.name}"
