@@ -116,12 +116,11 @@ class Demo:
         self, dataset: str, scene: Path, prefix: str, tracing: tuple[str, ...] = (), **options: Any
     ) -> list[Run]:
         from ..runs.api import train
-        from ..stages.scene_side import FAST
 
-        settings = {"hybrid": (f"stages={','.join(FAST)}",), "ray-tracing": tracing}
         runs = []
         for model, in_scene in MODELS.items():
-            how: dict[str, Any] = {"settings": settings.get(model, ()), **options}
+            how: dict[str, Any] = {"settings": tracing if model == "ray-tracing" else (), **options}
+            how |= {"preset": "fast"} if model == "hybrid" else {}
             how |= {"scene": scene if in_scene else None, "on_progress": self.on_progress, "stop": self.stop}
             runs.append(train(dataset, model, out=self.folder / f"{prefix}{model}", **how))
             self._say(summary(runs[-1:]))
