@@ -132,9 +132,8 @@ class State:
         prior = self.posterior.prior(self.mean, free)
         covariance = posterior_covariance(derivative, residual, prior, self.noise)
         # Rounding makes variances that the data leave nothing of negative.
-        return np.sqrt(np.maximum(np.diag(covariance), 0)), left_out_residuals(
-            derivative, residual, covariance, self.noise
-        )
+        deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
+        return deviation, left_out_residuals(derivative, residual, covariance, self.noise)
 
 
 def _met_most(count: IntArray) -> IntArray:

@@ -87,7 +87,8 @@ def plan_run(
     split = _split_of(record, request)
     record, splits, left_out = _split_rows(record, split, seed, request.n_train, _least_rows(record, request))
     if request.wanted is not None:
-        splits = [replace(rows, wanted_m=_wanted_m(record, request.wanted)) for rows in splits]
+        wanted_m = _wanted_m(record, request.wanted)
+        splits = [replace(rows, wanted_m=wanted_m) for rows in splits]
     for rows in splits:
         check_held_receivers(record, rows, model, MODELS.values())
         check_observations(record, rows, model.complete, may_be_silent=TASKS[record.task].in_decibel)

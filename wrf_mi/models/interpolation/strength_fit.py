@@ -213,8 +213,9 @@ def folds(position_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
     """
     count = len(position_m)
     _, first, place = np.unique(np.round(position_m / PLACE_M), axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first[place.reshape(-1)], kind="stable")
-    begins = np.searchsorted(first[place.reshape(-1)][order], first[place.reshape(-1)][order])
+    visit = first[place.reshape(-1)]
+    order = np.argsort(visit, kind="stable")
+    begins = np.searchsorted(visit[order], visit[order])
     stretch = int(np.clip(count // (2 * FOLDS), *STRETCH))
     number = begins // stretch
     for fold in range(min(FOLDS, int(number[-1]) + 1)):
