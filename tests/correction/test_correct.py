@@ -19,7 +19,8 @@ from wrf_mi_scenes.build_laboratory import sheet
 import wrf_mi
 from wrf_mi.core import InputError
 from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
-from wrf_mi.correction.correct import _error_ratio, _last_is_best
+from wrf_mi.correction.correct import _errors, _last_is_best
+from wrf_mi.correction.edits import error_ratio
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.options import PARTS
 from wrf_mi.correction.page import _facts, _picture
@@ -117,7 +118,8 @@ def test_error_ratio_is_the_larger_one_of_equal_rows(held, left_out, expected):
     record = SimpleNamespace(receivers=("a", "b"))
     final = SimpleNamespace(record=record, rows=np.array([2, 4, 6, 8]), residual=lambda vector: fitted)
     unseen = SimpleNamespace(rows=np.array([4, 8]), residual=lambda vector: -held * fitted[[1, 3, 5, 7]])
-    assert _error_ratio(unseen, np.zeros(1), final, np.zeros(1), left_out * fitted) == pytest.approx(expected)
+    errors = _errors(unseen, np.zeros(1), final, np.zeros(1), left_out * fitted)
+    assert error_ratio(errors) == pytest.approx(expected)
 
 
 def test_planes_alone_are_corrected(true, corrected):

@@ -7,8 +7,7 @@ import pytest
 from correction_rooms import CARRIER_HZ, channels, stated_scene
 
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.correction import path_sum
-from wrf_mi.correction.correct import default_options
+from wrf_mi.correction import default_options, path_sum
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.options import GAIN, MATERIALS, PLANES, CorrectionOptions
 from wrf_mi.correction.path_sum import PathSum

@@ -20,7 +20,7 @@ from wrf_mi.models import Session
 from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
-from wrf_mi.stages.scene_side import inside
+from wrf_mi.stages.scene import inside
 from wrf_mi.training.checkpoint import read_checkpoint
 from wrf_mi.training.loop import Progress
 

@@ -12,7 +12,8 @@ from wrf_mi.core import InputError, Prediction, Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.models.interpolation.idw import MODEL as IDW
 from wrf_mi.models.model import Arrays, Fitted, Inputs, Problem, Session
-from wrf_mi.stages.engine import FEW_ROWS, LEAST_ROWS, Engine
+from wrf_mi.stages.engine import CONFIDENCE, LEAST_ROWS, Engine
+from wrf_mi.stages.residual import FEW_ROWS
 from wrf_mi.stages.stage import Option, Stage, State
 from wrf_mi.training.selection import hold_out
 
@@ -40,10 +41,15 @@ class Levels(Stage):
     levels: Sequence[tuple[str, float, int]]
     fits: list[tuple[str, int]]
     trusts_default: bool = False
+    after: str = ""  # option that the last one goes on from
     name = "level"
 
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
-        return [Option(name, partial(self._fit, name, level), freedom) for name, level, freedom in self.levels]
+        options = [Option(name, partial(self._fit, name, level), freedom) for name, level, freedom in self.levels]
+        return [*options[:-1], options[-1]._replace(after=self.after)]
+
+    def confidence(self, rows: int) -> float | None:
+        return CONFIDENCE if self.trusts_default and rows < FEW_ROWS else None
 
     def _fit(self, name: str, level: float, state: State, split: Split, session: Session) -> State:
         self.fits.append((name, len(split.all_train)))
@@ -99,6 +105,19 @@ def test_best_option_is_taken_and_reported(levels: list[tuple[str, float, int]],
     assert {rows for _, rows in fits[:-1]} == {len(fold.all_train)}
     assert engine.unseen is not None
     assert len(engine.unseen.mean) == len(fold.test)
+
+
+@pytest.mark.parametrize(("level", "tried"), [(-50.5, True), (-52.0, False)])
+def test_an_option_that_goes_on_from_another_is_tried_where_that_one_leads(level, tried, tmp_path: Path) -> None:
+    levels = [("stated", -54.0, 0), ("rival", -51.0, 1), ("found", level, 1), ("further", -50.0, 1)]
+    fits = list[tuple[str, int]]()
+    engine = engine_of(tmp_path, [Levels(levels, fits, after="found")])
+    engine.fit()
+    assert ("further" in {name for name, _ in fits}) is tried
+    reports = {report.option: report for report in engine.reports}
+    assert list(reports) == [name for name, _, _ in levels]
+    assert reports["further"].taken is tried
+    assert ("not tried: found is behind" in reports["further"].why) is not tried
 
 
 def test_an_option_is_judged_by_the_finished_chain(tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import write_spectrum_folder
-from wrf_mi.stages import scene_side
-from wrf_mi.stages.scene_side import STAGES
+from wrf_mi.stages.engine import Engine, Fold
+from wrf_mi.stages.scene import STAGES
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.training.session import Interrupted
@@ -25,6 +25,18 @@ HZ = 920e6
 SHAPES = {"spectrum": (24, 48), "rssi": (), "csi": (6,)}
 TRACE = TraceOptions(depth=2, rays=1 << 12)
 QUICK = ("steps=30",)
+STOPPED_IN = (
+    ("paths: choices", "(calibrated)"),
+    ("paths: least squares", "(calibrated)"),
+    ("paths: choices", "(corrected)"),
+    ("paths: choices", "(corrected, paths found anew)"),
+    ("paths: calibrated", ""),
+    ("paths: training", "(trained)"),
+    ("paths: least squares", "parameters"),
+    ("kriging, held-out rows: signals", ""),
+    ("choosing weights", ""),
+)
+"""Beginnings and ends of reports after which a fit is stopped, in their order."""
 FLOAT32_GREY = 1e-4  # of greys that a batch of transmitters and a single one give: sums in single precision
 CLEAR_DB = 0.3  # of strengths without noise in the true scene; the constant level and slope are fitted to 30 rows
 CLEAR_GREY = 0.05  # gain of the mean SSIM by the true materials of three of six walls: 0.1 with 30 rows
@@ -103,21 +115,21 @@ def test_fit_in_a_scene_is_restored_with_its_sides(spectra: tuple[wrf_mi.Run, Re
 
 
 def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(scenes: dict[str, Path], tmp_path: Path) -> None:
-    """Stopped in the correction, in the middle of training, and while it interpolates, one after the other."""
+    """Stopped in each option of the scene and of the paths, with all rows, and while it interpolates, in turn."""
     record, split = measured(scenes, "spectrum", 16)
     record = replace(record, official=(split.train, split.test))
     data, out = str(write_spectrum_folder(tmp_path / "room", record)), tmp_path / "stopped"
     how = {"scene": scenes["thought"], "settings": ("steps=20",), "deterministic": True}
     uninterrupted = wrf_mi.train(data, out=tmp_path / "whole", **how)
     sitting = partial(wrf_mi.train, data, out=out, **how)
-    for stage, share in (("paths: choices", 0.0), ("paths: training", 0.5), ("kriging, held-out rows: signals", 0.0)):
+    for begin, end in STOPPED_IN:
         reports = [("", 0.0)]
         with pytest.raises(Interrupted):
             sitting(
                 on_progress=lambda *report, reports=reports: reports.append(report[:2]),
-                stop=lambda reports=reports: reports[-1][0].startswith(stage) and reports[-1][1] >= share,  # noqa: B023
+                stop=lambda reports=reports: reports[-1][0].startswith(begin) and reports[-1][0].endswith(end),  # noqa: B023
             )
-        assert reports[-1][0].startswith(stage)
+        assert reports[-1][0].startswith(begin)
         sitting = partial(wrf_mi.resume, out)
     position = record.tx_pos_m[:6]
     np.testing.assert_array_equal(sitting().predict(position).mean, uninterrupted.predict(position).mean)
@@ -174,14 +186,21 @@ def test_few_rows_train_paths_and_hold_two_out(scenes: dict[str, Path], tmp_path
     assert run.metrics["inside_90"] > 0.5
 
 
-def test_scene_as_stated_is_kept_where_few_rows_prefer_it(scenes, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scene_as_stated_is_kept_where_a_training_in_it_is_better(scenes, tmp_path, monkeypatch) -> None:
     """Stages that are not wanted are not fitted."""
-    stated = str(scenes["thought"])
-    monkeypatch.setattr(scene_side, "_held_out_score", lambda side: float(side.problem.scene == stated))
+    stated, judged = str(scenes["thought"]), Engine._scores
+    best = ("calibrated in the scene as stated", "trained in the scene as stated")
+
+    def favouring(engine: Engine, fold: Fold, plan: tuple[str, ...]) -> np.ndarray:
+        scene, paths = plan
+        return judged(engine, fold, plan) + 10.0 * (paths in best) + 1.0 * (scene == "calibrated")
+
+    monkeypatch.setattr(Engine, "_scores", favouring)
     record, split = measured(scenes, "spectrum", 16)
     settings = ("stages=mean,correction,surfaces", "steps=20")
     run = wrf_mi.train(record, out=tmp_path / "run", scene=stated, split=split, settings=settings)
     again = assert_restored(run, record)
+    assert taken(run) == [("paths", "scene", "calibrated"), ("paths", "paths", best[1])]
     assert all(opened.fitted.parts["paths"].problem.scene == stated for opened in (run, again))
     assert not (run.folder / "parts" / "paths" / "scene").exists()
     reports = {report["stage"]: report for report in run.metrics["stages"]}

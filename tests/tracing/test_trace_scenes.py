@@ -15,7 +15,7 @@ from wrf_mi_scenes.mitsuba_xml import ABSORBER
 
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
-from wrf_mi.correction.correct import correct_scene, default_options
+from wrf_mi.correction import correct_scene, default_options
 from wrf_mi.correction.page import write_page
 from wrf_mi.datasets.splits import make_splits
 from wrf_mi.receivers.instruments import PowerInstrument

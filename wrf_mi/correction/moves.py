@@ -28,7 +28,7 @@ from .least_squares import Noise
 from .misfit import Misfit
 from .options import FRAME, FRAME_SD, MATERIALS, PLANES
 from .path_sum import PathSum, near
-from .state import ABSENT, ABSENT_VALUES, ScenePosterior, State, material_places
+from .state import ABSENT, ABSENT_VALUES, SceneEdit, ScenePosterior, State, material_places
 
 COMMON = ("concrete", "brick", "plasterboard", "ceiling_board", "wood", "chipboard", "glass", "metal")
 """Materials of ITU-R P.2040 that surfaces in buildings have; others lie between them."""
@@ -176,9 +176,9 @@ class Moves:
             state = move(state)
         return state
 
-    def continued(self, state: State) -> State:
+    def continued(self, edit: SceneEdit) -> State:
         """The most probable state that is found from one over other paths."""
-        state = self._rounds(state.at(self.posterior).solved(), range(1, ROUNDS + 1))
+        state = self._rounds(edit.at(self.posterior).solved(), range(1, ROUNDS + 1))
         return self._otherwise(state, of_materials=True) if self.material else state
 
     def _solved_if_better(self, state: State, other: State, bonus: float = 0.0) -> State:

@@ -31,7 +31,7 @@ from ..scene.correction_data import KEY as DATA
 from ..tasks import task_of
 from ..tracing.paths.corrected_scene import moved_triangles, write_corrected_scene
 from ..tracing.paths.scene_parameters import QUANTITIES, SHIFT, SURFACE, TILT, name_of
-from .correct import Correction
+from .edits import Correction
 from .options import FRAME, MATERIALS, PHASES
 from .state import LEAST_PATHS, rigid_motion, scene_entries
 
@@ -49,11 +49,9 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
     Raises:
         InputError: a folder that exists and is not to be replaced, or cannot be written, or no surface is left.
     """
-    facts, state = _facts(correction), correction.state
+    facts = _facts(correction)
     with atomic_folder(Path(folder), replace=replace) as part:
-        opened, parameters = correction.misfit.sides[0].scene, state.scene_parameters()
-        how: dict[str, Any] = {"kinds": correction.kinds, "absent": state.absent(), "replace": True}
-        write_corrected_scene(part, opened, parameters, grouping="surface", **how)
+        _write_scene(correction, part)
         plain = json.dumps(facts, indent=1, default=lambda x: x.tolist() if hasattr(x, "tolist") else str(x))
         write_atomically(part / FILE, plain + "\n")
         lines = [*_scores_text(correction, facts), *_frame_text(facts["frame"])]
@@ -62,6 +60,18 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
         write_atomically(part / PAGE, "\n".join(lines))
         write_figure(part / PICTURE, _picture(correction, facts))
     return facts
+
+
+def write_scene(correction: Correction, folder: Path) -> None:
+    """Write a corrected scene without its page atomically, in place of what is there (InputError: no surface left)."""
+    with atomic_folder(folder, replace=True) as part:
+        _write_scene(correction, part)
+
+
+def _write_scene(correction: Correction, folder: Path) -> None:
+    opened, state = correction.misfit.sides[0].scene, correction.state
+    how: dict[str, Any] = {"kinds": correction.kinds, "absent": state.absent(), "replace": True}
+    write_corrected_scene(folder, opened, state.scene_parameters(), grouping="surface", **how)
 
 
 def _facts(correction: Correction) -> dict[str, Any]:

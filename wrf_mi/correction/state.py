@@ -7,12 +7,16 @@ n . (t + w x (p - c)) and tilted by a . (w x n), b . (w x n): so the planes' pri
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..core.array_files import keyed, under
 from ..core.types import FloatArray, IntArray
 from ..tracing.paths.scene_parameters import (
     EXPONENT,
@@ -38,6 +42,43 @@ ABSENT_VALUES = np.append(np.log([LEAST_SUSCEPTIBILITY, LEAST_CONDUCTIVITY, 0.00
 STILL_ABSENT = 0.1  # susceptibility up to which a surface that was chosen to be absent is, after least squares
 REFINING_STEPS = 3  # largest number of least-squares steps of one plane while shifts are compared
 UNKNOWN = Noise(1.0, 1.0)  # noise before any least squares
+
+
+@dataclass(frozen=True)
+class SceneEdit:
+    """A state of a correction by itself, without the rows that led to it: for all planes and surfaces of the scene.
+
+    Parameters and the means of their prior are by the names of `wrf_mi.tracing.paths.traced_field.TracedField`.
+    """
+
+    stage: str  # parts that were changed, joined by "+"
+    parameters: Mapping[str, FloatArray]
+    mean: Mapping[str, FloatArray]
+    materials: Mapping[str, str]  # material of each surface that was chosen, by its name
+    absent: IntArray  # surfaces that are left out of the scene, by their numbers there, ascending
+    planes: IntArray  # planes and surfaces of which something is known, by their numbers in the scene
+    slabs: IntArray
+    noise: Noise = UNKNOWN  # noise of the residuals after the last least squares
+
+    def at(self, posterior: ScenePosterior) -> State:
+        """The state over some rows and paths, which may meet other surfaces: vector and means of their entries."""
+        vector, mean = (posterior.vector_of(values) for values in (self.parameters, self.mean))
+        return State(posterior, self.stage, vector, mean, self.materials, self.noise)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a file."""
+        arrays = {name: np.asarray(getattr(self, name)) for name in ("stage", "absent", "planes", "slabs")}
+        arrays["noise"] = np.array([self.noise.variance, self.noise.values])
+        arrays["materials"] = np.asarray(json.dumps(dict(self.materials)))
+        return arrays | keyed("parameters/", self.parameters) | keyed("mean/", self.mean)
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> SceneEdit:
+        """The state that `arrays` described."""
+        parameters, mean = under("parameters/", arrays), under("mean/", arrays)
+        materials, noise = json.loads(str(arrays["materials"])), Noise(*map(float, arrays["noise"]))
+        of_scene = arrays["absent"], arrays["planes"], arrays["slabs"]
+        return cls(str(arrays["stage"]), parameters, mean, materials, *of_scene, noise)
 
 
 @dataclass(frozen=True)
@@ -108,11 +149,16 @@ class State:
             parameters |= {SHIFT: moved[:count], TILT: moved[count:].reshape(count, 2)}
         return parameters
 
+    @property
+    def edit(self) -> SceneEdit:
+        """The state by itself, for other rows or paths."""
+        misfit, absent = self.posterior.misfit, np.array(sorted(self.absent()), np.int64)
+        of_scene = self.scene_parameters(), misfit.of_scene(self.mean), self.materials
+        return SceneEdit(self.stage, *of_scene, absent, misfit.planes, misfit.slabs, self.noise)
+
     def at(self, posterior: ScenePosterior) -> State:
-        """The state over other rows or paths, which meet other surfaces: vector and means of their entries."""
-        of_scene = self.scene_parameters(), self.posterior.misfit.of_scene(self.mean)
-        vector, mean = map(posterior.misfit.vector_of, of_scene)
-        return replace(self, posterior=posterior, vector=vector, mean=mean)
+        """The state over other rows or paths."""
+        return self.edit.at(posterior)
 
     def absent(self) -> frozenset[int]:
         """Surfaces that are left out of the scene, by their numbers there."""
@@ -176,6 +222,11 @@ class ScenePosterior:
             self.stated[material_places(misfit, slab)] = ABSENT_VALUES
         for name, gain in misfit.missing_gains(self.stated).items():
             self.stated[misfit.parts[name].start] += gain
+
+    def vector_of(self, parameters: Mapping[str, FloatArray]) -> FloatArray:
+        """The vector [p] of parameters of the whole scene; those of receivers without any are as at the start."""
+        # Of receivers that the rows before lacked nothing is known.
+        return self.misfit.vector_of({**self.misfit.of_scene(self.stated), **parameters})
 
     def start(self, stage: str) -> State:
         """The scene as stated, without the faces that it lacks."""

@@ -278,7 +278,7 @@ def error_priors(run: Run, receivers: Sequence[int], positions_m: FloatArray) ->
 def _scene_problem(run: Run) -> Problem:
     """The problem with the scene of the fit: the one that it corrected, where there is one."""
     from ..stages.fitted import PATHS
-    from ..stages.scene_side import in_scene
+    from ..stages.scene import in_scene
 
     return in_scene(run.problem, run.folder / "parts" / PATHS)
 

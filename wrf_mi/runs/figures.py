@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
 from ..core.types import IntArray
-from ..stages.scene_side import STAGES
+from ..stages.scene import STAGES
 
 if TYPE_CHECKING:
     from ..gaussians.footprint import Footprints

@@ -9,7 +9,7 @@ options/  in the session's folder: predictions of held-out rows by each chain, w
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import groupby
@@ -21,19 +21,16 @@ import numpy as np
 from ..core import InputError, Split
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.types import FloatArray, IntArray
-from ..models.held_out import arrays_of_held_out, fold_of, labelled, stored_held_out
+from ..models.held_out import arrays_of_held_out, fold_of, stored_held_out
 from ..models.model import HeldOutPrediction, Model, Problem, Session
 from ..tasks import task_of
 from ..training.by_distance import unit_means
-from ..training.selection import HeldOut, hold_out, last_gain
+from ..training.selection import HeldOut, hold_out, improves, last_gain
 from .stage import Option, Stage, State
 
 FOLDER, CHOSEN = "options", "chosen"  # folder of the predictions, and name of those of the chosen chain
-LEAST_ROWS, FEW_ROWS, CONFIDENCE = 3, 8, 0.95
-"""Fewest held-out rows that choose options, and number below which an option has to gain with this confidence, by
-Student's t, where the stage trusts its default: by the mean of four rows of a flat, the worst of three origins of
-lengths was taken as often as the best.
-"""
+LEAST_ROWS = 3  # fewest held-out rows that choose options
+CONFIDENCE = 0.95  # one-sided confidence in a gain, by Student's t, where a stage asks for it
 Plan = tuple[str, ...]  # names of the options of the stages up to one
 
 
@@ -49,7 +46,7 @@ class OptionReport:
     seconds: float | None = None  # duration of its fit and prediction; None: not judged
 
 
-class _Fold(NamedTuple):
+class Fold(NamedTuple):
     """Rows that are held out, and what fits to the others may see."""
 
     held_out: HeldOut
@@ -79,27 +76,29 @@ class Engine:
         self._stages = [stage for stage, options in listed if options]
         self._options = [list(options) for _, options in listed if options]
         self._folder, self._states = session.folder / FOLDER, dict[Plan, State]()
+        self._judged = {stage.name: dict[str, FloatArray]() for stage in self._stages}  # scores of what was tried
         self.reports, self.unseen = list[OptionReport](), cast(HeldOutPrediction | None, None)
 
     @cached_property
-    def _fold(self) -> _Fold | None:
+    def _fold(self) -> Fold | None:
         record, fold = self._problem.record, hold_out(self._problem.record, self._split)
         if fold is None:
             return None
         held_out = HeldOut.of(record, fold, self._problem.seed)
         # Places of receivers that nobody surveyed are estimated once, for all options.
-        return _Fold(held_out, *fold_of(self._entry, self._problem, fold, self._session)) if len(held_out) else None
+        return Fold(held_out, *fold_of(self._entry, self._problem, fold, self._session)) if len(held_out) else None
 
     def fit(self) -> State:
         """The chosen options fitted to all rows."""
         plan, fold = self._chosen(), self._fold
+        self._plan = plan
         if fold is not None:
             self.unseen = self._predicted(fold, plan, finish=True)
         state = State(self._problem)
         for number, stage in enumerate(self._stages):
             option = self._option(number, plan[number])
             if fold is not None:
-                option = stage.continued(option, self._state(fold, plan[: number + 1]))
+                option = stage.continued(option, self._state(fold, plan[: number + 1]), self._judged[stage.name])
             state = option.fit(state, self._split, self._session)
         self._session.discarded.append(self._folder)
         return self._finished(state, self._split)
@@ -131,46 +130,62 @@ class Engine:
                 self.reports.append(OptionReport(stage.name, first.name, True, why))
                 plan = (*plan, first.name)
                 continue
-            scores = dict[str, FloatArray]()
+            scores, left = self._judged[stage.name], dict[str, str]()
             for done, option in enumerate(options):
+                if option.after and self._is_behind(option.after, options, scores):
+                    left[option.name] = f"not tried: {option.after} is behind"
+                    continue
                 self._session.report(f"{stage.name}: {option.name}", done / len(options))
                 try:
                     scores[option.name] = self._scores(fold, (*plan, option.name, *later))
                 except InputError as error:  # the default has to serve the data, others may not
                     if option is first:
                         raise
-                    self.reports.append(OptionReport(stage.name, option.name, False, str(error)))
+                    left[option.name] = str(error)
             self._session.report(f"{stage.name}: chosen", 1.0)
-            best = self._best(options, scores, stage.trusts_default and rows < FEW_ROWS)
-            self._report(stage, scores, best, plan, later)
+            best = self._best(options, scores, stage.confidence(rows))
+            for option in options:
+                if option.name in left:
+                    self.reports.append(OptionReport(stage.name, option.name, False, left[option.name]))
+                else:
+                    path = self._path((*plan, option.name, *later))
+                    self.reports.append(self._report(stage, option.name, scores, best, path))
             plan = (*plan, best)
         return plan
 
-    def _best(self, options: Sequence[Option], scores: dict[str, FloatArray], doubted: bool) -> str:
+    def _is_behind(self, name: str, options: Sequence[Option], scores: dict[str, FloatArray]) -> bool:
+        """Whether an option is behind one of its freedom in the mean, or clearly behind another one."""
+        freedom, own = {option.name: option.freedom for option in options}, scores.get(name)
+        if own is None:
+            return True
+        return any(
+            other.mean() > own.mean() if freedom[rival] == freedom[name] else improves(other, own, True)
+            for rival, other in scores.items()
+            if rival != name
+        )
+
+    def _best(self, options: Sequence[Option], scores: dict[str, FloatArray], confidence: float | None) -> str:
         """Name of the best option: the best mean of equal freedom, then the last clear gain of more freedom."""
-        if doubted:
-            return last_gain(scores.items(), higher_is_better=True, confidence=CONFIDENCE)
-        best_of = []
-        judged = (option for option in options if option.name in scores)
-        for _, equal in groupby(judged, key=lambda option: option.freedom):
-            # The first of equal ones: options may be the same for the data.
-            name = max((option.name for option in equal), key=lambda name: scores[name].mean())
-            best_of.append((name, scores[name]))
-        return last_gain(best_of, higher_is_better=True)
+        judged, best_of = [option for option in options if option.name in scores], []
+        # The default competes with no option where these have to gain with a confidence.
+        alone = None if confidence is None else judged[0].name
+        for _, equal in groupby(judged, key=lambda option: (option.name == alone, option.freedom)):
+            # The first of equal ones, as options may be the same for the data, but for what goes on from another one.
+            best = max(equal, key=lambda option: (scores[option.name].mean(), bool(option.after)))
+            best_of.append((best.name, scores[best.name]))
+        return last_gain(best_of, higher_is_better=True, confidence=confidence)
 
-    def _report(self, stage: Stage, scores: dict[str, FloatArray], best: str, plan: Plan, later: Plan) -> None:
-        sign = 1 if task_of(self._problem.record).higher_is_better else -1
-        for name, score in scores.items():
-            why = "best" if name == best else "no clear gain" if score.mean() > scores[best].mean() else "worse"
-            seconds = float(stored_arrays(self._path((*plan, name, *later)))["seconds"])
-            mean = sign * float(score.mean())
-            self.reports.append(OptionReport(stage.name, name, name == best, f"{why} on held-out rows", mean, seconds))
+    def _report(self, stage: Stage, name: str, scores: dict[str, FloatArray], best: str, path: Path) -> OptionReport:
+        sign, mean = 1 if task_of(self._problem.record).higher_is_better else -1, float(scores[name].mean())
+        why = "best" if name == best else "no clear gain" if mean > scores[best].mean() else "worse"
+        seconds = float(stored_arrays(path)["seconds"])
+        return OptionReport(stage.name, name, name == best, f"{why} on held-out rows", sign * mean, seconds)
 
-    def _unit(self, fold: _Fold) -> IntArray:
+    def _unit(self, fold: Fold) -> IntArray:
         """Unit of each held-out observation: errors are independent between rows, or between receivers."""
         return fold.held_out.receiver if self._split.held_receivers else fold.held_out.row
 
-    def _scores(self, fold: _Fold, plan: Plan) -> FloatArray:
+    def _scores(self, fold: Fold, plan: Plan) -> FloatArray:
         """Mean scores of the independent units of held-out rows by a chain, the higher the better."""
         record, count = self._problem.record, len(fold.held_out)
         means = self._predicted(fold, plan).mean[None]
@@ -180,7 +195,7 @@ class Engine:
     def _path(self, plan: Plan, finish: bool = False) -> Path:
         return self._folder / f"{CHOSEN if finish else '+'.join(plan)}.npz"
 
-    def _predicted(self, fold: _Fold, plan: Plan, finish: bool = False) -> HeldOutPrediction:
+    def _predicted(self, fold: Fold, plan: Plan, finish: bool = False) -> HeldOutPrediction:
         """Predictions of held-out rows by a chain, of the ``finish``-ed one with deviations; kept in the folder."""
         path, record, begun = self._path(plan, finish), self._problem.record, time.perf_counter()
         if not path.exists():
@@ -194,13 +209,32 @@ class Engine:
             write_arrays(path, arrays | {"seconds": np.asarray(time.perf_counter() - begun)})
         return stored_held_out(path, self._problem, fold.held_out)
 
-    def _state(self, fold: _Fold, plan: Plan) -> State:
+    def _state(self, fold: Fold, plan: Plan) -> State:
         """The state of some options, fitted to the rows of the fold; chains share their beginnings."""
         if not plan:
-            return State(fold.problem)
+            return State(fold.problem, fold=fold.split)
         if plan not in self._states:
-            number, before = len(plan) - 1, self._state(fold, plan[:-1])
+            option = self._option(len(plan) - 1, plan[-1])
+            before = self._state(fold, (*plan[:-1], option.after) if option.after else plan[:-1])
             folder = self._folder.joinpath(*plan)
-            session = labelled(replace(self._session, folder=folder), f"{self._stages[number].name}, {plan[-1]}")
-            self._states[plan] = self._option(number, plan[-1]).fit(before, fold.split, session)
+            on_progress = self._session.on_progress
+
+            def report(stage: str, share: float, _: object = None, /) -> None:
+                on_progress(f"{stage} ({option.name})", share)
+
+            session = replace(self._session, folder=folder, on_progress=report)
+            self._states[plan] = option.fit(before, fold.split, session)
         return self._states[plan]
+
+    def of_fold(self, name: str, predict: Callable[[State, Fold, FloatArray], FloatArray]) -> FloatArray | None:
+        """``predict(state, fold, mean)`` by the chosen chain, kept in the folder; None where no rows are held out.
+
+        ``state`` is that of the rows of the fold, ``mean`` [q, ...] what it predicts of those held out.
+        """
+        if self._fold is None or self.unseen is None:
+            return None
+        path = self._folder / f"{name}.npz"
+        if not path.exists():
+            values = predict(self._state(self._fold, self._plan), self._fold, self.unseen.mean)
+            write_arrays(path, {"mean": values})
+        return stored_arrays(path)["mean"]

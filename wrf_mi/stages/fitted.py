@@ -22,7 +22,7 @@ from ..models.reception import Reception
 from ..tasks import task_of
 from ..training.by_distance import LEAST, Intervals, Mixture, expected_size
 from ..training.selection import HeldOut, RowDistance, rows_at_receiver
-from .scene_side import SceneSide, by_stage
+from .side import SceneSide, by_stage
 
 LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
 LeftOver = Mapping[int, tuple[IntArray, NDArray[Any]]]

@@ -1,7 +1,7 @@
 """The model ``hybrid``: one fit in stages, from a scene's paths to interpolation of what they leave.
 
-Stages 1 to 5 (`wrf_mi.stages.scene_side`) predict from the scene, the last one interpolates: their residuals and
-the observations themselves, weighted by the distance to the nearest training row. One hold-out
+Stages of the scene (`wrf_mi.stages.scene`, `wrf_mi.stages.paths`) predict from it, the last one interpolates: their
+residuals and the observations themselves, weighted by the distance to the nearest training row. One hold-out
 (`wrf_mi.training.selection.hold_out`) chooses stages, weights and standard deviations.
 
 parts/  in the run folder: files of the parts
@@ -47,20 +47,9 @@ from ..training import by_distance
 from ..training.by_distance import Intervals, Mixture
 from ..training.selection import HeldOut, away_as, hold_out
 from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
-from .scene_side import (
-    FAST,
-    FIELD,
-    MEAN,
-    RESIDUAL,
-    STAGES,
-    SURFACES,
-    InScene,
-    SceneSide,
-    StageReport,
-    TracedStages,
-    inside,
-    stated_reports,
-)
+from .paths import TracedPaths
+from .scene import FAST, FIELD, MEAN, RESIDUAL, STAGES, SURFACES, StageReport, inside, stated_reports
+from .side import SceneSide
 from .strengths import TracedStrengths
 
 logger = logging.getLogger(__name__)
@@ -92,7 +81,7 @@ class HybridSettings(CheckedSettings):
 
 def scene_side(record: Record) -> Model:
     """Entry of the scene's side; a map of strengths is traced at one carrier."""
-    return TracedStrengths() if task_of(record).in_decibel and record.frequencies_hz is not None else TracedStages()
+    return TracedStrengths() if task_of(record).in_decibel and record.frequencies_hz is not None else TracedPaths()
 
 
 def _stages_of(problem: Problem) -> dict[str, str]:
@@ -236,46 +225,22 @@ class _Fit:
         """Predict the held-out rows by a part, and by the residuals of the scene's side."""
         model, problem = self.parts[name]
         unseen: HeldOutPrediction | None = None
-        if name == PATHS:
-            # Its stages are chosen by the held-out rows, which it predicts on the way.
-            side = self._part(name)
-            self.scene_seconds = time.perf_counter() - self.begun
-            assert isinstance(side, SceneSide)
-            self.reports += side.stages
-            model, problem = InScene(), side.problem  # the scene is corrected once
-            unseen = None if self.held_out is None else side.held_out_at(self.held_out)
-        elif model.selects(problem, [self.split]):
+        if model.selects(problem, [self.split]):
             unseen = self._part(name).unseen
+        side = self.fitted.get(name)
+        if isinstance(side, SceneSide):
+            self.scene_seconds = time.perf_counter() - self.begun
+            self.reports += side.stages
         if self.fold is None or self.held_out is None:
             return
         if unseen is None:
             place = inside(self.session, FOLDER, name, "held")
             unseen = held_out_predictions(model, problem, self.fold, self.held_out, place, name)
         self.predictions[name] = unseen
-        if name == PATHS and self._kriges_residuals:
-            self._krige_residuals(self.fold, self.held_out)
-
-    @property
-    def _kriges_residuals(self) -> bool:
-        # Strengths are kriged about the scene's, and reports of other carriers have residuals of their own.
-        one_carrier = self.record.carriers_hz is None
-        return RESIDUAL in self.problem.settings.wanted and not self.task.in_decibel and one_carrier
-
-    def _krige_residuals(self, fold: Split, held_out: HeldOut) -> None:
-        """Residuals of the training rows, and predictions of held-out rows with those of the others.
-
-        Both are residuals of the final parameters, which have seen the held-out rows, too: an approximation. To keep
-        those of the chosen state would take the reports of all rows.
-        """
-        record, seed = self.record, self.problem.seed
-        left, mean = left_over(self._part(PATHS), record, self.split), np.array(self.predictions[PATHS].mean)
-        among_known = Residuals.of(left, record, fold, seed)
-        for receiver in np.unique(held_out.receiver):
-            places = held_out.receiver == receiver
-            mean[places] += among_known(record.tx_pos_m[held_out.row[places]], int(receiver), mean.shape[1:])
-        del among_known  # as large as those of all rows
-        self.predictions[RESIDUAL] = HeldOutPrediction(np.clip(mean, 0, 1) if self.task.image else mean)
-        self.residuals = Residuals.of(left, record, self.split, seed)
+        if isinstance(side, SceneSide) and side.with_residuals is not None:
+            self.predictions[RESIDUAL] = HeldOutPrediction(side.with_residuals)
+            left = left_over(side, self.record, self.split)
+            self.residuals = Residuals.of(left, self.record, self.split, self.problem.seed)
 
     def _weights(self, held_out: HeldOut) -> tuple[str, Mixture, FloatArray, dict[str, float]]:
         """Form of the weights, the weights, those of held-out rows by the others, and mean held-out scores."""

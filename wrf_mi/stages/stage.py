@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from ..core import Split
+from ..core.types import FloatArray
 from ..models.model import Fitted, Problem, Session
 
 
@@ -18,6 +19,9 @@ class State:
     problem: Problem  # with the scene that they have edited
     mean: Any = None  # mean of the observations that later stages are about; None: theirs
     fitted: Fitted | None = None  # prediction; None: no stage predicts yet
+    #: split whose test rows are held out of the fit, by which a training may choose its steps; None: none are
+    fold: Split | None = None
+    kept: Mapping[str, Any] = field(default_factory=dict)  # what a stage needs to go on with all rows, by its name
 
 
 class Option(NamedTuple):
@@ -28,20 +32,30 @@ class Option(NamedTuple):
     #: Options of equal freedom compete by their mean score of held-out rows; one of more freedom is taken where its
     #: gain is clear (`wrf_mi.training.selection.last_gain`).
     freedom: int = 0
+    after: str = ""  # option that it goes on from: it is tried where that one is the best so far
 
 
 class Stage(ABC):
     """A stage of a fit."""
 
     name: str  # name in reports
-    trusts_default: bool = False  # whether few rows have to show a clear gain for another option than the default
 
     @abstractmethod
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
         """Its options, the default one first, which later stages of a trial are fitted by; none: it does not apply."""
 
-    def continued(self, option: Option, chosen: State) -> Option:
-        """An option for all rows, given the state that the rows of a fold led to."""
+    def confidence(self, rows: int) -> float | None:
+        """One-sided confidence by Student's t in a gain over the default that so many held-out rows have to give.
+
+        None: options of the default's freedom compete with it by their mean, others gain by a standard error.
+        """
+        return None
+
+    def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
+        """An option for all rows, given the state that the rows of a fold led to.
+
+        ``scores`` are those of the held-out rows by the options that were tried.
+        """
         return option
 
     def finish(self, state: State, split: Split, session: Session) -> State:

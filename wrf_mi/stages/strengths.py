@@ -28,13 +28,13 @@ from ..tracing.tracer import check_polarization
 from .engine import Engine, OptionReport
 from .kriging import StrengthKriging
 from .residual import StrengthResidual
-from .scene_side import CALIBRATION, CORRECTED, MEAN, SceneSide, StageReport, corrected, in_scene, too_few
+from .scene import MEAN, SceneStage, StageReport, in_scene, scene_reports
+from .side import SceneSide
 from .stage import Option, Stage, State
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
 """Spacing of the traced grid, and standard deviation of the Gaussian over which powers are averaged."""
 TRACE = TraceOptions(transmission=True, depth=STRENGTHS.depth, reflections=STRENGTHS.reflections)  # as a correction's
-AS_STATED = "scene as stated"
 ExactMean = Callable[[Sequence[Receiver]], TracedPower]
 """Power at positions themselves for some receivers of a problem; fits share what was traced."""
 
@@ -60,24 +60,6 @@ class FittedStrengths(SceneSide):
             # Errors of the other rows, which the scene knows, are as much too small: deviations stay in proportion.
             strengths = replace(strengths, widen=strengths.widen / data.error_ratio)
         return FittedStrengths(strengths, self.problem)
-
-
-class Calibration(Stage):
-    """Materials and gains by the measurements."""
-
-    name = CALIBRATION
-
-    def options(self, problem: Problem, split: Split) -> Sequence[Option]:
-        """The scene as it is stated, and calibrated where rows suffice and settings allow it."""
-        options = [Option(AS_STATED, lambda state, split, session: state)]
-        wanted = not {CALIBRATION, CORRECTED}.isdisjoint(problem.settings.wanted)
-        if wanted and (split.held_receivers or not too_few(problem.record, split)):
-            options.append(Option("calibrated", self._fit))
-        return options
-
-    def _fit(self, state: State, split: Split, session: Session) -> State:
-        session.folder.mkdir(parents=True, exist_ok=True)
-        return replace(state, problem=corrected(state.problem, split, session)[0])
 
 
 class Mean(Stage):
@@ -129,7 +111,7 @@ class TracedStrengths(Model):
 
     def fit(self, problem: Problem, split: Split, session: Session) -> FittedStrengths:
         """Calibrate the scene, trace its mean, and fit kriging about it."""
-        stages = Calibration(), Mean(), StrengthResidual(StrengthSettings())
+        stages = SceneStage(), Mean(), StrengthResidual(StrengthSettings())
         engine = Engine(self, stages, problem, split, session)
         state = engine.fit()
         strengths = state.fitted
@@ -171,12 +153,7 @@ class TracedStrengths(Model):
 
 def _stage_reports(options: Sequence[OptionReport]) -> list[StageReport]:
     """Reports of the mean, and of the calibration where it was tried: whether it was taken, and its score."""
-    reports = list[StageReport]()
-    for stage in (MEAN, CALIBRATION):
-        of_stage = [option for option in options if option.stage == stage]
-        taken = next(option for option in of_stage if option.taken)
-        if stage == MEAN or len(of_stage) > 1:
-            judged = taken if stage == MEAN else of_stage[-1]
-            seconds = sum(option.seconds or 0.0 for option in of_stage)
-            reports.append(StageReport(stage, taken.option != AS_STATED, judged.held_out, seconds))
-    return reports
+    of_mean = [option for option in options if option.stage == MEAN]
+    taken = next(option for option in of_mean if option.taken)
+    seconds = sum(option.seconds or 0.0 for option in of_mean)
+    return [StageReport(MEAN, True, taken.held_out, seconds), *scene_reports(options)[1:]]

@@ -273,6 +273,8 @@ def check_rows(split: Split, record: Record, source: str) -> None:
 class FitPlan:
     """Data, graph and schedule of a fit, a function of its arguments, those of `wrf_mi.training.trainer.Trainer`.
 
+    With ``held_out``, the validation rows of the split are those that choose stages and state; else some are chosen.
+
     Attributes:
         config: settings with number of steps and scale of transmitters.
         stages: names of the stages in their order.
@@ -288,7 +290,13 @@ class FitPlan:
     """
 
     def __init__(
-        self, record: Record, split: Split, config: TrainConfig, field: Field | None = None, scene: Any | None = None
+        self,
+        record: Record,
+        split: Split,
+        config: TrainConfig,
+        field: Field | None = None,
+        scene: Any | None = None,
+        held_out: bool = False,
     ) -> None:
         check_rows(split, record, f"split {split.name}")
         self.task, name = task_of(record), config.loss.name
@@ -308,14 +316,14 @@ class FitPlan:
         # What corrects paths is chosen also on rows far from the training rows: near them, Gaussians that interpolate
         # always gain, whatever they do elsewhere.
         wanted = (self.graph.corrects or len(self.stages) > 1) and config.patience > 0 < config.holdout_steps_fraction
-        self.choosing = hold_out_groups(split, record.tx_pos_m) if wanted else split
+        self.choosing = hold_out_groups(split, record.tx_pos_m) if wanted and not held_out else split
         # Rows for a score alone: they choose no state, and are trained on in the end.
         shown = not config.patience and 0 < config.holdout_steps_fraction < 1
         if self.graph.scene is None and record.has_positions and shown:
             self.choosing = self._with_far_rows()
-        self.in_groups = wanted and (self.choosing is not split or self.graph.corrects)
+        self.in_groups = wanted and (held_out or self.choosing is not split or self.graph.corrects)
         # Without rows to choose by, Gaussians are not used at all (`Trainer`): paths alone are the safe answer.
-        self.unjudged = self.in_groups and self.choosing is split
+        self.unjudged = self.in_groups and self.choosing is split and not held_out
         self.schedule = self._planned()
         # Sides are traced for all training rows at once, validation rows included, and addressed by these slots.
         self.known = [self.targets.at(port, rows) for port in range(self.targets.ports)]

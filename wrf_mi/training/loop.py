@@ -185,6 +185,8 @@ class TrainingLoop(ABC):
     config: LoopConfig  # settings of the loop
     schedule: Schedule  # rows and learning rates of each step
     state: FitState  # state between two steps
+    until_chosen: bool = False  # whether steps end once a state is chosen, before the validation rows train
+    ends_at: int | None = None  # step at which they end before that
     seconds: float = 0.0  # training time so far, resumed runs included
     _origin_s: float  # reading of the clock at which ``seconds`` would have been 0
     label: str  # name of the validation score
@@ -219,7 +221,7 @@ class TrainingLoop(ABC):
         save: Callable[[], None] = lambda: None,
         stop: Callable[[], bool] = lambda: False,
     ) -> bool:
-        """Train from the current step to the last; whether that was reached.
+        """Train from the current step to the last, or until a state is chosen; whether that was reached.
 
         Args:
             on_progress: called every ``log_every`` steps and at the end.
@@ -237,7 +239,14 @@ class TrainingLoop(ABC):
         self.seconds = time.perf_counter() - self._origin_s
         self._require_finite(trouble)
         save()
-        return self.state.step == self.config.steps
+        return self._is_over
+
+    @property
+    def _is_over(self) -> bool:
+        chosen, step = self.state.chosen > 0, self.state.step
+        if self.ends_at is not None and (chosen or step >= self.ends_at):
+            return True
+        return step == self.config.steps or (self.until_chosen and (chosen or step >= self.schedule.joined))
 
     def _sitting(
         self, on_progress: Callable[[Progress], None], save: Callable[[], None], stop: Callable[[], bool]
@@ -245,7 +254,7 @@ class TrainingLoop(ABC):
         """Steps to the last or until stopped (`run`); returns the report after them."""
         config, before_s, trouble = self.config, self.seconds, NonFiniteReport.none(self.state.adam)
         losses, logged, steps = dr.zeros(mi.Float), 0, 0  # steps since the last line of the log, and in this sitting
-        while self.state.step < config.steps and not (steps and stop()):
+        while not self._is_over and not (steps and stop()):
             losses, trouble = self._next(losses, trouble)
             logged, steps, last = logged + 1, steps + 1, self.state.step == config.steps
             self.seconds = time.perf_counter() - self._origin_s

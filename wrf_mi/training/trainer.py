@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ from ..gaussians import InitialGaussians
 from ..gaussians.initial import adapt, reset_opacity
 from ..graph.graph import Field, Graph
 from ..tasks import Loss
+from ..tracing.options import DISC, FACTOR
 from ..tracing.paths.traced_field import TracedField
 from .adam import NonFiniteReport
 from .by_distance import Reach, choose_reach
@@ -25,7 +27,7 @@ from .config import TrainConfig
 from .evaluator import Request
 from .fit_plan import SURFACES, FitPlan, check_params
 from .initial import starting_values
-from .loop import FitState, TrainingLoop
+from .loop import OF_FIT, FitState, TrainingLoop
 from .predictor import Predictor
 from .selection import improves
 from .step import Steps
@@ -277,6 +279,35 @@ class Trainer(TrainingLoop):
         if state.chosen:
             self.schedule, _ = self.schedule.after(state.chosen)
         self._restore_paths()
+
+    @contextmanager
+    def at_best(self) -> Iterator[None]:
+        """The best state so far in place of the present one, where stages are chosen and none is yet."""
+        present = self.state
+        if not self.plan.chooses_stages or present.chosen or present.best is None:
+            yield
+            return
+        self.state, self._predictor = present.go_back(), None
+        self.state.held_out = self.selection.choose_phase_error(self.predictor(), self.state)
+        try:
+            yield
+        finally:
+            self.state, self._predictor = present, None
+
+    def go_on_from(self, params: Mapping[str, NDArray[np.float32]], chosen: FitState) -> None:
+        """Train what is left after a state was chosen by a fit to some of the rows, with parameters of that state.
+
+        Those of another shape in this scene keep their starting values, but for Gaussians on surfaces, which have
+        places of their own.
+        """
+        start = self.state.params()
+        same = {name: values for name, values in params.items() if name in start and values.shape == start[name].shape}
+        discs = {name: values for name, values in params.items() if name in (DISC, FACTOR)}
+        self.state = FitState(start | same | discs, self.state.adam.beta_1)
+        for name in ("chosen", "reach_m", "surface", "phase_error", *OF_FIT):
+            setattr(self.state, name, getattr(chosen, name))
+        self.plan.graph.cover(self.sides, self.state.params())
+        self.schedule, self.state.step = self.schedule.after(chosen.chosen)
 
     @property
     def graph(self) -> Graph:

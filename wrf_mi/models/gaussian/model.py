@@ -30,7 +30,7 @@ from ...training.by_distance import Reach
 from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings, unused_of_loop, validates
 from ...training.fit_plan import FitPlan, check_params, field_of
-from ...training.initial import initial_gaussians
+from ...training.initial import initial_gaussians, starting_values
 from ...training.loop import FitState, Progress
 from ...training.predictor import Predictor
 from ...training.trainer import HeldOutReports, Trainer
@@ -84,6 +84,11 @@ PARAM = "param/"  # prefix of a parameter's array in ``model.npz``
 REACH = "reach_m"  # array of the reach in metres: infinite where no validation chose a finite one
 PHASE_ERROR = "phase_error"
 """Array of the standard deviation of a reflection's phase in predictions, rad, where it is not 0."""
+
+
+def placed_of(problem: Problem, plan: FitPlan) -> tuple[Receiver, ...]:
+    """Receivers of a problem as a plan's graph takes them."""
+    return placed_receivers(problem.record, by_uplink=bool(plan.graph.form.features))
 
 
 class FittedField(Fitted):
@@ -272,40 +277,110 @@ class GaussianField(Model):
             Interrupted: stopped between two steps; the checkpoint is written.
             NumericsError: a value that is not finite.
         """
-        folder, record, config = session.folder, problem.record, problem.settings
+        # Receivers without rows would have parameters that nothing trains: they get those of the others afterwards.
+        trainer = self._trainer(self._plan(problem, split), session)
+        fitted = self._finished(trainer, problem, split, session)
+        del trainer
+        release_memory()
+        return fitted
+
+    def first_stage(self, problem: Problem, split: Split, session: Session) -> tuple[FittedField, Trainer]:
+        """The best state of the first of several stages by the validation rows of a split, and the training so far.
+
+        Raises:
+            Interrupted, NumericsError: as `fit`.
+        """
+        (record, rows), scene = trained_part(problem.record, split), _scene(problem, split)
+        trainer = self._trainer(FitPlan(record, rows, problem.settings, scene=scene, held_out=True), session)
+        trainer.ends_at = trainer.schedule.stages[0] if trainer.schedule.stages else None
+        trainer.until_chosen = True
+        return self._finished(trainer, problem, split, session), trainer
+
+    def chosen(self, trainer: Trainer, problem: Problem, split: Split, session: Session) -> tuple[FittedField, Trainer]:
+        """The training of `first_stage` goes on until the validation rows have chosen a state of all stages."""
+        if (session.folder / CHECKPOINT).exists():
+            trainer = self._trainer(trainer.plan, session)
+        session.folder.mkdir(parents=True, exist_ok=True)
+        trainer.ends_at, trainer.until_chosen = None, True
+        return self._finished(trainer, problem, split, session), trainer
+
+    def continued(
+        self, trainer: Trainer, scene: str | None, problem: Problem, split: Split, session: Session
+    ) -> FittedField:
+        """The training of `chosen` in a ``scene`` goes on with all rows of a split, in the scene of a problem."""
+        folder, record, before = session.folder, problem.record, trainer.plan.graph.receivers
+        placed = placed_receivers(record, by_uplink=False)
+        if problem.scene == scene and [each.name for each in placed] == [each.name for each in before]:
+            if (folder / CHECKPOINT).exists():  # stopped in what follows
+                trainer = self._trainer(trainer.plan, session)
+            trainer.until_chosen = False
+            folder.mkdir(parents=True, exist_ok=True)
+        elif (folder / CHECKPOINT).exists():
+            trainer = self._trainer(self._plan(problem, split), session)
+        else:
+            names = [each.name for each in before]
+            order = [names.index(each.name) for each in placed if each.name in names]
+            new = tuple(number for number, each in enumerate(placed) if each.name not in names)
+            assert order == sorted(order), "a fold leaves receivers out, and moves none"
+            params, _ = of_all_receivers(trainer.state.mean_params(), None, placed, new)
+            chosen, trainer = trainer, self._trainer(self._plan(problem, split), session)
+            trainer.go_on_from(params, chosen.state)
+            trainer.seconds = chosen.seconds
+        return self._finished(trainer, problem, split, session)
+
+    def as_traced(self, problem: Problem, split: Split, session: Session) -> FittedField:
+        """The paths of a scene without any training, with the gains that training would start from."""
+        plan = self._plan(problem, split)
+        # Images are scaled to their extremes: there is no gain, and no row has to be traced.
+        sides = [] if plan.task.image else plan.traced()
+        params = {} if plan.task.image else starting_values(plan, sides, (), None)
+        return FittedField(self._arrays(plan, params, problem, split), plan.config, problem, session.folder)
+
+    def _trainer(self, plan: FitPlan, session: Session) -> Trainer:
+        """A trainer of a plan, at the last checkpoint in a folder or at the start."""
+        folder = session.folder
+        folder.mkdir(parents=True, exist_ok=True)
         stored = read_checkpoint(folder) if (folder / CHECKPOINT).exists() else None
         state = None if stored is None else FitState.from_arrays(stored)
-        # Receivers without rows would have parameters that nothing trains: they get those of the others afterwards.
-        plan = self._plan(problem, split)
-        trainer = Trainer(plan.record, plan.split, config, state=state, plan=plan)
+        trainer = Trainer(plan.record, plan.split, plan.config, state=state, plan=plan)
         trainer.seconds = 0.0 if stored is None else float(stored["seconds"])
         cut_log(folder, trainer.state.step)  # a killed run has logged steps after its checkpoint
+        return trainer
+
+    def _finished(self, trainer: Trainer, problem: Problem, split: Split, session: Session) -> FittedField:
+        """The field of a trainer after its last step (Interrupted: stopped before)."""
+        folder, steps = session.folder, trainer.config.steps
 
         def on_progress(progress: Progress) -> None:
             append_log(folder, progress)
-            session.on_progress("training", progress.step / config.steps, progress)
+            session.on_progress("training", progress.step / steps, progress)
 
         if not trainer.run(on_progress, partial(write_checkpoint, folder, trainer), session.stop):
-            raise session.interrupted(f"after step {trainer.state.step} of {config.steps}")
-        receivers = placed_receivers(record, by_uplink=bool(trainer.graph.form.features))
-        params, reach = of_all_receivers(*_used(trainer), receivers, without_rows(split))
-        arrays: Arrays = {
-            **keyed(PARAM, params),
-            **trainer.graph.form.arrays(),
-            "tx_antenna": np.asarray(astuple(record.tx_antenna)),
-            **receiver_arrays(receivers),
-        }
+            raise session.interrupted(f"after step {trainer.state.step} of {steps}")
+        with trainer.at_best():
+            return self._fitted(trainer, problem, split, folder)
+
+    def _fitted(self, trainer: Trainer, problem: Problem, split: Split, folder: Path) -> FittedField:
+        params, reach = of_all_receivers(*_used(trainer), placed_of(problem, trainer.plan), without_rows(split))
+        arrays = self._arrays(trainer.plan, params, problem, split)
         if reach is not None:
             # Receivers observe different numbers of transmitters: flat positions and their counts.
             arrays[REACH], arrays["known_m"] = np.asarray(reach.length_m), np.concatenate(reach.known_m)
             arrays["known_counts"] = np.array([len(positions_m) for positions_m in reach.known_m])
         if trainer.state.phase_error:
             arrays[PHASE_ERROR] = np.asarray(trainer.state.phase_error)
-        fitted = FittedField(arrays, config, problem, folder)
+        fitted = FittedField(arrays, trainer.config, problem, folder)
         fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.selection.reports(trainer.state)
-        del trainer
-        release_memory()
         return fitted
+
+    def _arrays(self, plan: FitPlan, params: Params, problem: Problem, split: Split) -> Arrays:
+        """Arrays of a fitted field but for its reach."""
+        return {
+            **keyed(PARAM, params),
+            **plan.graph.form.arrays(),
+            "tx_antenna": np.asarray(astuple(problem.record.tx_antenna)),
+            **receiver_arrays(placed_of(problem, plan)),
+        }
 
     def _plan(self, problem: Problem, split: Split) -> FitPlan:
         """Plan of a fit, taken from `check` where data, rows, settings and scene are the same."""

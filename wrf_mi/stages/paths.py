@@ -1,0 +1,266 @@
+"""The stage *paths*: paths of the scene, Gaussians on its surfaces and those of a field, for spectra and channels."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core import InputError, Prediction, Record, Split
+from ..core.settings import with_settings
+from ..core.types import FloatArray, IntArray
+from ..models import model
+from ..models.gaussian.model import WRF_GS_PLUS, FittedField
+from ..models.model import Arrays, Model, Problem, Session
+from ..tasks import task_of
+from ..training.config import TrainConfig, calibration_config, task_settings
+from ..training.selection import hold_out
+from ..training.trainer import Trainer
+from .engine import Engine, Fold
+from .fitted import Residuals, left_over
+from .scene import (
+    CALIBRATION,
+    CORRECTED,
+    FIELD,
+    MEAN,
+    RESIDUAL,
+    SCENE,
+    STAGES,
+    SURFACES,
+    SceneStage,
+    StageReport,
+    in_scene,
+    scene_reports,
+    too_few,
+)
+from .side import SceneSide
+from .stage import Option, Stage, State
+
+AS_TRACED, CALIBRATED, TRAINED = "as traced", "calibrated", "trained"
+IN_STATED = " in the scene as stated"
+
+
+def config_of(problem: Problem, split: Split, few: bool) -> TrainConfig:
+    """Settings of the graph: Gaussians beside paths, or paths alone.
+
+    Where rows are too ``few`` to choose stages, materials of each surface and Gaussians on surfaces are trained
+    together from the first step: of six ways the best in the mean of three draws of 5 of the laboratory's training
+    rows, judged by 60 others.
+    """
+    task, wanted = task_of(problem.record), problem.settings.wanted
+    if FIELD in wanted and not few:
+        config = with_settings(TrainConfig(), task_settings(task.name, task.image, True))
+        if SURFACES not in wanted:
+            config = with_settings(config, ["traced.surface=0"])
+    else:
+        parts = ["gain", *(["materials"] if {CALIBRATION, CORRECTED} & {*wanted} else [])]
+        config = calibration_config([*parts, *(["surface"] if SURFACES in wanted else [])], task.image)
+        config = with_settings(config, ["traced.materials=surface", *(["traced.alone=0"] if few else [])])
+    settings = problem.settings
+    of_hybrid = [f"seed={problem.seed}", f"deterministic={str(settings.deterministic).lower()}"]
+    of_hybrid += [] if settings.steps is None else [f"steps={settings.steps}"]
+    return with_settings(config, of_hybrid).resolved(problem.record.tx_pos_m[split.all_train])
+
+
+class FittedPaths(SceneSide):
+    """The scene's side: a graph of paths, Gaussians on surfaces and those of a field."""
+
+    fitted: FittedField
+
+    def arrays(self) -> Arrays:
+        """Arrays of the graph, and its settings."""
+        return super().arrays() | {"settings": model.settings_array(self.fitted.config)}
+
+    def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
+        """Reports of held-out rows by which the training chose its state; None: other rows are among them."""
+        reports = self.fitted.held_out
+        if reports is None:
+            return None
+        mine = np.flatnonzero(reports.receiver == receiver)
+        order = mine[np.argsort(reports.row[mine], kind="stable")]
+        place = np.searchsorted(reports.row[order], rows)
+        known = place < len(order)
+        if not known.all() or (reports.row[order[place]] != rows).any():
+            return None
+        return Prediction(reports.report[order[place]])
+
+
+class _Training(NamedTuple):
+    """A training whose state held-out rows choose, and the problem with the scene of its paths."""
+
+    trainer: Trainer
+    problem: Problem
+
+
+class PathsStage(Stage):
+    """Traced paths as they are, or trained: parameters of paths, then Gaussians on surfaces, then those of a field."""
+
+    name = "paths"
+
+    def options(self, problem: Problem, split: Split) -> Sequence[Option]:
+        """All; trained ones alone where rows are too few to choose by.
+
+        A training finds materials itself, from those of the scene as it is stated or as it is calibrated: both are
+        tried, and all further stages in the better one.
+        """
+        wanted = {*problem.settings.wanted}
+        if hold_out(problem.record, split) is None or too_few(problem.record, split):
+            return [Option(TRAINED, self._unjudged)]
+        options = [Option(AS_TRACED, self._as_traced)]
+        if task_of(problem.record).image and wanted <= {MEAN, RESIDUAL}:
+            return options  # images have no gain that could be trained
+        stated = [False, True] if {CALIBRATION, CORRECTED} & wanted else [False]
+        options += [Option(_named(CALIBRATED, of), partial(self._calibrated, of), 1) for of in stated]
+        if {SURFACES, FIELD} & wanted:
+            after = [(_named(TRAINED, of), _named(CALIBRATED, of)) for of in stated]
+            options += [Option(name, self._trained, 1, earlier) for name, earlier in after]
+        return options
+
+    def _as_traced(self, state: State, split: Split, session: Session) -> State:
+        config = calibration_config(["gain"], task_of(state.problem.record).image)
+        of_gain = replace(state.problem, settings=config, checked=[])
+        session.report("tracing", 0.0)
+        return replace(state, fitted=FittedPaths(WRF_GS_PLUS.as_traced(of_gain, split, session), state.problem))
+
+    def _unjudged(self, state: State, split: Split, session: Session) -> State:
+        """A training whose state is chosen, if at all, by rows that it holds out itself."""
+        few = too_few(state.problem.record, split)
+        if few:  # all of them train, as none can choose
+            split = replace(split, train=split.all_train, validation=split.validation[:0])
+        inner = replace(state.problem, settings=config_of(state.problem, split, few), checked=[])
+        return replace(state, fitted=FittedPaths(WRF_GS_PLUS.fit(inner, split, session), state.problem))
+
+    def _calibrated(self, in_stated: bool, state: State, split: Split, session: Session) -> State:
+        """The first stage of a training, or all where no rows are held out by which it could choose."""
+        problem, fold = state.problem, state.fold
+        if in_stated:
+            if SceneStage.name not in state.kept:
+                raise InputError("the scene is as stated")
+            problem = state.kept[SceneStage.name].stated
+        if fold is None or not _of_rows(problem.record, fold):
+            return self._unjudged(replace(state, problem=problem), split, session)
+        rows = replace(split, train=split.all_train, validation=fold.test, test=fold.test[:0])
+        inner = replace(problem, settings=config_of(problem, rows, False), checked=[])
+        graph, trainer = WRF_GS_PLUS.first_stage(inner, rows, session)
+        return self._with(state, problem, graph, trainer)
+
+    def _trained(self, state: State, split: Split, session: Session) -> State:
+        """All stages of the training whose first one a state has."""
+        found: _Training | None = state.kept.get(self.name)
+        if found is None:
+            return state
+        rows = found.trainer.plan.split
+        graph, trainer = WRF_GS_PLUS.chosen(found.trainer, replace(state.problem, checked=[]), rows, session)
+        return self._with(state, state.problem, graph, trainer)
+
+    def _with(self, state: State, problem: Problem, graph: FittedField, trainer: Trainer) -> State:
+        kept = {**state.kept, self.name: _Training(trainer, problem)}
+        return replace(state, problem=problem, fitted=FittedPaths(graph, problem), kept=kept)
+
+    def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
+        """The training goes on from the chosen state with all rows."""
+        found: _Training | None = chosen.kept.get(self.name)
+        if option.name == AS_TRACED:
+            return option
+
+        def fit(state: State, split: Split, session: Session) -> State:
+            problem = state.problem
+            if option.name.endswith(IN_STATED):  # what the scene's stage has found is not used
+                shutil.rmtree(session.folder / SCENE, ignore_errors=True)
+                problem = replace(problem, scene=chosen.problem.scene, material=chosen.problem.material)
+            if found is None:
+                return self._unjudged(replace(state, problem=problem), split, session)
+            inner = replace(problem, settings=config_of(problem, split, False), checked=[])
+            graph = WRF_GS_PLUS.continued(found.trainer, found.problem.scene, inner, split, session)
+            return replace(state, problem=problem, fitted=FittedPaths(graph, problem))
+
+        return option._replace(fit=fit)
+
+
+def _named(name: str, in_stated: bool) -> str:
+    return name + IN_STATED * in_stated
+
+
+def _of_rows(record: Record, fold: Split) -> bool:
+    """Whether a fold holds out rows of receivers and carriers that train, by which a training can choose its state."""
+    carriers = record.carriers_hz
+    known = carriers is None or bool(np.isin(carriers[fold.test], carriers[fold.all_train]).all())
+    return known and not fold.held_receivers
+
+
+class TracedPaths(Model):
+    """The scene's side for spectra and channels: no name of the registry."""
+
+    name, source, settings = "paths", WRF_GS_PLUS.source, object
+    tasks, gaps = WRF_GS_PLUS.tasks, WRF_GS_PLUS.gaps
+    scene, uplink = "required", "optional"
+    several_carriers, new_receivers = True, True
+
+    def fit(self, problem: Problem, split: Split, session: Session) -> FittedPaths:
+        """Correct the scene, then train paths, Gaussians on surfaces and those of the field in it.
+
+        Raises:
+            Interrupted: stopped; the correction is kept, training goes on from its checkpoint.
+        """
+        engine = Engine(self, (SceneStage(), PathsStage()), problem, split, session)
+        state = engine.fit()
+        side = state.fitted
+        assert isinstance(side, FittedPaths)
+        side.problem, side.unseen, side.options = state.problem, engine.unseen, engine.stated_reports()
+        side.stages = tuple(_reports(engine, side.fitted))
+        # Reports of other carriers have residuals of their own.
+        if RESIDUAL in problem.settings.wanted and problem.record.carriers_hz is None:
+            side.with_residuals = engine.of_fold("with-residuals", partial(_with_residuals, problem))
+        return side
+
+    def selects(self, problem: Problem, splits: Sequence[Split]) -> bool:
+        """By held-out rows."""
+        return True
+
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedPaths:
+        """The scene's side that was fitted in a folder."""
+        config, inner = model.stored_settings(TrainConfig, arrays, str(folder)), in_scene(problem, folder)
+        return FittedPaths(FittedField(arrays, config, replace(inner, settings=config), folder), inner)
+
+    def check(self, problem: Problem, splits: Sequence[Split]) -> None:
+        """Refuse what the training of the graph refuses."""
+        for split in splits:
+            config = config_of(problem, split, too_few(problem.record, split))
+            WRF_GS_PLUS.check(replace(problem, settings=config), [split])
+
+
+def _with_residuals(problem: Problem, state: State, fold: Fold, mean: FloatArray) -> FloatArray:
+    """Predictions of held-out observations, ``mean`` [q, ...] by a state, with what that leaves of the other rows."""
+    record, held_out, result = fold.problem.record, fold.held_out, np.array(mean)
+    assert state.fitted is not None
+    residuals = Residuals.of(left_over(state.fitted, record, fold.split), record, fold.split, problem.seed)
+    for place, number in enumerate(fold.numbers):
+        of_receiver = held_out.receiver == number
+        if of_receiver.any():
+            at_m = problem.record.tx_pos_m[held_out.row[of_receiver]]
+            result[of_receiver] += residuals(at_m, place, mean.shape[1:])
+    return np.clip(result, 0, 1) if task_of(problem.record).image else result
+
+
+def _reports(engine: Engine, graph: FittedField) -> list[StageReport]:
+    """Reports of the scene's stages and of those of the training; materials that the graph trained are a calibration
+    where the scene's were not taken.
+    """
+    reports = {report.stage: report for report in scene_reports(engine.reports)}
+    if any(report.taken and report.option.endswith(IN_STATED) for report in engine.reports):
+        unused = [replace(report, kept=False) for report in reports.values() if report.stage != MEAN]
+        reports |= {report.stage: report for report in unused}
+    scores: Mapping[str, float] = {} if graph.held_out is None else graph.held_out.score
+    used = {SURFACES: any(name.startswith("surface.") for name in graph.params), FIELD: graph.field is not None}
+    if CALIBRATION in scores and not reports.get(CALIBRATION, StageReport(CALIBRATION, False)).kept:
+        reports[CALIBRATION] = StageReport(CALIBRATION, True, scores[CALIBRATION])
+    trained = [StageReport(name, used[name], scores.get(name)) for name in used if name in scores or used[name]]
+    if trained:
+        trained[-1] = replace(trained[-1], seconds=graph.train_seconds)
+    reports |= {report.stage: report for report in trained}
+    return sorted(reports.values(), key=lambda report: STAGES.index(report.stage))

@@ -1,0 +1,167 @@
+"""The stage *scene*: materials, gains and geometry of a scene by the measurements (`wrf_mi.correction`).
+
+scene/    in a fit's folder: the corrected scene, of a fit to all rows with its page
+edit.npz  beside it, of a fit to a part of the rows: the state of the correction, from which one to all rows goes on
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ..backend.device import release_memory
+from ..core import Record, Split
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.types import FloatArray
+from ..correction import CorrectionOptions, default_options, write_page, write_scene
+from ..correction.edits import fit_edit, refit_edit
+from ..correction.options import FRAME, HIDDEN, PLANES
+from ..correction.state import SceneEdit
+from ..models.model import Problem, Session
+from ..scene.correction_data import FILE as CORRECTION
+from ..training.selection import hold_out_groups
+from .engine import CONFIDENCE, OptionReport
+from .stage import Option, Stage, State
+
+SCENE, EDIT = "scene", "edit.npz"
+STAGES = ("mean", "calibration", "correction", "surfaces", "field", "residual")  # stages in their order
+MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL = STAGES
+OF_GEOMETRY = frozenset((PLANES, FRAME, HIDDEN))  # parts of a correction beyond materials and gains
+FAST = tuple(stage for stage in STAGES if stage != FIELD)  # without the stage whose training takes most of the time
+AS_STATED, CALIBRATED, MOVED, ANEW = "as stated", "calibrated", "corrected", "corrected, paths found anew"
+"""Options of the scene: nothing, materials and gains (and faces that a scan lacks), planes, too, and further along the
+paths of the scene whose planes have moved."""
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """What one stage contributes."""
+
+    stage: str  # its name, of `STAGES`
+    kept: bool  # whether it is part of the prediction
+    # Mean score of held-out training rows by the stages up to it; None: it was not judged
+    held_out: float | None = None
+    seconds: float | None = None  # duration of its fit; None: it is part of the next one's
+
+
+def stated_reports(reports: Collection[StageReport]) -> list[dict[str, Any]]:
+    """Reports as ``metrics.json`` has them."""
+    return [asdict(report) for report in reports]
+
+
+def inside(session: Session, *names: str) -> Session:
+    """The session with a folder inside its own."""
+    place = session.folder.joinpath(*names)
+    return replace(session, folder=place, run=place)
+
+
+def too_few(record: Record, split: Split) -> bool:
+    """Whether the training rows are too few to hold groups of them out for a choice of stages."""
+    return hold_out_groups(split, record.tx_pos_m) is split
+
+
+def in_scene(problem: Problem, folder: Path) -> Problem:
+    """The problem with the scene of a fit in a folder: the corrected one, where there is one."""
+    corrected = folder / SCENE
+    return replace(problem, scene=str(corrected), material=None) if (corrected / CORRECTION).exists() else problem
+
+
+@dataclass(frozen=True)
+class Edited:
+    """A scene and what was found of it, kept for a fit to all rows."""
+
+    stated: Problem  # with the scene before the edit
+    options: CorrectionOptions
+    edit: SceneEdit
+
+
+class SceneStage(Stage):
+    """Correction of the scene."""
+
+    name = "scene"
+
+    def options(self, problem: Problem, split: Split) -> Sequence[Option]:
+        """The scene as it is stated, and where rows suffice and settings allow it, calibrated and corrected."""
+        options, wanted = [Option(AS_STATED, lambda state, split, session: state)], {*problem.settings.wanted}
+        enough = split.held_receivers or not too_few(problem.record, split)
+        if {CALIBRATION, CORRECTED}.isdisjoint(wanted) or not enough:
+            return options
+        how = default_options(problem.record)
+        if CORRECTED not in wanted:
+            how = replace(how, parts=tuple(part for part in how.parts if part not in OF_GEOMETRY))
+        still = replace(how, parts=tuple(part for part in how.parts if part not in (PLANES, FRAME)))
+        options.append(Option(CALIBRATED, partial(self._fit, still), 1))
+        if still != how:
+            # Other paths make good planes better. They do not mend those that fit training rows alone, and finding
+            # them takes as long as all that was done before.
+            options += [Option(MOVED, partial(self._fit, how), 2), Option(ANEW, partial(self._fit, how), 2, MOVED)]
+        return options
+
+    def confidence(self, rows: int) -> float:
+        """Fits with more freedom also fit what no surface explains."""
+        return CONFIDENCE
+
+    def _fit(self, options: CorrectionOptions, state: State, split: Split, session: Session) -> State:
+        before: Edited | None = state.kept.get(self.name)
+        stated, place = before.stated if before else state.problem, session.folder / SCENE
+        path = session.folder / EDIT
+        if not path.exists():
+            assert stated.scene is not None
+            of_fit = stated.scene, stated.record, split, options, stated.material, session.report
+            correction = fit_edit(*of_fit, before and before.edit)
+            session.folder.mkdir(parents=True, exist_ok=True)
+            write_scene(correction, place)
+            write_arrays(path, correction.state.edit.arrays())
+            del correction
+            release_memory()
+        edited = Edited(stated, options, SceneEdit.from_arrays(stored_arrays(path)))
+        problem = replace(stated, scene=str(place), material=None)
+        return replace(state, problem=problem, kept={**state.kept, self.name: edited})
+
+    def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
+        """Least squares with all rows, from what was found by the rows of the fold."""
+        edited: Edited | None = chosen.kept.get(self.name)
+        if edited is None:
+            return option
+        of_fold = chosen.problem.record.receivers
+        out = [of_fold[number].name for number in chosen.fold.held_receivers] if chosen.fold is not None else []
+
+        def fit(state: State, split: Split, session: Session) -> State:
+            problem, place = state.problem, session.folder / SCENE
+            if not (place / CORRECTION).exists():  # a resumed fit finds it
+                assert problem.scene is not None
+                of_fit = problem.scene, problem.record, split, edited.options, edited.edit
+                names = [name for name in out if name not in _held(problem, split)]
+                named = {"" if name == AS_STATED else name: score for name, score in scores.items()}
+                write_page(refit_edit(*of_fit, named, names, problem.material, session.report), place, replace=True)
+                release_memory()
+            return replace(state, problem=in_scene(problem, session.folder))
+
+        return option._replace(fit=fit)
+
+
+def _held(problem: Problem, split: Split) -> set[str]:
+    return {problem.record.receivers[number].name for number in split.held_receivers}
+
+
+def scene_reports(options: Sequence[OptionReport]) -> list[StageReport]:
+    """Reports of the stages mean, calibration and correction by those of the scene's options, none if none was tried.
+
+    Materials and gains are the calibration, all further parts the correction.
+    """
+    tried = {report.option: report for report in options if report.stage == SceneStage.name and report.seconds}
+    if not tried:
+        return []
+    taken = next((name for name, report in tried.items() if report.taken), AS_STATED)
+    reports = [StageReport(MEAN, True, tried[AS_STATED].held_out)]
+    for stage, names in ((CALIBRATION, (CALIBRATED,)), (CORRECTED, (MOVED, ANEW))):
+        of_stage = [tried[name] for name in names if name in tried]
+        if of_stage:
+            # What was not taken is reported by the last that was tried.
+            best = next((report for report in of_stage if report.taken), of_stage[-1])
+            kept = taken in names or (stage == CALIBRATION and taken in (MOVED, ANEW))
+            reports.append(StageReport(stage, kept, best.held_out, sum(report.seconds or 0.0 for report in of_stage)))
+    return reports

@@ -1,0 +1,116 @@
+"""A scene's side of a fit in stages: a model fitted in the scene that the measurements have edited."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from copy import copy
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import Prediction, Split
+from ..correction import default_options
+from ..models.error_prior import ErrorPrior
+from ..models.gaussian.model import FittedField
+from ..models.model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem
+from ..tasks import instrument_of, task_of
+from ..tracing import TraceOptions
+from ..tracing.tracer import RayTracer, fit_offsets
+from .scene import CALIBRATION, CORRECTED, FIELD, MEAN, STAGES, SURFACES, StageReport
+
+OFFSET_ROWS = 400  # most training rows whose traces tell the offset of a receiver
+
+
+class SceneSide(Fitted):
+    """A part of the hybrid that predicts from the scene, by a model fitted in it.
+
+    ``problem`` is the hybrid's with that scene, ``stages`` are reports of those that were tried, none after loading;
+    ``with_residuals`` [q, ...] are predictions of the held-out rows with what the side leaves of the others, None where
+    none were asked for.
+    """
+
+    with_residuals: NDArray[Any] | None = None
+
+    def __init__(self, fitted: Fitted, problem: Problem, stages: Collection[StageReport] = ()) -> None:
+        self.fitted, self.problem, self.stages = fitted, problem, tuple(stages)
+        self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """Observations of the receiver of that index, [m, ...]."""
+        return self.fitted.predict(inputs, receiver)
+
+    def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
+        """The mean of `predict`, of strengths in a fraction of its time."""
+        return self.fitted.predict_mean(inputs, receiver)
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        """Observations, and the paths' and the Gaussians' share of them where there are both."""
+        return self.fitted.decompose(inputs, receiver, std)
+
+    def error_prior(self, receiver: int) -> ErrorPrior | None:
+        """As of the fitted model."""
+        return self.fitted.error_prior(receiver)
+
+    def tracing_once(self) -> SceneSide:
+        """As of the fitted model."""
+        shared = copy(self)
+        shared.fitted = self.fitted.tracing_once()
+        return shared
+
+    def in_scene(self, scene: str) -> SceneSide:
+        """The fitted model in an edited copy of the scene that it was fitted in."""
+        return type(self)(self.fitted.in_scene(scene), replace(self.problem, scene=scene, material=None))
+
+    def arrays(self) -> Arrays:
+        """Arrays of the fitted model."""
+        return self.fitted.arrays()
+
+
+def by_stage(problem: Problem, split: Split, side: SceneSide, used: Collection[str]) -> dict[str, PredictAll]:
+    """Predictions of the stages up to each but the last, of the ``used`` ones of a fitted scene's side.
+
+    The problem has the scene as it is stated; training rows of the split fit offsets of traced signal strengths.
+    """
+    predictions: dict[str, PredictAll] = {}
+    earlier = [stage for stage in STAGES if stage in used][:-1]
+    if MEAN in earlier:
+        predictions[MEAN] = _traced(problem, split)
+    if side.problem.scene != problem.scene:
+        predictions |= {stage: _traced(side.problem, split) for stage in (CALIBRATION, CORRECTED) if stage in earlier}
+    field = side.fitted
+    if isinstance(field, FittedField):
+        if SURFACES in earlier:
+            fitted = field.without_gaussians() if FIELD in used else side
+            predictions[SURFACES] = partial(_at_all_receivers, fitted)
+        if FIELD in earlier:
+            predictions[FIELD] = partial(_at_all_receivers, side)
+    return predictions
+
+
+def _at_all_receivers(fitted: Fitted, inputs: Inputs) -> NDArray[np.generic]:
+    assert fitted.receivers is not None
+    return np.stack([fitted.predict_mean(inputs, receiver) for receiver in range(len(fitted.receivers))])
+
+
+def _traced(problem: Problem, split: Split) -> PredictAll:
+    """Traced reports; strengths with the offset of each receiver that fits its training rows."""
+    record, how = problem.record, default_options(problem.record)
+    stated = record if record.carriers_hz is None else record.at_carrier(record.carriers_hz[0])
+    options = TraceOptions(transmission=True, depth=how.depth, reflections=how.reflections)
+    assert problem.scene is not None
+    tracer = RayTracer(problem.scene, instrument_of(stated), options, problem.material)
+    offsets = None
+    if task_of(record).in_decibel:
+        every = split.all_train
+        rows = every[:: -(-len(every) // OFFSET_ROWS)]
+        offsets = fit_offsets(tracer(record.tx_pos_m[rows]), record.seen(split).observation[:, rows])
+
+    def predict(inputs: Inputs) -> NDArray[np.generic]:
+        traced = tracer.trace(inputs.tx_pos_m, first_row=inputs.first_row, carriers_hz=inputs.carriers_hz)
+        observed = tracer.observe(traced)
+        return observed if offsets is None else offsets(observed)
+
+    return predict
