@@ -9,7 +9,7 @@ help:
 	@echo "make demo       a scanned room and 40 measurements: hybrid, ray tracing and interpolation compared"
 	@echo "make test       lint, types, import order, tests, notebooks"
 	@echo "make test-gpu   the tests that need a CUDA device"
-	@echo "make test-slow  the tests that take minutes"
+	@echo "make test-slow  the tests and notebooks that take minutes"
 	@echo "make docs       the documentation site with executed notebooks; minutes, then seconds for what has changed"
 	@echo "make docs-quick the same without executing notebooks"
 	@echo "make package-test  wheel and source distribution, tested in empty environments; minutes"
@@ -45,7 +45,7 @@ test: lint
 	$(BIN)/pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --nbmake notebooks tests
 
 test-slow: $(READY)
-	$(BIN)/pytest -m "slow and not gpu"
+	$(BIN)/pytest -m "slow and not gpu" --nbmake notebooks tests
 
 test-gpu: $(READY)
 	$(BIN)/pytest -m gpu

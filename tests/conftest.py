@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from wrf_mi.core import Record
     from wrf_mi.parallel import Scheduler
 
+SLOW_NOTEBOOKS = ("few_measurements", "from_files_to_map", "without_measurements")
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -41,6 +42,14 @@ def pytest_configure(config: pytest.Config) -> None:
     if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
         os.environ.setdefault("OMP_NUM_THREADS", str(max(1, CORES // workers)))
     init()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the notebooks that take minutes as slow tests."""
+    for item in items:
+        if item.path.suffix == ".ipynb" and item.path.stem in SLOW_NOTEBOOKS:
+            item.add_marker("slow")
 
 
 @pytest.hookimpl(tryfirst=True)

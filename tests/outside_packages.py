@@ -118,11 +118,55 @@ def huber(prediction, truth, batch, *shape):
     error = dr.abs(prediction - dr.select(known, truth, prediction))
     return dr.mean(dr.select(error < LIMIT, dr.square(error) / 2, LIMIT * (error - LIMIT / 2)))
 """
+STEPS = """
+from dataclasses import replace
+
+import numpy as np
+
+from wrf_mi.core import Prediction
+from wrf_mi.stages.further import Further, FurtherStage
+from wrf_mi.stages.stage import Option
+
+class InSteps(Further):
+    \"\"\"Strengths of an instrument that reports multiples of a step.\"\"\"
+
+    stage = "steps"
+
+    def __init__(self, before, step_db):
+        super().__init__(before)
+        self.step_db = step_db
+
+    def predict(self, inputs, receiver):
+        prediction = self.before.predict(inputs, receiver)
+        return Prediction(self.step_db * np.round(prediction.mean / self.step_db), prediction.std)
+
+    def own_arrays(self):
+        return {"step_db": np.asarray(self.step_db)}
+
+class Steps(FurtherStage):
+    name = "steps"
+
+    def options(self, problem, split):
+        if problem.record.task != "rssi":
+            return []
+        return [Option("as predicted", lambda state, split, session: state), Option("in steps", self._fit)]
+
+    def _fit(self, state, split, session):
+        values = np.unique(state.problem.record.observation[:, split.all_train])
+        step_db = float(np.diff(values[np.isfinite(values)]).min())
+        return replace(state, fitted=InSteps(state.fitted, step_db))
+
+    def load(self, arrays, before):
+        return InSteps(before, float(arrays["step_db"]))
+
+STAGE = Steps()
+"""
 SOURCES = {
     "nearest_of_others": NEAREST,
     "attenuators": ATTENUATORS,
     "delays_of_others": DELAYS,
     "losses_of_others": HUBER,
+    "stages_of_others": STEPS,
 }
 ENTRY_POINTS = """
 [wrf_mi.models]
@@ -137,6 +181,8 @@ delay-spread = delays_of_others:TASK
 delays = delays_of_others:LAYOUT
 [wrf_mi.losses]
 huber = losses_of_others:huber
+[wrf_mi.stages]
+steps = stages_of_others:STAGE
 """
 CALLS = """
 import contextlib, io, json, sys

@@ -21,6 +21,7 @@ def test_without_a_gpu_it_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "gpu" not in all_here()
 
 
+@pytest.mark.slow
 def test_rows_have_the_figures_of_all_backends(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """All jobs are measured on the CPU, each in its own process, as no test has a GPU."""
     small = tmp_path / "small_job.py"

@@ -12,19 +12,21 @@ from typing import Any
 import numpy as np
 import pytest
 from calling import refused
-from outside_packages import ATTENUATORS, CABLE_DB, NEAREST, commands, installed
+from outside_packages import ATTENUATORS, CABLE_DB, NEAREST, STEPS, commands, installed
 from small_fits import stop_after
 from wrf_mi_bench import bench
 from wrf_mi_bench.bench import CHECKS, Check
 
 from wrf_mi import models
-from wrf_mi.core import InputError
+from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.registry import Registry
 from wrf_mi.datasets import load
+from wrf_mi.datasets.ble_folder import write_ble_folder
 from wrf_mi.graph import receivers
 from wrf_mi.graph.receivers import RECEIVERS
 from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
+from wrf_mi.stages.further import FURTHER_STAGES
 from wrf_mi.tasks import LOSSES
 
 SETTINGS = ("steps=60", "batch=8", "validate_every=20", "checkpoint_every=20", "initial.gaussians=6")
@@ -92,6 +94,44 @@ def test_registered_receiver_is_trained_resumed_evaluated_and_compared(attenuate
     field.form = replace(field.form, receiver="power")
     np.testing.assert_allclose(field.predictor(positions, 0), predicted + CABLE_DB, atol=1e-3)
     assert compare([out], tmp_path / "page")
+
+
+@pytest.fixture
+def stepped(tmp_path: Path) -> Iterator[Path]:
+    """Strengths in steps of 4 dB by the law of distance, and the stage of another package that knows of steps."""
+    module: dict[str, Any] = {}
+    exec(STEPS, module)
+    FURTHER_STAGES.add("steps", module["STAGE"])
+    yield write_ble_folder(tmp_path / "data", in_steps())
+    del FURTHER_STAGES._known["steps"]
+
+
+def in_steps() -> Record:
+    tx = np.random.default_rng(1).uniform([0, 0, 1], [12, 8, 1], (90, 3))
+    receiver = Receiver("r", np.array([1.0, 1.0, 2.5]), np.array([0.0, 0, 0, 1]))
+    power_dbm = -30 - 35 * np.log10(np.linalg.norm(tx - receiver.position_m, axis=1))
+    observed = (4 * np.round(power_dbm / 4))[None].astype(np.float32)
+    official = np.arange(60), np.arange(60, 90)
+    return Record("steps", "rssi", tx, (receiver,), observed, frequencies_hz=np.array([2.4e9]), official=official)
+
+
+def test_stage_of_another_package_is_trained_resumed_evaluated_and_compared(stepped: Path, tmp_path: Path) -> None:
+    out, reports = tmp_path / "run", [""]
+    with pytest.raises(Interrupted):
+        train(stepped, out=out, on_progress=lambda what, *_: reports.append(what), stop=lambda: "fitted" in reports[-1])
+    run = resume(out)
+    whole = train(stepped, out=tmp_path / "whole")
+    assert run.metrics["abs_error_db"] == whole.metrics["abs_error_db"] == evaluate_run(out)["abs_error_db"]
+    chosen = {report["option"]: report for report in run.metrics["options"] if report["stage"] == "steps"}
+    assert [name for name, report in chosen.items() if report["taken"]] == ["in steps"]
+    without = train(stepped, out=tmp_path / "without", settings=("stages=residual",))
+    assert run.metrics["abs_error_db"]["mean"] < without.metrics["abs_error_db"]["mean"]
+    assert [(report["stage"], report["kept"]) for report in run.stages] == [("steps", True)]
+    assert run.stages[0]["test"] == pytest.approx(run.metrics["abs_error_db"]["mean"])
+    predicted = open_run(out).predict([[2.0, 3.0, 1.0], [9.0, 5.0, 1.0]], 0)
+    np.testing.assert_array_equal(predicted.mean % 4, 0)
+    assert predicted.std is not None
+    assert compare([out, without.folder], tmp_path / "page")
 
 
 @pytest.fixture
@@ -166,12 +206,20 @@ def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[
             "nearest": ["train", flat_folder, *nearest],
             "receiver": ["train", flat_folder, "--model", "wrf-gs+", *asked],
             "loss": ["train", flat_folder, "--model", "wrf-gs+", *by_loss],
+            "stage": ["train", write_ble_folder(folder / "steps", in_steps()), "--out", folder / "stage", "--json"],
         },
     )
-    for name in ("nearest/model.npz", "nearest/metrics.json", "nearest/predictions.npz", "idw/metrics.json"):
+    for name in (
+        "stage/model.npz",
+        "stage/metrics.json",
+        "nearest/model.npz",
+        "nearest/metrics.json",
+        "nearest/predictions.npz",
+        "idw/metrics.json",
+    ):
         (folder / name).unlink()  # as of runs that were stopped
     calls = {"benchmark": ["bench", "attenuator", "--out", folder / "results", "--runs", folder / "benchmarks"]}
-    for run, of in (("nearest", "nearest"), ("idw", "kriging")):
+    for run, of in (("nearest", "nearest"), ("idw", "kriging"), ("stage", "stage")):
         calls |= {
             f"{run} resumed": ["train", "--resume", folder / run, "--json"],
             f"{run} scored": ["evaluate", folder / run, "--json"],
@@ -205,6 +253,16 @@ def test_commands_find_the_loss_of_an_installed_package(outcome: Any) -> None:
     folder, results = outcome
     assert results["loss"][0] == 0, results["loss"]
     assert "name: huber" in (folder / "huber" / "config.yaml").read_text()
+
+
+def test_commands_find_the_stage_of_an_installed_package(outcome: Any) -> None:
+    folder, results = outcome
+    asked = [f"stage{how}" for how in ("", " resumed", " scored", " predicted", " compared")]
+    assert [results[name][0] for name in asked] == [0] * 5, results
+    errors = [json.loads(results[name][1])["abs_error_db"] for name in asked[:3]]
+    assert errors[0] == errors[1] == errors[2]
+    with np.load(folder / "stage.npz") as predicted:
+        np.testing.assert_array_equal(predicted["prediction"] % 4, 0)
 
 
 def test_commands_find_the_task_and_the_layout_of_an_installed_package(outcome: Any) -> None:

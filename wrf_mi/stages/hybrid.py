@@ -47,6 +47,7 @@ from ..training import by_distance
 from ..training.by_distance import Intervals, Mixture
 from ..training.selection import HeldOut, away_as, hold_out
 from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, TRACED, UPLINK_PARTS, FittedHybrid, Residuals, left_over
+from .further import FURTHER_STAGES, first_of, fit_further, load_further
 from .paths import TracedPaths
 from .scene import FAST, FIELD, MEAN, RESIDUAL, STAGES, SURFACES, StageReport, inside, stated_reports
 from .side import SceneSide
@@ -59,9 +60,9 @@ logger = logging.getLogger(__name__)
 class HybridSettings(CheckedSettings):
     """Settings of the hybrid."""
 
-    #: stages that may be used, separated by commas, of mean, calibration, correction, surfaces, field and residual;
-    #: null: all that the data allow; without a scene the field, which takes minutes and which interpolation surpasses
-    #: near measurements, is used where it is named
+    #: stages that may be used, separated by commas, of mean, calibration, correction, surfaces, field and residual, and
+    #: of those that installed packages add; null: all that the data allow; without a scene the field, which takes
+    #: minutes and which interpolation surpasses near measurements, is used where it is named
     stages: str | None = None
     #: optimiser steps of the graph of paths and Gaussians, or, without a scene, of the field; null: the default of
     #: `TrainConfig` for the task
@@ -70,13 +71,16 @@ class HybridSettings(CheckedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if unknown := [stage for stage in self.wanted if stage not in STAGES]:
-            raise InputError(f"stages: {unknown[0]!r} is unknown; choose of {', '.join(STAGES)}")
+        every = (*STAGES, *FURTHER_STAGES)
+        if unknown := [stage for stage in self.wanted if stage not in every]:
+            raise InputError(f"stages: {unknown[0]!r} is unknown; choose of {', '.join(every)}")
 
     @property
     def wanted(self) -> tuple[str, ...]:
-        """Stages that may be used."""
-        return STAGES if self.stages is None else tuple(stage.strip() for stage in self.stages.split(","))
+        """Stages that may be used, those of installed packages last."""
+        if self.stages is None:
+            return (*STAGES, *FURTHER_STAGES)
+        return tuple(stage.strip() for stage in self.stages.split(","))
 
 
 def scene_side(record: Record) -> Model:
@@ -114,7 +118,7 @@ def _means(problem: Problem) -> list[tuple[str, bool]]:
     if problem.record.uplink is not None:
         of_uplink = [("r2f2-scene", True)] * with_scene + [(name, False) for name in UPLINK_PARTS]
         means = of_uplink if MEAN in settings.wanted else []
-    elif with_scene and task_of(problem.record).receiver_with_scene and {*settings.wanted} - {RESIDUAL}:
+    elif with_scene and task_of(problem.record).receiver_with_scene and {*settings.wanted} & {*STAGES} - {RESIDUAL}:
         means = [(PATHS, True)]
     if not with_scene and settings.stages is not None and FIELD in settings.wanted:
         means.append((FIELD, False))
@@ -293,6 +297,10 @@ def _used(names: Sequence[str], mixture: Mixture) -> list[str]:
     return used
 
 
+def _fitted(problem: Problem, split: Split, session: Session) -> FittedHybrid:
+    return _Fit(problem, split, session).hybrid()
+
+
 class Hybrid(Model):
     """The hybrid for any task, or for data of one."""
 
@@ -317,7 +325,7 @@ class Hybrid(Model):
         """Whether no part is the graph of a scene's paths, which is fitted to the rows of each receiver."""
         return problem.scene is None or problem.record.frequencies_hz is not None
 
-    def fit(self, problem: Problem, split: Split, session: Session) -> FittedHybrid:
+    def fit(self, problem: Problem, split: Split, session: Session) -> Fitted:
         """Fit all parts, and choose weights and standard deviations by held-out rows.
 
         Raises:
@@ -325,10 +333,18 @@ class Hybrid(Model):
             Interrupted: stopped; finished parts are kept.
         """
         known_positions(problem.record, problem.rows(split), self.name)
-        return _Fit(problem, split, session).hybrid()
+        names = [name for name in problem.settings.wanted if name in FURTHER_STAGES]
+        names = [name for name in names if FURTHER_STAGES[name].options(problem, split)]
+        if not names:
+            return _fitted(problem, split, session)
+        fitted, reports, options = fit_further(self, _fitted, names, problem, split, session)
+        stated = first_of(fitted).stated
+        stated["stages"] = [*stated["stages"], *reports]
+        stated["options"] = [*stated.get("options", []), *options]
+        return fitted
 
-    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedHybrid:
-        """The hybrid that `FittedHybrid.arrays` described."""
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
+        """The hybrid that `FittedHybrid.arrays` described, and stages of other packages after it."""
         facts = json.loads(str(arrays["facts"]))
         if "sizes" not in facts:
             raise InputError(f"{folder}: a hybrid of an earlier version, which mixed other models; train the run anew")
@@ -341,7 +357,8 @@ class Hybrid(Model):
         residuals = Residuals.from_arrays(left, problem.record) if left else None
         intervals = from_field_arrays(Intervals, stored) if stored else None
         reception = Reception.from_arrays(arrays, problem.record)
-        return FittedHybrid(problem, arrays["known"], parts, mixture, residuals, intervals, facts, reception)
+        hybrid = FittedHybrid(problem, arrays["known"], parts, mixture, residuals, intervals, facts, reception)
+        return load_further(arrays, hybrid)
 
     def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
         """Steps where no stage trains step by step."""
@@ -356,7 +373,7 @@ class Hybrid(Model):
             for stage in settings.wanted:
                 if stage in idle:
                     raise InputError(f"--stages {settings.stages}: {stage} has no effect: {idle[stage]}; omit it")
-            if problem.scene is not None and {*settings.wanted} == {RESIDUAL}:
+            if problem.scene is not None and {*settings.wanted} & {*STAGES} == {RESIDUAL}:
                 raise InputError(f"--scene {problem.scene}: not used by --stages {RESIDUAL}; omit one of them")
         for split in splits:
             known_positions(problem.record, split.all_train, self.name)

@@ -112,7 +112,7 @@ class PathsStage(Stage):
         if hold_out(problem.record, split) is None or too_few(problem.record, split):
             return [Option(TRAINED, self._unjudged)]
         options = [Option(AS_TRACED, self._as_traced)]
-        if task_of(problem.record).image and wanted <= {MEAN, RESIDUAL}:
+        if task_of(problem.record).image and not wanted & {CALIBRATION, CORRECTED, SURFACES, FIELD}:
             return options  # images have no gain that could be trained
         stated = [False, True] if {CALIBRATION, CORRECTED} & wanted else [False]
         options += [Option(_named(CALIBRATED, of), partial(self._calibrated, of), 1) for of in stated]

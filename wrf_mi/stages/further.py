@@ -1,0 +1,159 @@
+"""Stages of other packages, which go on from the prediction of the hybrid.
+
+A stage is an instance of `FurtherStage`, which an entry point of the group ``wrf_mi.stages`` names by the stage's name.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from copy import copy
+from functools import partial
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import Split
+from ..core.array_files import keyed, under
+from ..core.registry import Registry
+from ..models.error_prior import ErrorPrior
+from ..models.model import Arrays, Fitted, Inputs, Model, PredictAll, Problem, Session
+from .engine import Engine
+from .fitted import FittedHybrid
+from .scene import StageReport, stated_reports
+from .stage import Option, Stage, State
+
+FURTHER = "further"  # array of the names of such stages in their order, and beginning of the names of their arrays
+
+
+class Further(Fitted):
+    """A prediction that a stage made of that of the stages ``before``; all but `predict` is theirs."""
+
+    stage: str  # name of the stage
+
+    def __init__(self, before: Fitted) -> None:
+        self.before = before
+        self.receivers, self.uses_heading, self.carriers_hz = before.receivers, before.uses_heading, before.carriers_hz
+
+    @abstractmethod
+    def own_arrays(self) -> Arrays:
+        """All that `FurtherStage.load` needs beside the prediction before."""
+
+    @property
+    def depends_on_heading(self) -> bool:
+        """As before."""
+        return self.before.depends_on_heading
+
+    def _about(self, before: Fitted) -> Self:
+        changed = copy(self)
+        changed.before = before
+        return changed
+
+    def tracing_once(self) -> Self:
+        """The stage after the model that traces once."""
+        return self._about(self.before.tracing_once())
+
+    def in_scene(self, scene: str) -> Self:
+        """The stage after the prediction in an edited scene."""
+        return self._about(self.before.in_scene(scene))
+
+    def error_prior(self, receiver: int) -> ErrorPrior | None:
+        """As before."""
+        return self.before.error_prior(receiver)
+
+    def by_stage(self, split: Split) -> dict[str, PredictAll]:
+        """Predictions by the stages before, up to each and to the last of them."""
+        kept = [report["stage"] for report in self.facts()["stages"] if report["kept"]]
+        last = kept[kept.index(self.stage) - 1] if self.stage in kept[1:] else ""
+        if not last:
+            return self.before.by_stage(split)
+        count = len(first_of(self).problem.record.receivers)
+        return self.before.by_stage(split) | {last: partial(_at_all_receivers, self.before, count)}
+
+    def arrays(self) -> Arrays:
+        """Arrays of the stages before and of this one."""
+        arrays = self.before.arrays()
+        names = [*np.atleast_1d(arrays.get(FURTHER, np.zeros(0, str))), self.stage]
+        return arrays | {FURTHER: np.asarray(names, str)} | keyed(f"{FURTHER}/{self.stage}/", self.own_arrays())
+
+    def facts(self) -> dict[str, Any]:
+        """As before."""
+        return self.before.facts()
+
+
+def _at_all_receivers(fitted: Fitted, count: int, inputs: Inputs) -> NDArray[Any]:
+    return np.stack([fitted.predict_mean(inputs, receiver) for receiver in range(count)])
+
+
+def first_of(fitted: Fitted) -> FittedHybrid:
+    """The prediction that all further stages go on from."""
+    while isinstance(fitted, Further):
+        fitted = fitted.before
+    assert isinstance(fitted, FittedHybrid)
+    return fitted
+
+
+class FurtherStage(Stage):
+    """A stage after all of this package, for data of any task that it serves.
+
+    The first of its options leaves the prediction as it is; the others set ``State.fitted`` to a `Further`.
+    """
+
+    @abstractmethod
+    def load(self, arrays: Arrays, before: Fitted) -> Further:
+        """The prediction from `Further.own_arrays` and that of the stages before."""
+
+
+FURTHER_STAGES: Registry[FurtherStage] = Registry("stage", "wrf_mi.stages", {})
+
+
+class _Before(Stage):
+    """All stages of this package."""
+
+    name = "hybrid"
+
+    def __init__(self, fit: Callable[[Problem, Split, Session], Fitted]) -> None:
+        self._fit = fit
+
+    def options(self, problem: Problem, split: Split) -> Sequence[Option]:
+        """The one fit."""
+
+        def fitted(state: State, split: Split, session: Session) -> State:
+            session.folder.mkdir(parents=True, exist_ok=True)
+            return State(state.problem, fitted=self._fit(state.problem, split, session))
+
+        return [Option("fitted", fitted)]
+
+
+def fit_further(
+    entry: Model,
+    fit: Callable[[Problem, Split, Session], Fitted],
+    names: Sequence[str],
+    problem: Problem,
+    split: Split,
+    session: Session,
+) -> tuple[Fitted, list[dict[str, Any]], list[dict[str, Any]]]:
+    """A ``fit`` of all stages of this package and further ones of some names, and reports of stages and options.
+
+    The fit is made twice, once without the rows by which the further stages are chosen.
+    """
+    stages = [FURTHER_STAGES[name] for name in names]
+    engine = Engine(entry, [_Before(fit), *stages], problem, split, session)
+    fitted, reports = engine.fit().fitted, list[StageReport]()
+    assert fitted is not None
+    for stage in stages:
+        of_stage = [report for report in engine.reports if report.stage == stage.name]
+        taken = next((report for report in of_stage if report.taken), None)
+        if taken is not None:
+            seconds = sum(report.seconds or 0.0 for report in of_stage)
+            reports.append(StageReport(stage.name, taken is not of_stage[0], taken.held_out, seconds))
+    options = [report for report in engine.stated_reports() if report["stage"] in names]
+    return fitted, stated_reports(reports), options
+
+
+def load_further(arrays: Arrays, fitted: Fitted) -> Fitted:
+    """The stages of other packages after a fitted model, from the arrays of a run."""
+    for name in map(str, np.atleast_1d(arrays.get(FURTHER, np.zeros(0, str)))):
+        fitted = FURTHER_STAGES[name].load(under(f"{FURTHER}/{name}/", arrays), fitted)
+    return fitted
