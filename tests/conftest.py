@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 # another process has one of the cores, small products take twenty times as long.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import hypothesis
 import pytest
 from made_flat import write_flat, write_plain_flat
 
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from wrf_mi.parallel import Scheduler
 
 SLOW_NOTEBOOKS = ("few_measurements", "from_files_to_map", "without_measurements")
+# Machines are shared: a case may take ten times as long as the one before.
+hypothesis.settings.register_profile("shared", deadline=None)
+hypothesis.settings.load_profile("shared")
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

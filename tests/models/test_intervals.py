@@ -90,6 +90,27 @@ def test_intervals_of_few_rows_are_not_too_narrow():
     assert np.mean(inside) == pytest.approx(0.9, abs=0.03)
 
 
+def test_intervals_hold_values_of_groups_that_they_do_not_know():
+    """Images of 6 rows in 3 groups: errors of each group have a size of their own, which differs by a factor e."""
+    rng, inside = np.random.default_rng(3), {False: [], True: []}
+
+    def draw(groups: int) -> tuple[np.ndarray, np.ndarray]:
+        scale = np.repeat(np.exp(rng.normal(0, 1, groups)), 2)[:, None]
+        mean = rng.uniform(1, 3, (2 * groups, 50))
+        return mean, mean + scale * rng.normal(size=mean.shape)
+
+    for _ in range(200):
+        mean, observed = draw(3)
+        group, ones, here = np.repeat(np.arange(3), 2), np.ones(mean.shape), np.zeros(6)
+        new_mean, truth = draw(50)
+        for known in inside:
+            intervals = fit_intervals(mean, observed, ones, here, np.arange(6), group if known else None)
+            found = intervals(new_mean, np.ones(new_mean.shape), np.zeros(100))
+            inside[known].append(inside_interval(new_mean, found.stated_std, truth))
+    assert np.mean(inside[False]) < 0.86
+    assert np.mean(inside[True]) == pytest.approx(0.9, abs=0.03)
+
+
 def test_intervals_beyond_all_distances_are_as_wide_as_the_widest_and_those_of_exact_predictions_not_empty():
     rng = np.random.default_rng(1)
     distance, mean = np.linspace(0, 1, 100), np.zeros((100, 5))

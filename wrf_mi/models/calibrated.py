@@ -125,7 +125,8 @@ class WithIntervals(Model):
             predicted = held_out_predictions(self.model, problem, fold, held_out, place, self.name)
             session.discarded.append(place.folder)
         size = expected_size(task_of(record), predicted)
-        intervals = fit_intervals(predicted.mean, held_out.observed(record), size, held_out.distance_m, held_out.row)
+        of_rows = held_out.distance_m, held_out.row, held_out.group
+        intervals = fit_intervals(predicted.mean, held_out.observed(record), size, *of_rows)
         reception, every, rows = None, predicted.every, problem.rows(split)
         if every is not None:
             distance_m = RowDistance.of_rows(record, fold.all_train).of_pairs(record, *held_out.every.T)

@@ -278,7 +278,7 @@ class _Fit:
             if (std > 0).all():  # kriging of two or three rows may pass through all of them
                 # Few rows tell a factor of stated deviations, not how errors depend on them.
                 sizes, size, unit = STATED, np.ones(mean.shape), std
-        of_rows = held_out.distance_m, held_out.row
+        of_rows = held_out.distance_m, held_out.row, held_out.group
         intervals = by_distance.fit_intervals(mean / unit, observed / unit, size, *of_rows)
         if sizes == STATED:
             # Parts calibrate what they state by rows that they hold out: few more rows change little of it.

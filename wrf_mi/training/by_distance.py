@@ -297,9 +297,11 @@ class Intervals:
             size: sizes of their expected errors [m, ...], see `expected_size`.
             distance_m: distances to the nearest training row [m], metres; infinite: that of the last knot.
         """
-        std = np.interp(size, self.size, self.std)
-        std *= _columns(np.interp(distance_m, self.distance_m, self.factor), std.ndim)
-        return Prediction(mean, std)
+        return Prediction(mean, self.widths(size, _columns(distance_m, size.ndim)))
+
+    def widths(self, size: FloatArray, distance_m: FloatArray) -> FloatArray:
+        """Standard deviations of errors of some sizes at distances, of shapes that broadcast."""
+        return np.interp(size, self.size, self.std) * np.interp(distance_m, self.distance_m, self.factor)
 
 
 def expected_size(task: Task, prediction: Prediction) -> FloatArray:
@@ -314,7 +316,12 @@ def expected_size(task: Task, prediction: Prediction) -> FloatArray:
 
 
 def fit_intervals(
-    mean: NDArray[Any], observed: NDArray[Any], size: FloatArray, distance_m: FloatArray, row: IntArray
+    mean: NDArray[Any],
+    observed: NDArray[Any],
+    size: FloatArray,
+    distance_m: FloatArray,
+    row: IntArray,
+    group: IntArray | None = None,
 ) -> Intervals:
     """Intervals of which 90 % hold the held-out observations, as in split conformal prediction.
 
@@ -324,27 +331,51 @@ def fit_intervals(
         size: size of the expected error of each value [q, ...], see `expected_size`.
         distance_m: distance of each to the nearest row of its fit [q], metres.
         row: row that each belongs to [q]: those of one row, held out twice or received by several, have errors alike.
+        group: group of each [q]; intervals of the others have to hold 90 % of a group's values, too. None: one.
 
     Source: Lei et al., "Distribution-free predictive inference for regression", 2018.
     """
     # Half the width of a 90 % interval in standard deviations, of a real or a complex normal error.
     inside = COMPLEX_90 if np.iscomplexobj(observed) else REAL_90
     step = max(1, mean.size // MOST_ERRORS)
-    sizes, error = (np.ravel(values)[::step] for values in (size, np.abs(mean - observed)))
-    distance = np.broadcast_to(_columns(distance_m, mean.ndim), mean.shape).ravel()[::step]
-    # Receivers of one row have errors alike; values of an image or channel differ as much within as between rows.
-    count = len(np.unique(row)) if mean.ndim == 1 else error.size
-    # A new error exceeds the largest of n with probability 1 / (n + 1): the quantile is raised by as much.
-    level = min(LEVEL * (1 + 1 / count), 1.0)
+    groups = np.zeros(len(row), np.int64) if group is None else group
+    sizes, error, distance, rows, number = (
+        np.broadcast_to(_columns(np.asarray(values, float), mean.ndim), mean.shape).ravel()[::step]
+        for values in (size, np.abs(mean - observed), distance_m, row, groups)
+    )
     floor = max(
         SMALLEST * float(np.median(error)), float(np.finfo(np.float32).eps * np.median(np.abs(observed))), LEAST
     )
+    one_each = mean.ndim == 1
+    of_all = _fitted_intervals(sizes, error / inside, distance, rows, floor, one_each)
+    names = np.unique(number)
+    if len(names) < 2:
+        return of_all
+    # Few rows differ in how large their errors are: those of a group that intervals do not know exceed them more often.
+    ratio = np.empty(len(error))
+    for name in names:
+        out = number == name
+        kept = [values[~out] for values in (sizes, error / inside, distance, rows)]
+        others = _fitted_intervals(kept[0], kept[1], kept[2], kept[3], floor, one_each)
+        ratio[out] = error[out] / (inside * others.widths(sizes[out], distance[out]))
+    return replace(of_all, std=of_all.std * max(float(np.quantile(ratio, LEVEL)), SMALLEST))
+
+
+def _fitted_intervals(
+    sizes: FloatArray, error: FloatArray, distance: FloatArray, row: FloatArray, floor: float, one_each: bool
+) -> Intervals:
+    """Intervals of the values [n] of some rows; ``error`` [n] in half widths, ``one_each``: a value of each row."""
+    rows = len(np.unique(row))
+    # Receivers of one row have errors alike; values of an image or channel differ as much within as between rows.
+    count = rows if one_each else error.size
+    # A new error exceeds the largest of n with probability 1 / (n + 1): the quantile is raised by as much.
+    level = min(LEVEL * (1 + 1 / count), 1.0)
     # Groups by rows, not by values: the pixels of one image are no independent evidence.
-    groups = max(1, len(np.unique(row)) // GROUP_ROWS)
+    groups = max(1, rows // GROUP_ROWS)
     knots, std = _by_group(sizes, error, min(groups, SIZES), level)
-    std = np.maximum(std / inside, floor)
+    std = np.maximum(std, floor)
     # What the size leaves is a function of the distance: errors relative to the intervals so far.
-    ratio = error / (inside * np.interp(sizes, knots, std))
+    ratio = error / np.interp(sizes, knots, std)
     distances, factor = _by_group(distance, ratio, min(groups, DISTANCES), level)
     # Beyond the largest distance errors are those at it, never smaller than nearer ones.
     factor = np.maximum.accumulate(np.maximum(factor, SMALLEST))
@@ -364,5 +395,5 @@ def _by_group(by: FloatArray, values: FloatArray, count: int, level: float) -> t
 
 
 def _columns(values: FloatArray, axes: int) -> FloatArray:
-    """Values [m] with further axes of length one."""
-    return np.asarray(values, float).reshape(-1, *[1] * (axes - 1))
+    """Values [m] with further axes of length one; others as they are."""
+    return values.reshape(-1, *[1] * (axes - 1)) if values.ndim == 1 else values

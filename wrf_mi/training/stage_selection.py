@@ -1,0 +1,196 @@
+"""Choice of state, stages and reach of a fit beside the paths of a scene, by held-out rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..core import Split
+from ..core.types import IntArray
+from ..tracing.paths.traced_field import TracedField
+from .by_distance import Reach, choose_reach
+from .evaluator import Request
+from .fit_plan import FitPlan
+from .loop import FitState
+from .predictor import Predictor
+from .selection import improves
+
+PHASE_ERRORS = (0.5, 1.0, 1.5)  # phase errors that are tried, rad: beyond, a reflection knows nothing of its phase
+
+
+@dataclass(frozen=True)
+class HeldOutReports:
+    """Reports of training rows that a fit had not seen when it chose its state."""
+
+    receiver: IntArray  # number of the receiver of each [q]
+    row: IntArray  # row of the record [q]
+    report: NDArray[Any]  # reports [q, ...] as observations
+    score: Mapping[str, float]  # best mean score of these rows by the stages' names
+
+
+class StageSelection:
+    """Scores and reports of a fit's held-out rows; ``sides`` are the traced sides of the ports, None without a scene.
+
+    Attributes:
+        scores: scores of the held-out rows at the last validation, port by port.
+    """
+
+    def __init__(self, plan: FitPlan, sides: Sequence[TracedField | None]) -> None:
+        self.plan, self._sides, self.scores = plan, sides, np.zeros(0)
+        self._higher = plan.task.higher_is_better
+
+    def reach(self, chosen: bool, length_m: float) -> Reach | None:
+        """Reach around the rows that train before or after a state is ``chosen``; None: Gaussians count everywhere."""
+        plan = self.plan
+        if not plan.graph.corrects:
+            return None
+        # Once a state is chosen, the held-out rows train, too, unless they stay out to the end.
+        joined = chosen and plan.schedule.joined < plan.config.steps
+        rows = plan.split.all_train if joined else plan.choosing.train
+        positions_m = [plan.record.tx_pos_m[plan.targets.received(port, rows)] for port in range(plan.targets.ports)]
+        receivers = range(len(plan.record.receivers))
+        return Reach(tuple(np.concatenate([positions_m[port] for port in plan.ports(r)]) for r in receivers), length_m)
+
+    def score(self, predict: Predictor, state: FitState) -> float:
+        """Median of `scores` by a state, all receivers pooled; NaN without held-out rows.
+
+        Where Gaussians correct paths, it chooses the reach of the state.
+        """
+        plan, rows = self.plan, self._held_out(bool(state.chosen))
+        if plan.graph.corrects:
+            each = [self._corrected_scores(predict, state, rows)]
+        elif plan.graph.scene is not None:
+            each = [self._scores(predict, port, port_rows) for port, port_rows in enumerate(rows) if len(port_rows)]
+        else:
+            record, score, validation = plan.record, plan.task.training_score, self._split(state.chosen).validation
+            receivers = range(len(record.receivers)) if len(validation) else ()
+            reports = [predict.of_rows(record, validation, r) for r in receivers]
+            each = [np.ravel(score(reports[r], record.observation[r, validation])) for r in receivers]
+        self.scores = np.concatenate([np.zeros(0), *each])
+        return float(np.nanmedian(self.scores)) if len(self.scores) else float("nan")
+
+    def _split(self, chosen: bool | int) -> Split:
+        """Split whose validation rows are scored before or after a state is ``chosen``."""
+        return self.plan.split if chosen else self.plan.choosing
+
+    def _held_out(self, chosen: bool) -> list[IntArray]:
+        """Conditions of each port that are held out before or after a state is ``chosen``."""
+        split = self._split(chosen)
+        return [self.plan.targets.received(port, split.validation) for port in range(self.plan.targets.ports)]
+
+    def facts(self, chosen: bool) -> dict[str, Any]:
+        """Fields of `Progress` on the rows of `scores`, before or after a state is ``chosen``."""
+        plan, split = self.plan, self._split(chosen)
+        record, test = plan.record, plan.split.test
+        facts: dict[str, Any] = {"validation_rows": len(split.validation)}
+        if not record.has_positions or not len(split.validation):
+            return facts
+        trained = cKDTree(record.tx_pos_m[split.train])
+        by_port = plan.graph.corrects or plan.graph.scene is not None  # the order of `score`
+        scored = self._held_out(chosen) if by_port else [split.validation] * len(record.receivers)
+        away_m = trained.query(record.tx_pos_m[np.concatenate(scored)])[0]
+        facts["validation_m"] = float(np.median(away_m))
+        if not len(test):
+            return facts
+        # Validation rows are compared with test rows as they are predicted: by a field that all of these rows trained.
+        known = split.all_train if plan.schedule.joined < plan.config.steps else split.train
+        facts["test_m"] = float(np.median(cKDTree(record.tx_pos_m[known]).query(record.tx_pos_m[test])[0]))
+        far = (away_m >= facts["test_m"]) & np.isfinite(self.scores)
+        if not far.any():
+            return facts
+        rows = len(np.unique(np.concatenate(scored)[far]))
+        return facts | {"far_score": float(np.median(self.scores[far])), "far_rows": rows}
+
+    def _reports(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[Any]:
+        """Reports of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""
+        # Sides hold all training rows, held-out ones too: scores need no further search for paths.
+        slots = np.searchsorted(self.plan.known[port], rows)
+        return predict.of_side(Request(self.plan.record.tx_pos_m[rows], port, self._sides[port], slots, weight))
+
+    def _observed(self, port: int, rows: IntArray) -> NDArray[Any]:
+        return np.asarray(self.plan.record.observation[port // self.plan.graph.carriers, rows])
+
+    def _scores(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[np.float64]:
+        reports = self._reports(predict, port, rows, weight)
+        return np.ravel(self.plan.task.training_score(reports, self._observed(port, rows)))
+
+    def _corrected_scores(self, predict: Predictor, state: FitState, rows: list[IntArray]) -> NDArray[np.float64]:
+        """Scores of held-out rows where Gaussians correct paths; the best reach is used until one is chosen."""
+        plan, reach = self.plan, self.reach(bool(state.chosen), state.reach_m)
+        assert reach is not None
+        reach = reach.of_ports(plan.graph.carriers)
+        positions_m = [plan.record.tx_pos_m[port_rows] for port_rows in rows]
+        lengths = [reach.length_m]
+        if plan.in_groups and not state.chosen:
+            # Before the last stage the field has not been trained.
+            trained = plan.schedule.stage(state.step - 1) == len(plan.schedule.stages)
+            lengths = reach.lengths(positions_m) if trained else [0.0]
+        # The state keeps the reach with which it is scored, so that the best state has the best reach.
+        state.reach_m, scores = choose_reach(
+            reach, lengths, positions_m, lambda port, w: self._scores(predict, port, rows[port], w), self._higher
+        )
+        return scores
+
+    def stage_score(self, state: FitState) -> float:
+        """Mean of `scores`, which decides beside paths; the worst one where a state is no better than stages before."""
+        # A mean has less variance than a median. The best mean score of the present stage is noted in the state.
+        plan, score = self.plan, float(np.nanmean(self.scores))
+        if not len(state.stage_scores):
+            state.stage_scores = np.full(len(plan.stages), np.nan)
+        # A score right at the end of a stage is that of its last state.
+        stage, better = plan.schedule.stage(state.step - 1), np.fmax if self._higher else np.fmin
+        state.stage_scores[stage] = better(state.stage_scores[stage], score)
+        # A stage's first gain over the stages before may be chance: by less than its standard error it does not count.
+        if len(state.baseline) and not improves(self.scores, state.baseline, self._higher):
+            score = -np.inf if self._higher else np.inf
+        if (score if self._higher else -score) > state.best_score:
+            state.best_scores = self.scores
+        if state.step in plan.schedule.stages:
+            state.baseline = state.best_scores
+        return score
+
+    def choose_phase_error(self, predict: Predictor, state: FitState) -> NDArray[Any]:
+        """Reports of all rows on which a state was chosen, port by port, by the phase error that predicts them best.
+
+        Planes that are centimetres off leave phases uncertain, and the expectation of a spectrum is then nearer to what
+        is measured than the spectrum of any phases (`Graph.report`). Other reports have no such expectation.
+        """
+        plan, rows = self.plan, self._held_out(False)
+        best = self._held_out_reports(predict, state, rows)
+        if plan.graph.scene is None or not plan.task.image:
+            return best
+        observed = np.concatenate([self._observed(port, port_rows) for port, port_rows in enumerate(rows)])
+        before = np.ravel(plan.task.training_score(best, observed))
+        for phase_error in PHASE_ERRORS:
+            predict.phase_error = phase_error
+            reports = self._held_out_reports(predict, state, rows)
+            scores = np.ravel(plan.task.training_score(reports, observed))
+            # Scores are taken to rise to one maximum, as each try costs a prediction of all held-out rows.
+            if not improves(scores, before, self._higher):
+                break
+            state.phase_error, best, before = phase_error, reports, scores
+        predict.phase_error = state.phase_error
+        return best
+
+    def _held_out_reports(self, predict: Predictor, state: FitState, rows: list[IntArray]) -> NDArray[Any]:
+        reach, reports = self.reach(False, state.reach_m), list[NDArray[Any]]()
+        for port, port_rows in enumerate(rows):
+            receiver = port // self.plan.graph.carriers
+            weight = None if reach is None else reach.weight(self.plan.record.tx_pos_m[port_rows], receiver)
+            reports.append(self._reports(predict, port, port_rows, weight))
+        return np.concatenate(reports)
+
+    def reports(self, state: FitState) -> HeldOutReports | None:
+        """Reports of held-out rows by the state that was chosen on them; None: none was chosen in groups."""
+        plan = self.plan
+        if not plan.in_groups or plan.graph.scene is None or not len(state.held_out):
+            return None
+        rows = self._held_out(False)
+        receiver = [np.full(len(port_rows), port // plan.graph.carriers) for port, port_rows in enumerate(rows)]
+        best = {name: float(score) for name, score in zip(plan.stages, state.stage_scores, strict=True)}
+        return HeldOutReports(np.concatenate(receiver), np.concatenate(rows), state.held_out, best)
