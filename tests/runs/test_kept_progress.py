@@ -89,7 +89,7 @@ def test_stages_that_are_fitted_stay_where_a_later_one_fails(walked: Record, roo
     assert_noted(raised.value, folder)
     stored = {path: path.stat().st_mtime_ns for path in (folder / "parts" / "paths").rglob("*.*")}
     # Predictions by the options of each stage, and by the chosen ones.
-    assert {"chosen.npz", "scene as stated+local+default.npz"} <= {path.name for path in stored}
+    assert {"chosen.npz", "as stated+local+default.npz"} <= {path.name for path in stored}
     resumed = api.resume(folder, record=walked)
     assert all(path.stat().st_mtime_ns == time for path, time in stored.items() if path.exists())
     for name in ("abs_error_db", "weights", "held_out"):

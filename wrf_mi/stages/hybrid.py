@@ -157,7 +157,7 @@ def _add(parts: dict[str, tuple[Model, Problem]], name: str, problem: Problem, s
 
 FOLDER, KRIGING = "parts", "kriging"
 STATED_ROWS = 35
-"""Held-out rows that count as much as the deviations that parts state. The logarithm of the 90 % quantile of n errors
+"""Held-out rows that count as much as the deviations that parts state of strengths. The logarithm of the 90 % quantile of n errors
 in standard deviations has a standard error of 0.88 / sqrt(n); for stated deviations 0.15 is taken: (0.88 / 0.15)^2."""
 
 
@@ -280,8 +280,8 @@ class _Fit:
                 sizes, size, unit = STATED, np.ones(mean.shape), std
         of_rows = held_out.distance_m, held_out.row, held_out.group
         intervals = by_distance.fit_intervals(mean / unit, observed / unit, size, *of_rows)
-        if sizes == STATED:
-            # Parts calibrate what they state by rows that they hold out: few more rows change little of it.
+        if sizes == STATED and self.task.in_decibel:
+            # Strengths calibrate what they state by rows that they hold out: few more rows change little of it.
             rows = len(np.unique(held_out.row))
             trust = rows / (rows + STATED_ROWS)
             intervals = replace(intervals, std=intervals.std**trust, factor=intervals.factor**trust)

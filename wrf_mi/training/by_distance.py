@@ -352,13 +352,14 @@ def fit_intervals(
     if len(names) < 2:
         return of_all
     # Few rows differ in how large their errors are: those of a group that intervals do not know exceed them more often.
+    # Never narrower: the groups are a handful, and a factor below 1 is chance.
     ratio = np.empty(len(error))
     for name in names:
         out = number == name
         kept = [values[~out] for values in (sizes, error / inside, distance, rows)]
         others = _fitted_intervals(kept[0], kept[1], kept[2], kept[3], floor, one_each)
         ratio[out] = error[out] / (inside * others.widths(sizes[out], distance[out]))
-    return replace(of_all, std=of_all.std * max(float(np.quantile(ratio, LEVEL)), SMALLEST))
+    return replace(of_all, std=of_all.std * max(float(np.quantile(ratio, LEVEL)), 1.0))
 
 
 def _fitted_intervals(
