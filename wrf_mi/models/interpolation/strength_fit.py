@@ -94,14 +94,15 @@ class StrengthPosterior:
 
     def _process_of(self, h: Hyperparameters) -> PooledProcess:
         prior, stops, ratio, parts = self.prior, self.stops, self.ratio, []
+        poses = stops.poses.moved(h.lever_m)
         for receiver in range(len(prior.receivers_m)):
-            received = np.isfinite(stops.value_dbm[receiver])
-            poses = stops.poses.take(received).moved(h.lever_m)
-            expected, columns, sd = prior.columns(poses, receiver)
+            received = np.flatnonzero(np.isfinite(stops.value_dbm[receiver]))
+            expected, columns, sd = prior.columns(poses.take(received), receiver)
             # Reports of a stop average their own noise out, but not the fading that persists during the stop.
             variance = (h.drift_db**2 + h.noise_db**2 / stops.count[receiver, received]) * ratio[receiver] ** 2
-            parts.append(ReceiverObservations(poses, columns, stops.value_dbm[receiver, received] - expected, variance))
-        return PooledProcess(parts, h.covariance, sd, h.variance(self.headings), self.rounds)
+            value = stops.value_dbm[receiver, received] - expected
+            parts.append(ReceiverObservations(received, columns, value, variance))
+        return PooledProcess(poses, parts, h.covariance, sd, h.variance(self.headings), self.rounds)
 
     @cached_property
     def _spread_process(self) -> PooledProcess:

@@ -231,7 +231,10 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
     begins = np.searchsorted(number, np.arange(count + 1))
     value = np.full((len(value_dbm), count), np.nan)
     total = np.zeros((len(value_dbm), count))
-    for stop in range(count):
+    single = np.flatnonzero(size == 1)
+    value[:, single], total[:, single] = value_dbm[:, begins[single]], weight[:, begins[single]]
+    total[np.isnan(value)] = 0
+    for stop in np.flatnonzero(size > 1):
         chunk = slice(begins[stop], begins[stop + 1])
         for receiver, reports in enumerate(value_dbm[:, chunk]):
             known = np.isfinite(reports)
