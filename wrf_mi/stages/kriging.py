@@ -18,7 +18,7 @@ from ..models.interpolation.strengths import (
 )
 from ..models.model import Arrays, Fitted, Model, Problem, Session, known_positions
 from .engine import Engine
-from .residual import StrengthResidual
+from .residual import StrengthMean, StrengthResidual
 
 STOPS = "stop.value_dbm"
 """Array of pooled strengths, which generic kriging has not: readings, NaN where a receiver did not report at a stop."""
@@ -42,7 +42,8 @@ class StrengthKriging(GenericKriging):
         if not self.pools_receivers(problem):
             return super().fit(problem, split, session)
         known_positions(problem.record, problem.rows(split), self.name)
-        engine = Engine(self, [StrengthResidual(problem.settings, problem.stated_settings)], problem, split, session)
+        settings, stated = problem.settings, problem.stated_settings
+        engine = Engine(self, [StrengthMean(settings), StrengthResidual(settings, stated)], problem, split, session)
         fitted = engine.fit().fitted
         assert isinstance(fitted, Strengths)
         fitted.options, fitted.unseen = engine.stated_reports(), engine.unseen

@@ -116,6 +116,11 @@ class PooledProcess:
         """Inputs of a receiver's observations, and weights [n] of the field's covariances with them in a mean."""
         return self._inputs.take(self._parts[receiver].rows), self._weights[receiver]
 
+    def residual(self, receiver: int) -> tuple[IntArray, FloatArray]:
+        """Numbers of the inputs of a receiver's observations [n], and what phi . beta leaves of these [n]."""
+        part = self._parts[receiver]
+        return part.rows, part.value - part.basis @ self.beta
+
     def _reweighted(self, variance: Sequence[FloatArray]) -> list[ReceiverObservations]:
         """Parts with the noise variances that their residuals imply for Student-t noise.
 

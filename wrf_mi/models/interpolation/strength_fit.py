@@ -20,6 +20,7 @@ from ...core.types import IntArray
 from ...tasks.scores import REAL_90
 from .pooled_process import PooledProcess, ReceiverObservations, of_each
 from .strength_terms import NEAREST_M, NOISE, PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
+from .strength_trees import TREES_OF_FOLD, Forest
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced
@@ -63,6 +64,8 @@ class PriorMean:
         if self.traced is not None:
             power = self.traced(poses.position_m, receiver)
             level = power - float(np.median(self.traced.power_dbm))  # centred, so that factor and offset are apart
+        elif not self.sd[1].any():  # no exponent of the distance: a level
+            power, level = np.zeros(len(poses)), None
         else:
             distance = np.linalg.norm(self.receivers_m[receiver] - poses.position_m, axis=1)
             frequency_hz = np.broadcast_to(self.frequency_hz, len(self.receivers_m))[receiver]
@@ -70,12 +73,18 @@ class PriorMean:
             power, level = at_1m - 10 * FREE_SPACE * np.log10(np.maximum(distance, NEAREST_M)), None
         return self.transmit_dbm + power, *basis(poses, receiver, self.receivers_m, level, self.sd, self.rx_sd_db)
 
+    def deviations(self, headings: bool) -> FloatArray:
+        """Prior standard deviations of the corrections [k], see `columns`."""
+        nowhere = Poses(np.zeros((0, 3)), np.zeros(0) if headings else None)
+        return self.columns(nowhere, 0)[2]
+
 
 class StrengthPosterior:
     """Posterior of the signal strengths, given stops (possibly none) and hyperparameters.
 
     ``ratio`` [n_rx] is that of each receiver's noise to the noise of all; ``rounds`` reweight for Student-t noise.
     Means are those of ``hyperparameters``, deviations those of ``spread`` (`likely_deviations`); None: the same.
+    ``trees`` is the number of trees of what the mean terms leave; ``forest``: trees that were grown already.
     """
 
     def __init__(
@@ -86,32 +95,51 @@ class StrengthPosterior:
         stops: Stops,
         rounds: int = 0,
         spread: Hyperparameters | None = None,
+        trees: int = 0,
+        forest: Forest | None = None,
     ) -> None:
         self.prior, self.hyperparameters, self.ratio, self.stops = prior, hyperparameters, ratio, stops
         self.spread, self.rounds = spread or hyperparameters, rounds
         self.headings = stops.poses.heading_rad is not None
         self._process = self._process_of(hyperparameters)
+        self.trees, self.forest = trees, forest
+        if trees and forest is None:
+            self.forest = Forest.grown(self._process, stops.poses, len(ratio), trees)
 
-    def _process_of(self, h: Hyperparameters) -> PooledProcess:
-        prior, stops, ratio, parts = self.prior, self.stops, self.ratio, []
-        poses = stops.poses.moved(h.lever_m)
-        for receiver in range(len(prior.receivers_m)):
-            received = np.flatnonzero(np.isfinite(stops.value_dbm[receiver]))
-            expected, columns, sd = prior.columns(poses.take(received), receiver)
+    @cached_property
+    def _moved(self) -> Poses:
+        return self.stops.poses.moved(self.hyperparameters.lever_m)
+
+    @cached_property
+    def _terms(self) -> list[tuple[IntArray, FloatArray, FloatArray]]:
+        """Of each receiver: numbers of its stops [n], columns of the mean [n, k], values less the expected [n]."""
+        terms = []
+        for receiver, values in enumerate(self.stops.value_dbm):
+            received = np.flatnonzero(np.isfinite(values))
+            expected, columns, _ = self.prior.columns(self._moved.take(received), receiver)
+            terms.append((received, columns, values[received] - expected))
+        return terms
+
+    def _process_of(self, h: Hyperparameters, prior: PriorMean | None = None) -> PooledProcess:
+        """The process of hyperparameters with this lever, and of deviations of a prior with this mean."""
+        parts = []
+        for (received, columns, value), count, ratio in zip(self._terms, self.stops.count, self.ratio, strict=True):
             # Reports of a stop average their own noise out, but not the fading that persists during the stop.
-            variance = (h.drift_db**2 + h.noise_db**2 / stops.count[receiver, received]) * ratio[receiver] ** 2
-            value = stops.value_dbm[receiver, received] - expected
+            variance = (h.drift_db**2 + h.noise_db**2 / count[received]) * ratio**2
             parts.append(ReceiverObservations(received, columns, value, variance))
-        return PooledProcess(poses, parts, h.covariance, sd, h.variance(self.headings), self.rounds)
+        sd = (prior or self.prior).deviations(self.headings)
+        return PooledProcess(self._moved, parts, h.covariance, sd, h.variance(self.headings), self.rounds)
 
     @cached_property
     def _spread_process(self) -> PooledProcess:
         return self._process if self.spread == self.hyperparameters else self._process_of(self.spread)
 
-    @property
-    def cost(self) -> float:
-        """Minus twice the logarithm of the marginal likelihood of the stops, up to a constant."""
-        return self._process.cost
+    def cost(self, prior: PriorMean, h: Hyperparameters) -> float:
+        """Minus twice the logarithm of the marginal likelihood of the stops, up to a constant.
+
+        ``h`` has the lever of these hyperparameters, and ``prior`` other deviations about this mean.
+        """
+        return self._process_of(h, prior).cost
 
     def predict(self, poses: Sequence[Poses], receiver: int) -> list[tuple[FloatArray, FloatArray]]:
         """Mean in dBm, and variance of the local mean power about it, [m] each, of several poses [m]."""
@@ -124,6 +152,9 @@ class StrengthPosterior:
             mean, variance = self._process.predict(receiver, moved[k], terms[k][1])
             if spread is not self._process:
                 variance = spread.predict(receiver, moved[k], terms[k][1])[1]
+            if self.forest is not None:
+                more = self.forest.predict(poses[k], receiver)
+                mean, variance = mean + more[0], variance + more[1]
             return terms[k][0] + mean, variance
 
         spread = self._spread_process  # computed here, not on threads
@@ -138,6 +169,8 @@ class StrengthPosterior:
         moved = poses.moved(self.hyperparameters.lever_m)
         expected, columns, _ = self.prior.columns(moved, receiver)
         field = self.hyperparameters.weighted_covariance(moved, *self._process.weights(receiver))
+        if self.forest is not None:
+            field = field + self.forest.predict(poses, receiver)[0]
         return expected + columns @ self._process.beta + field
 
 
@@ -160,8 +193,6 @@ def by_likelihood(
     length_m = max(np.sqrt(spacing_m * extent_m / 2), NEAREST_M)  # rows may all be at one place
     middle = np.log([AREA_SHADOW_DB, length_m, AREA_NOISE_DB, prior.rx_sd_db])
     deviation = np.array([0.5, 1.0, 0.5, 1.0])
-    ratio = np.ones(len(few.receivers_m))
-
     def at(logarithms: FloatArray, prior: PriorMean) -> tuple[PriorMean, Hyperparameters]:
         shadow_db, shadow_m, noise_db, rx_sd_db = map(float, np.exp(logarithms))
         chosen = {"shadow_db": shadow_db, "shadow_m": shadow_m, "drift_db": noise_db, "noise_db": noise_db}
@@ -176,9 +207,11 @@ def by_likelihood(
         logarithms[free] = chosen
         return logarithms
 
+    posterior = StrengthPosterior(few, start, np.ones(len(few.receivers_m)), stops)
+
     def cost(chosen: FloatArray) -> float:
-        fit = StrengthPosterior(*at(every(chosen), few), ratio, stops)
-        return fit.cost + float(np.square((chosen - middle[free]) / deviation[free]).sum())
+        penalty = float(np.square((chosen - middle[free]) / deviation[free]).sum())
+        return posterior.cost(*at(every(chosen), few)) + penalty
 
     simplex = np.vstack([middle[free], middle[free] + np.diag(deviation[free])])
     options = {"initial_simplex": simplex, "maxfev": LIKELIHOOD_STEPS, "xatol": 0.05, "fatol": 0.1}
@@ -236,6 +269,7 @@ class Fit:
         self._prior, self._measured = prior, measured
         self.ratio = np.ones(len(prior.receivers_m))
         self.spread: Hyperparameters | None = None
+        self.trees = 0  # number of trees of each fold
         used = [*folds(measured.poses.position_m)][::every]
         self._folds = [(join(measured.take(train)), held_out) for train, held_out in used]
 
@@ -252,7 +286,13 @@ class Fit:
             hidden = (np.arange(len(mean)) % 2 == number) & unheard
             value_dbm = np.where(hidden[:, None], np.nan, stops.value_dbm)
             field = StrengthPosterior(
-                self._prior, hyperparameters, self.ratio, replace(stops, value_dbm=value_dbm), rounds, self.spread
+                self._prior,
+                hyperparameters,
+                self.ratio,
+                replace(stops, value_dbm=value_dbm),
+                rounds,
+                self.spread,
+                self.trees,
             )
             predicts = hidden | (not unheard)
             measured_dbm = np.where(predicts[:, None], self._measured.value_dbm, np.nan)

@@ -39,6 +39,8 @@ from .strength_fit import (
     widening,
 )
 from .strength_terms import OF_HEADINGS, Hyperparameters, Measured, Poses, Stops, stops_of
+from .strength_trees import TREES as TREES_OF_ALL
+from .strength_trees import TREES_OF_FOLD, Forest
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced, Tracer
@@ -49,6 +51,7 @@ MOST_COVARIANCES = 2e8
 """Covariances between stops over all receivers, whose factors take 1.6 GB; with more, stops are thinned."""
 ROBUST_ROUNDS = 2
 LEAST_HEARD = 4  # receivers with more than a few rows that tell how well the others are predicted from them
+NO_SHADOW_DB = 1e-3  # standard deviation of shadowing where there is none: it has to be above zero
 WIDER = 2.0  # factor of the stops' extent during the search, which takes a third of the time for the same choice
 SKEW_DB = 0.4  # shift of predictions a priori, as fades reach deeper than peaks
 STOP_M, STOP_RAD, STOP_ROWS = 0.1, 0.2, 20  # consecutive rows so near, so little turned and so many at most are joined
@@ -59,10 +62,11 @@ EXPONENT_SD = (1.0, 0.3)
 TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
 BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
-Shadowing = Literal["default", "searched", "likelihood"]
-SHADOWINGS: tuple[Shadowing, ...] = ("default", "searched", "likelihood")
-DEFAULT, BY_SEARCH, LIKELIHOOD = SHADOWINGS
-"""Origins of hyperparameters, see `StrengthSettings.shadowing`."""
+LEVEL_SD_DB = 10.0  # likewise of each receiver's level where the mean has no law of distance
+Shadowing = Literal["default", "searched", "likelihood", "trees", "none"]
+SHADOWINGS: tuple[Shadowing, ...] = ("default", "searched", "likelihood", "trees", "none")
+DEFAULT, BY_SEARCH, LIKELIHOOD, TREES, NONE = SHADOWINGS
+"""Origins of shadowing, see `StrengthSettings.shadowing`."""
 EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
 
 
@@ -75,11 +79,14 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
     Attributes:
         transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
             or 0 dBm without any.
-        shadowing: where hyperparameters come from: ``default``, ``searched`` by stretches that are held out, or
-            ``likelihood``; null: the one whose predictions of held-out rows have the smallest error.
+        distance: whether the mean has a law of distance, or else a level for each receiver; null: held-out rows choose.
+        shadowing: what is added to the mean: kriging with hyperparameters that are ``default``, ``searched`` by
+            stretches that are held out, or of the greatest ``likelihood``; randomised ``trees``; or ``none``; null:
+            that whose predictions of held-out rows have the smallest error.
     """
 
     transmit_dbm: float | None = None
+    distance: bool | None = None
     shadowing: Shadowing | None = None
     FIXED: ClassVar[Mapping[str, float]] = {
         "receiver_sd_db": RECEIVER_SD_DB,
@@ -163,7 +170,7 @@ class Strengths(Fitted):
         stops = _stops(_measured(record, rows, field.headings))
         with one_blas_thread():
             posterior = StrengthPosterior(
-                field.prior, field.hyperparameters, field.ratio, stops, field.rounds, field.spread
+                field.prior, field.hyperparameters, field.ratio, stops, field.rounds, field.spread, field.trees
             )
         return replace(self, field=posterior)
 
@@ -195,7 +202,7 @@ class Strengths(Fitted):
             turns = np.zeros(len(position_m)) if field.headings else None
             return field.prior.columns(Poses(position_m, turns), receiver)[1]
 
-        deviation = field.prior.columns(field.stops.poses.take(np.zeros(0, np.int64)), receiver)[2]
+        deviation = field.prior.deviations(field.headings)
         noise = h.drift_db**2 + h.noise_db**2 / field.stops.count[receiver, received]
         scale = widen * field.ratio[receiver] ** 2
         return ErrorPrior(
@@ -227,6 +234,8 @@ class Strengths(Fitted):
             **field_arrays(field.hyperparameters, "knob."),
             **field_arrays(field.spread, "spread."),
         }
+        if field.forest is not None:
+            arrays |= field.forest.arrays() | {"trees": field.trees}
         if prior.traced is not None:
             arrays |= field_arrays(prior.traced.local if prior.traced.exact else prior.traced, "map.")
             if prior.traced.exact:
@@ -256,7 +265,9 @@ class Strengths(Fitted):
         spread = hyperparameters  # earlier versions stored no other
         if "spread.shadow_m" in arrays:
             spread = from_field_arrays(Hyperparameters, arrays, "spread.")
-        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]), spread)
+        rounds, trees = int(arrays["rounds"]), int(arrays.get("trees", 0))
+        forest = Forest.from_arrays(arrays)
+        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, rounds, spread, trees, forest)
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         shadowing = str(arrays.get("shadowing", DEFAULT))
         options = json.loads(str(arrays.get("options", "[]")))
@@ -323,8 +334,13 @@ def fit_strengths(
         hyperparameters = search.search(
             hyperparameters, stated, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
         )
-    ones = np.ones(len(measured.value_dbm))
-    field = StrengthPosterior(prior, hyperparameters, ones, _stops(measured), ROBUST_ROUNDS)
+    elif shadowing in (TREES, NONE):
+        # What shadowing is left in the mean terms' residuals is noise to these.
+        h = hyperparameters
+        drift_db = float(np.linalg.norm([h.drift_db, h.shadow_db, h.body_db]))
+        hyperparameters = replace(h, drift_db=drift_db, shadow_db=NO_SHADOW_DB, body_db=0.0)
+    ones, trees = np.ones(len(measured.value_dbm)), TREES_OF_ALL * (shadowing == TREES)
+    field = StrengthPosterior(prior, hyperparameters, ones, _stops(measured), ROBUST_ROUNDS, trees=trees)
     # Traces at exact positions have no fades left in what they do not predict.
     shift = 0.0 if power_map is not None and power_map.exact else SKEW_DB
     strengths = Strengths(field, shift, ones, {"rows": float(len(measured.rows))}, shadowing)
@@ -345,9 +361,9 @@ def calibrated(
     if len(measured.rows) < 2:
         return strengths
     fit = Fit(prior, measured, _stops)
+    fit.trees = min(TREES_OF_FOLD, field.trees)
     fit.set_ratio(hyperparameters)
-    if strengths.shadowing != LIKELIHOOD:  # whose hyperparameters are those of a likelihood already
-        fit.spread = likely_deviations(prior, field.stops, hyperparameters, stated)
+    fit.spread = _deviations(strengths, stated)
     on_progress("strengths: held-out rows", 0.8)
     mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
     residual = values - mean
@@ -361,9 +377,24 @@ def calibrated(
     if np.isfinite(residual).any():
         facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
     on_progress("strengths: all rows", 0.9)
-    field = StrengthPosterior(prior, hyperparameters, fit.ratio, field.stops, ROBUST_ROUNDS, fit.spread)
+    field = StrengthPosterior(
+        prior, hyperparameters, fit.ratio, field.stops, ROBUST_ROUNDS, fit.spread, field.trees, field.forest
+    )
     on_progress("strengths: all rows", 1.0)
     return replace(strengths, field=field, shift_db=shift, widen=widen, fit_facts=facts)
+
+
+def _deviations(strengths: Strengths, stated: Collection[str]) -> Hyperparameters | None:
+    """Hyperparameters of the deviations, see `likely_deviations`; None: those of the means."""
+    field, shadowing = strengths.field, strengths.shadowing
+    h, likely = field.hyperparameters, partial(likely_deviations, field.prior, field.stops)
+    if shadowing == LIKELIHOOD:  # whose hyperparameters are those of a likelihood already
+        return None
+    if shadowing == TREES:
+        # The noise about the shadowing, which the spread of the trees stands for.
+        noise = likely(StrengthSettings().hyperparameters, stated)
+        return replace(h, drift_db=noise.drift_db, noise_db=noise.noise_db)
+    return likely(h, {*stated, "shadow_db"} if shadowing == NONE else stated)
 
 
 def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:
@@ -388,6 +419,8 @@ def _prior(record: Record, measured: Measured, power_map: Traced | None, setting
     receivers_m = np.stack([receiver.position_m for receiver in record.receivers]).astype(float)
     traced_sd = np.multiply(TRACED_SD, power_map is not None)
     sd = np.array([(OFFSET_SD_DB, RECEIVER_SD_DB), EXPONENT_SD, traced_sd, BODY_PATTERN_DB])
+    if settings.distance is False:
+        sd[:2] = (OFFSET_SD_DB, LEVEL_SD_DB), (0, 0)
     of_receivers = record.receiver_carriers_hz
     carrier_hz = np.mean(record.frequencies_hz, keepdims=True) if of_receivers is None else of_receivers
     at_0_dbm = PriorMean(receivers_m, 0.0, carrier_hz, power_map, sd, RECEIVER_PATTERN_DB)
