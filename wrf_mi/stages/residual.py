@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 from ..core import Split
 from ..datasets.observations import LEAST_ROWS, rows_received
 from ..models.interpolation.strength_terms import Hyperparameters
 from ..models.interpolation.strengths import (
-    BY_SEARCH,
     DEFAULT,
     LIKELIHOOD,
     SHADOWINGS,
@@ -62,7 +61,7 @@ class StrengthResidual(Stage):
         if self.settings.shadowing is not None:
             names = (self.settings.shadowing,)
         elif not {each.name for each in fields(Hyperparameters)}.isdisjoint(self.stated):
-            names = DEFAULT, BY_SEARCH, LIKELIHOOD  # kriging alone has hyperparameters
+            names = DEFAULT, LIKELIHOOD  # kriging alone has hyperparameters
         return [Option(name, partial(self._fit, replace(self.settings, shadowing=name))) for name in names]
 
     def _fit(self, settings: StrengthSettings, state: State, split: Split, session: Session) -> State:
@@ -71,20 +70,6 @@ class StrengthResidual(Stage):
             settings, mean = replace(settings, distance=False), None
         fitted = fit_strengths(record, rows, mean, settings, session.report, self.stated, calibrate=False)
         return replace(state, fitted=fitted)
-
-    def continued(self, option: Option, chosen: State) -> Option:
-        """Lengths that were searched hold for all rows, too, of which those of a search would be much the same."""
-        if option.name != BY_SEARCH:
-            return option
-        assert isinstance(chosen.fitted, Strengths)
-        found = replace(self.settings, shadowing=DEFAULT, **asdict(chosen.fitted.field.hyperparameters))
-
-        def fit(state: State, split: Split, session: Session) -> State:
-            state = self._fit(found, state, split, session)
-            assert isinstance(state.fitted, Strengths)
-            return replace(state, fitted=replace(state.fitted, shadowing=BY_SEARCH))
-
-        return option._replace(fit=fit)
 
     def finish(self, state: State, split: Split, session: Session) -> State:
         """Deviations, shift and noise of each receiver, by stretches that are held out."""

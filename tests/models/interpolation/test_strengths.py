@@ -227,25 +227,6 @@ def test_model_is_restored_from_arrays() -> None:
     assert again.facts() == model.facts()
 
 
-def test_search_lowers_the_held_out_error() -> None:
-    record = made(120, noise_db=1.0, body_db=3.0)
-    wrong = replace(DEFAULTS, shadow_db=12.0, shadow_m=0.2)
-    settings = wrong, replace(wrong, shadowing="searched")
-    before, after = (fit_strengths(record, np.arange(120), None, one, stated=()).facts()["fitted"] for one in settings)
-    assert after["held_out_db"] < before["held_out_db"] - 0.1
-    assert after["shadow_db"] < 12
-
-
-def test_an_antenna_ahead_of_its_stated_position_is_found() -> None:
-    record = made(120, noise_db=0.5)
-    ahead = Poses(record.tx_pos_m, record.tx_heading_rad).moved(0.4).position_m
-    turn = record.tx_heading_rad[:, None]
-    np.testing.assert_allclose(ahead - record.tx_pos_m, 0.4 * np.hstack([np.cos(turn), np.sin(turn), 0 * turn]))
-    stated = replace(record, tx_pos_m=2 * record.tx_pos_m - ahead)  # the antenna is 0.4 m ahead of that
-    model = fit_strengths(stated, np.arange(120), settings=replace(DEFAULTS, shadowing="searched", noise_db=1.0))
-    assert model.facts()["fitted"]["lever_m"] == pytest.approx(0.4, abs=0.15)  # steps of the search
-
-
 def test_stops_are_thinned_where_factors_would_fill_the_memory(turning, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(strengths, "MOST_COVARIANCES", 3 * 50**2)
     model = fit_strengths(turning[0], np.arange(150))
@@ -274,11 +255,10 @@ def test_folds_hold_all_readings_of_a_place_out(visits: str) -> None:
     assert (held == 1).all()
 
 
-def test_rows_of_one_place_hold_nothing_out_and_keep_the_start_of_a_search() -> None:
+def test_rows_of_one_place_hold_nothing_out() -> None:
     assert list(folds(np.zeros((30, 3)))) == []
-    record = replace(made(30, 1.0), tx_pos_m=np.ones((30, 3)))
-    fitted = fit_strengths(record, np.arange(30), settings=replace(DEFAULTS, shadowing="searched"))
-    assert fitted.field.hyperparameters == DEFAULTS.hyperparameters
+    fitted = fit_strengths(replace(made(30, 1.0), tx_pos_m=np.ones((30, 3))), np.arange(30))
+    assert fitted.shift_db == strengths.SKEW_DB
 
 
 def test_skewed_residuals_shift_and_widen() -> None:

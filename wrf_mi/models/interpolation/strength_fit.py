@@ -1,4 +1,4 @@
-"""Fit of signal strengths: expected power, folds, choice of hyperparameters, calibration of predictions.
+"""Fit of signal strengths: expected power, folds, likely hyperparameters, calibration of predictions.
 
 The processes of the receivers are those of `wrf_mi.models.interpolation.pooled_process`.
 """
@@ -19,8 +19,8 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks.scores import REAL_90
 from .pooled_process import PooledProcess, ReceiverObservations, of_each
-from .strength_terms import NEAREST_M, NOISE, PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
-from .strength_trees import TREES_OF_FOLD, Forest
+from .strength_terms import NEAREST_M, PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
+from .strength_trees import Forest
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced
@@ -31,10 +31,6 @@ STRETCH = (4, 150)
 """Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
 PLACE_M = 0.1  # grid whose cells are places: readings at a stop differ by what positions are known to
 BUFFER = 0.25  # share of a stretch that is left out on either side of it, as consecutive rows share noise
-SEARCHED, SEARCHED_OF_HEADINGS = ("shadow_db", "shadow_m", *PARTS_OF_NOISE), ("body_db", "body_m", "lever_m")
-"""Hyperparameters that the search may change, the latter where headings count."""
-LEAST_GAIN_DB = 0.005  # least reduction of the held-out error by which the search changes a parameter
-MOST_STEPS = 5  # steps of one parameter in one direction
 TRUST = 500.0  # number of held-out values that weigh as much as the prior in estimates from their distribution
 SKEW_TRUST = 2000.0  # the same number for the middle of their narrowest half, which is less certain than a mean
 RATIO = (0.5, 2.0)  # bounds of the ratio of a receiver's noise to that of all
@@ -263,14 +259,14 @@ def folds(position_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
 
 
 class Fit:
-    """Choices by held-out stretches of the training rows, of one fold in ``every``; ``join`` makes stops of rows."""
+    """Predictions of held-out stretches of the training rows; ``join`` makes stops of rows."""
 
-    def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops], every: int = 1) -> None:
+    def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops]) -> None:
         self._prior, self._measured = prior, measured
         self.ratio = np.ones(len(prior.receivers_m))
         self.spread: Hyperparameters | None = None
         self.trees = 0  # number of trees of each fold
-        used = [*folds(measured.poses.position_m)][::every]
+        used = folds(measured.poses.position_m)
         self._folds = [(join(measured.take(train)), held_out) for train, held_out in used]
 
     def held_out(
@@ -311,45 +307,14 @@ class Fit:
                 mean[receiver, received[receiver]], std[receiver, received[receiver]] = value, np.sqrt(total)
         return mean, std
 
-    def _residual(self, hyperparameters: Hyperparameters) -> FloatArray:
-        return self.held_out(hyperparameters)[0] - self._measured.value_dbm
-
     def set_ratio(self, hyperparameters: Hyperparameters) -> None:
         """Set ``ratio`` by the spread of each receiver's held-out residuals."""
-        received = [row[np.isfinite(row)] for row in np.abs(self._residual(hyperparameters))]
+        residual_db = self.held_out(hyperparameters)[0] - self._measured.value_dbm
+        received = [row[np.isfinite(row)] for row in np.abs(residual_db)]
         spread = np.array([np.median(row) if len(row) else 1 for row in received])
         count = np.array([len(row) for row in received])
         # Shrunk towards 1 in the logarithm: the spread of few residuals is chance.
         self.ratio = np.clip(spread / np.median(spread), *RATIO) ** (count / (count + TRUST))
-
-    def search(
-        self, hyperparameters: Hyperparameters, stated: Collection[str], on_progress: Callable[[float], None]
-    ) -> Hyperparameters:
-        """Change one parameter at a time while that lowers the mean absolute held-out error by `LEAST_GAIN_DB`.
-
-        One pass through all parameters that are not ``stated``; ``on_progress`` takes the fraction done. Rows that are
-        all at one place hold nothing out and choose nothing.
-        """
-        if not self._folds:
-            return hyperparameters
-
-        def error_db(candidate: Hyperparameters) -> float:
-            return float(np.nanmean(np.abs(self._residual(candidate))))
-
-        names = ["shadow_db", "shadow_m", NOISE]
-        if self._measured.poses.heading_rad is not None:
-            names += SEARCHED_OF_HEADINGS
-        # Each error fits all folds anew, a Cholesky factor for every receiver: only a few steps are affordable.
-        best = error_db(hyperparameters)
-        for done, name in enumerate(names, start=1):
-            for sign in (1, -1):
-                for _ in range(MOST_STEPS):
-                    candidate = hyperparameters.changed(name, sign, stated)
-                    if candidate == hyperparameters or (error := error_db(candidate)) > best - LEAST_GAIN_DB:
-                        break
-                    best, hyperparameters = error, candidate
-            on_progress(done / len(names))
-        return hyperparameters
 
 
 def shift_of(residual_db: FloatArray, prior_db: float = 0.0) -> float:

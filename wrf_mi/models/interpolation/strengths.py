@@ -52,7 +52,6 @@ MOST_COVARIANCES = 2e8
 ROBUST_ROUNDS = 2
 LEAST_HEARD = 4  # receivers with more than a few rows that tell how well the others are predicted from them
 NO_SHADOW_DB = 1e-3  # standard deviation of shadowing where there is none: it has to be above zero
-WIDER = 2.0  # factor of the stops' extent during the search, which takes a third of the time for the same choice
 SKEW_DB = 0.4  # shift of predictions a priori, as fades reach deeper than peaks
 STOP_M, STOP_RAD, STOP_ROWS = 0.1, 0.2, 20  # consecutive rows so near, so little turned and so many at most are joined
 RECEIVER_SD_DB = 4.0  # standard deviation of each receiver's offset from the common one: antennas and their mounting
@@ -63,9 +62,9 @@ TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
 BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
 LEVEL_SD_DB = 10.0  # likewise of each receiver's level where the mean has no law of distance
-Shadowing = Literal["default", "searched", "likelihood", "trees", "none"]
-SHADOWINGS: tuple[Shadowing, ...] = ("default", "searched", "likelihood", "trees", "none")
-DEFAULT, BY_SEARCH, LIKELIHOOD, TREES, NONE = SHADOWINGS
+Shadowing = Literal["default", "likelihood", "trees", "none"]
+SHADOWINGS: tuple[Shadowing, ...] = ("default", "likelihood", "trees", "none")
+DEFAULT, LIKELIHOOD, TREES, NONE = SHADOWINGS
 """Origins of shadowing, see `StrengthSettings.shadowing`."""
 EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
 
@@ -74,15 +73,15 @@ EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a
 class StrengthSettings(KrigingSettings, Hyperparameters):
     """Settings of kriging of signal strengths.
 
-    Hyperparameters that are stated hold; others are those at the start of a search, or priors of a likelihood.
+    Hyperparameters that are stated hold, whatever the likelihood of others.
 
     Attributes:
         transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
             or 0 dBm without any.
         distance: whether the mean has a law of distance, or else a level for each receiver; null: held-out rows choose.
-        shadowing: what is added to the mean: kriging with hyperparameters that are ``default``, ``searched`` by
-            stretches that are held out, or of the greatest ``likelihood``; randomised ``trees``; or ``none``; null:
-            that whose predictions of held-out rows have the smallest error.
+        shadowing: what is added to the mean: kriging with ``default`` hyperparameters or those of the greatest
+            ``likelihood``; randomised ``trees``; or ``none``; null: that whose predictions of held-out rows have the
+            smallest error.
     """
 
     transmit_dbm: float | None = None
@@ -98,7 +97,7 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
 
     @property
     def hyperparameters(self) -> Hyperparameters:
-        """Stated hyperparameters, and the start of a search for the others."""
+        """Stated hyperparameters, and the default ones."""
         return Hyperparameters(**{each.name: getattr(self, each.name) for each in fields(Hyperparameters)})
 
 
@@ -310,8 +309,8 @@ def fit_strengths(
         power_map: traced power, a local mean or at positions themselves; None: free space is expected.
         settings: settings; hyperparameters whose origin they leave open are the default ones.
         on_progress: progress callback.
-        stated: names of the hyperparameters that hold, whatever a search or likelihood chooses for the others; None:
-            those that differ from their defaults.
+        stated: names of the hyperparameters that hold, whatever the likelihood of the others; None: those that differ
+            from their defaults.
         calibrate: whether deviations, shift and the receivers' noise come from held-out stretches, see `calibrated`.
 
     Raises:
@@ -328,12 +327,6 @@ def fit_strengths(
     shadowing = settings.shadowing or DEFAULT
     if len(measured.rows) > 1 and shadowing == LIKELIHOOD:
         prior, hyperparameters = by_likelihood(prior, _stops(measured), hyperparameters, stated)
-    elif len(measured.rows) > 1 and shadowing == BY_SEARCH:
-        search = Fit(prior, measured, partial(_stops, factor=WIDER), every=2)
-        search.set_ratio(hyperparameters)
-        hyperparameters = search.search(
-            hyperparameters, stated, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
-        )
     elif shadowing in (TREES, NONE):
         # What shadowing is left in the mean terms' residuals is noise to these.
         h = hyperparameters
@@ -408,8 +401,8 @@ def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:
     return Measured(poses, values, rows, record.precision(rows))
 
 
-def _stops(measured: Measured, factor: float = 1.0) -> Stops:
-    stops = stops_of(measured, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
+def _stops(measured: Measured) -> Stops:
+    stops = stops_of(measured, STOP_M, STOP_RAD, STOP_ROWS)
     return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(measured.value_dbm))))
 
 
