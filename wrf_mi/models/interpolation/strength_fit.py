@@ -35,8 +35,9 @@ TRUST = 500.0  # number of held-out values that weigh as much as the prior in es
 SKEW_TRUST = 2000.0  # the same number for the middle of their narrowest half, which is less certain than a mean
 RATIO = (0.5, 2.0)  # bounds of the ratio of a receiver's noise to that of all
 AREA_SHADOW_DB, AREA_NOISE_DB = 6.0, 2.0  # shadowing of areas a priori, and both parts of the noise
-LIKELIHOOD_STOPS, LIKELIHOOD_RECEIVERS, LIKELIHOOD_STEPS = 400, 12, 80
+LIKELIHOOD_STOPS, LIKELIHOOD_RECEIVERS, LIKELIHOOD_STEPS = 400, 12, 50
 """Largest numbers of stops and receivers in the likelihood, those with most rows, and of its evaluations."""
+DEVIATION_STOPS = 200  # the first of these where deviations alone are wanted
 COVERED = 0.9  # share of residuals that calibrated intervals cover
 
 
@@ -171,15 +172,19 @@ class StrengthPosterior:
 
 
 def by_likelihood(
-    prior: PriorMean, stops: Stops, start: Hyperparameters, stated: Collection[str] = ()
+    prior: PriorMean,
+    stops: Stops,
+    start: Hyperparameters,
+    stated: Collection[str] = (),
+    most: int = LIKELIHOOD_STOPS,
 ) -> tuple[PriorMean, Hyperparameters]:
     """Mean and hyperparameters by the likelihood of the stops, for areas of any extent.
 
     Shadowing, noise and the deviation of the receivers' patterns, which may be sectors, have the greatest posterior
     density. The length is a priori the geometric mean of the stops' spacing and half of their extent, uncertain by a
-    factor e. Hyperparameters that are ``stated`` hold.
+    factor e. Hyperparameters that are ``stated`` hold. Of more than ``most`` stops that many count.
     """
-    stops, few = stops.thinned(LIKELIHOOD_STOPS), prior
+    stops, few = stops.thinned(most), prior
     if prior.traced is None and len(prior.receivers_m) > LIKELIHOOD_RECEIVERS:
         counts = np.isfinite(stops.value_dbm).sum(axis=1)
         most = np.sort(np.argsort(-counts, kind="stable")[:LIKELIHOOD_RECEIVERS])
@@ -223,7 +228,7 @@ def likely_deviations(
     noise, and little on that. The likelihood tells both, by differences of rows at all distances, so that what a
     reading adds to the uncertainty of the mean is known. Parameters that are ``stated`` hold.
     """
-    return by_likelihood(prior, stops, hyperparameters, {*stated, "shadow_m"})[1]
+    return by_likelihood(prior, stops, hyperparameters, {*stated, "shadow_m"}, DEVIATION_STOPS)[1]
 
 
 def scales(position_m: FloatArray) -> tuple[float, float]:
