@@ -100,7 +100,6 @@ OTHER |= {
     "heading_length": ["0.4"],
     "cone_deg": ["40"],
     "shadowing": ["likelihood", "trees", "none"],
-    "distance": ["false"],
     "likelihood_rows": ["8", "4"],
 }
 OTHER |= {"neighbours": ["2"]}

@@ -18,7 +18,7 @@ from ..models.interpolation.strengths import (
 )
 from ..models.model import Arrays, Fitted, Model, Problem, Session, known_positions
 from .engine import Engine
-from .residual import StrengthMean, StrengthResidual
+from .residual import StrengthResidual
 
 STOPS = "stop.value_dbm"
 """Array of pooled strengths, which generic kriging has not: readings, NaN where a receiver did not report at a stop."""
@@ -42,8 +42,7 @@ class StrengthKriging(GenericKriging):
         if not self.pools_receivers(problem):
             return super().fit(problem, split, session)
         known_positions(problem.record, problem.rows(split), self.name)
-        settings, stated = problem.settings, problem.stated_settings
-        engine = Engine(self, [StrengthMean(settings), StrengthResidual(settings, stated)], problem, split, session)
+        engine = Engine(self, [StrengthResidual(problem.settings, problem.stated_settings)], problem, split, session)
         fitted = engine.fit().fitted
         assert isinstance(fitted, Strengths)
         fitted.options, fitted.unseen = engine.stated_reports(), engine.unseen
@@ -54,7 +53,7 @@ class StrengthKriging(GenericKriging):
         return self.pools_receivers(problem)
 
     def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
-        """Settings of pooled receivers where each is kriged alone; of headings, and of a search that is not made."""
+        """Settings of pooled receivers where each is kriged alone; and of headings that do not count."""
         unused = super().unused_settings(problem, splits)
         if self.pools_receivers(problem):
             return {**unused, **unused_of_pooled(problem)}

@@ -61,8 +61,6 @@ class PriorMean:
         if self.traced is not None:
             power = self.traced(poses.position_m, receiver)
             level = power - float(np.median(self.traced.power_dbm))  # centred, so that factor and offset are apart
-        elif not self.sd[1].any():  # no exponent of the distance: a level
-            power, level = np.zeros(len(poses)), None
         else:
             distance = np.linalg.norm(self.receivers_m[receiver] - poses.position_m, axis=1)
             frequency_hz = np.broadcast_to(self.frequency_hz, len(self.receivers_m))[receiver]
@@ -176,15 +174,15 @@ def by_likelihood(
     stops: Stops,
     start: Hyperparameters,
     stated: Collection[str] = (),
-    most: int = LIKELIHOOD_STOPS,
+    limit: int = LIKELIHOOD_STOPS,
 ) -> tuple[PriorMean, Hyperparameters]:
     """Mean and hyperparameters by the likelihood of the stops, for areas of any extent.
 
     Shadowing, noise and the deviation of the receivers' patterns, which may be sectors, have the greatest posterior
     density. The length is a priori the geometric mean of the stops' spacing and half of their extent, uncertain by a
-    factor e. Hyperparameters that are ``stated`` hold. Of more than ``most`` stops that many count.
+    factor e. Hyperparameters that are ``stated`` hold. Of more than ``limit`` stops that many count.
     """
-    stops, few = stops.thinned(most), prior
+    stops, few = stops.thinned(limit), prior
     if prior.traced is None and len(prior.receivers_m) > LIKELIHOOD_RECEIVERS:
         counts = np.isfinite(stops.value_dbm).sum(axis=1)
         most = np.sort(np.argsort(-counts, kind="stable")[:LIKELIHOOD_RECEIVERS])
@@ -194,6 +192,7 @@ def by_likelihood(
     length_m = max(np.sqrt(spacing_m * extent_m / 2), NEAREST_M)  # rows may all be at one place
     middle = np.log([AREA_SHADOW_DB, length_m, AREA_NOISE_DB, prior.rx_sd_db])
     deviation = np.array([0.5, 1.0, 0.5, 1.0])
+
     def at(logarithms: FloatArray, prior: PriorMean) -> tuple[PriorMean, Hyperparameters]:
         shadow_db, shadow_m, noise_db, rx_sd_db = map(float, np.exp(logarithms))
         chosen = {"shadow_db": shadow_db, "shadow_m": shadow_m, "drift_db": noise_db, "noise_db": noise_db}

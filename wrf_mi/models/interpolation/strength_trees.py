@@ -19,7 +19,7 @@ from .trees import GrownTrees, Trees
 
 TREES, TREES_OF_FOLD, LEAF = 50, 20, 5
 """Numbers of trees, of all rows and of each fold of a calibration, and least number of stops in a leaf."""
-LEAST_STOPS = 4 * LEAF  # stops of a receiver below which a tree would be little more than its mean
+LEAST_STOPS = 8 * LEAF  # stops of a receiver below which a tree would be little more than its mean
 STORED = "trees"  # beginning of the names of arrays
 
 

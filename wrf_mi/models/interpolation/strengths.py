@@ -61,7 +61,6 @@ EXPONENT_SD = (1.0, 0.3)
 TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
 BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
-LEVEL_SD_DB = 10.0  # likewise of each receiver's level where the mean has no law of distance
 Shadowing = Literal["default", "likelihood", "trees", "none"]
 SHADOWINGS: tuple[Shadowing, ...] = ("default", "likelihood", "trees", "none")
 DEFAULT, LIKELIHOOD, TREES, NONE = SHADOWINGS
@@ -78,14 +77,12 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
     Attributes:
         transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
             or 0 dBm without any.
-        distance: whether the mean has a law of distance, or else a level for each receiver; null: held-out rows choose.
         shadowing: what is added to the mean: kriging with ``default`` hyperparameters or those of the greatest
             ``likelihood``; randomised ``trees``; or ``none``; null: that whose predictions of held-out rows have the
             smallest error.
     """
 
     transmit_dbm: float | None = None
-    distance: bool | None = None
     shadowing: Shadowing | None = None
     FIXED: ClassVar[Mapping[str, float]] = {
         "receiver_sd_db": RECEIVER_SD_DB,
@@ -412,8 +409,6 @@ def _prior(record: Record, measured: Measured, power_map: Traced | None, setting
     receivers_m = np.stack([receiver.position_m for receiver in record.receivers]).astype(float)
     traced_sd = np.multiply(TRACED_SD, power_map is not None)
     sd = np.array([(OFFSET_SD_DB, RECEIVER_SD_DB), EXPONENT_SD, traced_sd, BODY_PATTERN_DB])
-    if settings.distance is False:
-        sd[:2] = (OFFSET_SD_DB, LEVEL_SD_DB), (0, 0)
     of_receivers = record.receiver_carriers_hz
     carrier_hz = np.mean(record.frequencies_hz, keepdims=True) if of_receivers is None else of_receivers
     at_0_dbm = PriorMean(receivers_m, 0.0, carrier_hz, power_map, sd, RECEIVER_PATTERN_DB)
