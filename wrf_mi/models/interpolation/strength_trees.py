@@ -17,9 +17,9 @@ from .pooled_process import PooledProcess
 from .strength_terms import Poses
 from .trees import GrownTrees, Trees
 
-TREES, TREES_OF_FOLD, LEAF = 50, 20, 5
+TREES, TREES_OF_FOLD, LEAF = 50, 20, 3
 """Numbers of trees, of all rows and of each fold of a calibration, and least number of stops in a leaf."""
-LEAST_STOPS = 8 * LEAF  # stops of a receiver below which a tree would be little more than its mean
+LEAST_STOPS = 12 * LEAF  # stops of a receiver below which a tree would be little more than its mean
 STORED = "trees"  # beginning of the names of arrays
 
 

@@ -367,8 +367,9 @@ def calibrated(
     if np.isfinite(residual).any():
         facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
     on_progress("strengths: all rows", 0.9)
+    # Trees are grown anew, of what the mean with these ratios leaves.
     field = StrengthPosterior(
-        prior, hyperparameters, fit.ratio, field.stops, ROBUST_ROUNDS, fit.spread, field.trees, field.forest
+        prior, hyperparameters, fit.ratio, field.stops, ROBUST_ROUNDS, fit.spread, trees=field.trees
     )
     on_progress("strengths: all rows", 1.0)
     return replace(strengths, field=field, shift_db=shift, widen=widen, fit_facts=facts)
