@@ -33,14 +33,14 @@ def shadows(kind: str, tx_pos_m: np.ndarray, rng: np.random.Generator) -> np.nda
     return np.zeros(len(tx_pos_m))
 
 
-def made(kind: str, seed: int = 0, headings: bool = False) -> Record:
+def made(kind: str, seed: int = 0, headings: bool = False, noise_db: float = NOISE_DB) -> Record:
     """Strengths by a law of exponent 2.5, shadowing and noise at three receivers; the last rows are tests."""
     rng = np.random.default_rng(seed)
     rows = ROWS + TESTS
     tx_pos_m = np.column_stack([rng.uniform(0, EXTENT_M, (rows, 2)), np.full(rows, 1.3)])
     places_m = np.array([[0, 0, 2.5], [15, 2, 2.5], [4, 14, 2.5]])
     law = -45 - 25 * np.log10(np.linalg.norm(places_m[:, None] - tx_pos_m, axis=2))
-    observed = law + np.stack([shadows(kind, tx_pos_m, rng) for _ in law]) + rng.normal(0, NOISE_DB, law.shape)
+    observed = law + np.stack([shadows(kind, tx_pos_m, rng) for _ in law]) + rng.normal(0, noise_db, law.shape)
     heading = rng.uniform(-3, 3, rows) if headings else None
     receivers = tuple(Receiver(f"r{k}", place_m, np.array(UPRIGHT)) for k, place_m in enumerate(places_m))
     record = Record("made", "rssi", tx_pos_m, receivers, observed.astype(np.float32), tx_heading_rad=heading)
@@ -72,6 +72,24 @@ def test_held_out_rows_choose_the_shadowing(kind: str, expected: tuple[str, ...]
     assert fitted.shadowing in expected
     assert {report["option"] for report in fitted.options} == {*KRIGING, TREES, NONE}
     assert COVERED[0] < np.mean(np.abs(relative_errors(fitted, record)) < REAL_90) < COVERED[1]
+
+
+def test_deviations_of_the_mean_by_trees_are_as_large_as_its_errors(tmp_path: Path) -> None:
+    record, truth = made("walls"), made("walls", noise_db=0.0)
+    fitted, test = fit(record, tmp_path, "shadowing=trees"), record.official[1]
+    predictions = [fitted.predict(inputs_of(record, test), receiver) for receiver in range(3)]
+    errors = np.stack([each.mean for each in predictions]) - truth.observation[:, test]
+    stated = np.stack([each.std_mean for each in predictions if each.std_mean is not None])
+    # Both deviations are scaled by errors of readings, so that neither is exact.
+    assert 0.5 < np.sqrt(np.mean(stated**2) / np.mean(errors**2)) < 2
+
+
+def test_planned_rows_lower_the_errors_of_trees_nearby(tmp_path: Path) -> None:
+    """Before anything else is measured, errors of trees are those of a process with shadowing."""
+    prior = fit(made("walls"), tmp_path, "shadowing=trees").error_prior(0)
+    at_m = np.array([[8.0, 8, 1.3], [8.2, 8, 1.3], [0.5, 15, 1.3]])
+    correlation = prior.covariance(at_m, at_m) / prior.covariance(at_m[:1], at_m[:1])
+    assert correlation[0, 1] > correlation[0, 2] + 0.1
 
 
 @pytest.mark.parametrize("shadowing", [TREES, NONE])

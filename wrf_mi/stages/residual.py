@@ -15,6 +15,7 @@ from ..models.interpolation.strengths import (
     LIKELIHOOD,
     NONE,
     SHADOWINGS,
+    TREES,
     Shadowing,
     Strengths,
     StrengthSettings,
@@ -46,7 +47,11 @@ class StrengthResidual(Stage):
             names = DEFAULT, LIKELIHOOD  # kriging alone has hyperparameters
         elif rows_received(problem.record, split.all_train).max(initial=0) < LEAST_STOPS:
             names = DEFAULT, LIKELIHOOD, NONE  # no trees are grown
-        return [Option(name, partial(self._fit, replace(self.settings, shadowing=name))) for name in names]
+        # Trees follow the fading of a run, too, and so need a clear gain.
+        return [
+            Option(name, partial(self._fit, replace(self.settings, shadowing=name)), freedom=int(name == TREES))
+            for name in names
+        ]
 
     def _fit(self, settings: StrengthSettings, state: State, split: Split, session: Session) -> State:
         record, rows = state.problem.record, split.all_train

@@ -11,7 +11,7 @@ import json
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -61,9 +61,9 @@ EXPONENT_SD = (1.0, 0.3)
 TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
 BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
-Shadowing = Literal["default", "likelihood", "trees", "none"]
-SHADOWINGS: tuple[Shadowing, ...] = ("default", "likelihood", "trees", "none")
-DEFAULT, LIKELIHOOD, TREES, NONE = SHADOWINGS
+Shadowing = Literal["default", "likelihood", "none", "trees"]
+SHADOWINGS: tuple[Shadowing, ...] = ("default", "likelihood", "none", "trees")
+DEFAULT, LIKELIHOOD, NONE, TREES = SHADOWINGS
 """Origins of shadowing, see `StrengthSettings.shadowing`."""
 EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
 
@@ -78,7 +78,7 @@ class StrengthSettings(KrigingSettings, Hyperparameters):
         transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
             or 0 dBm without any.
         shadowing: what is added to the mean: kriging with ``default`` hyperparameters or those of the greatest
-            ``likelihood``; randomised ``trees``; or ``none``; null: that whose predictions of held-out rows have the
+            ``likelihood``; ``none``; or randomised ``trees``; null: that whose predictions of held-out rows have the
             smallest error.
     """
 
@@ -184,10 +184,18 @@ class Strengths(Fitted):
             for rows in parts
         ]
 
+    @cached_property
+    def _field_of_errors(self) -> Hyperparameters:
+        """Hyperparameters of the errors before anything is measured; those of trees are likely ones of a process."""
+        field = self.field
+        if not field.trees:
+            return field.spread
+        return likely_deviations(field.prior, field.stops, StrengthSettings().hyperparameters, ())
+
     def error_prior(self, receiver: int) -> ErrorPrior:
         """Shadowing and the uncertain terms of the mean, about the stops of the training rows."""
         field, widen = self.field, self.widen[receiver] ** 2
-        h, received = field.spread, np.isfinite(field.stops.value_dbm[receiver])
+        h, received = self._field_of_errors, np.isfinite(field.stops.value_dbm[receiver])
         # Headings of a plan are not known: the part of the field that depends on them is noise there.
         turned = h.body_db**2 if field.headings else 0.0
 
