@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from wrf_mi.core import Receiver, Record, Split
+from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.models import MODELS, Problem, Session
+from wrf_mi.models.interpolation.strength_settings import DEFAULT, LIKELIHOOD, NONE, TREES
 from wrf_mi.models.interpolation.strength_trees import LEAST_STOPS
-from wrf_mi.models.interpolation.strengths import DEFAULT, LIKELIHOOD, NONE, TREES, Strengths, fit_strengths
+from wrf_mi.models.interpolation.strengths import Strengths, fit_strengths
 from wrf_mi.models.model import Inputs, default_settings, inputs_of
+from wrf_mi.runs.api import plan_run
+from wrf_mi.runs.folder import RunRequest
 from wrf_mi.tasks.scores import REAL_90
 from wrf_mi.tracing.power_map import PowerMap
 
@@ -152,6 +155,11 @@ def test_a_stated_setting_holds(setting: str, options: set[str], tmp_path: Path)
     assert {report["option"] for report in fitted.options} == options
     name, _, value = setting.partition("=")
     assert str(fitted.facts()["fitted"][name]) in (value, f"{value}.0")
+
+
+def test_hyperparameters_of_kriging_are_refused_beside_trees() -> None:
+    with pytest.raises(InputError, match="shadow_m=3.0: no effect on kriging of made: shadowing=trees"):
+        plan_run(made("none"), RunRequest("kriging", settings=["shadowing=trees", "shadow_m=3"]))
 
 
 def test_trees_need_rows(tmp_path: Path) -> None:

@@ -9,13 +9,8 @@ from ..core import InputError, Split
 from ..models.interpolation.diffuse import ChannelKriging
 from ..models.interpolation.kriging import GENERIC_ONLY, GenericKriging, KrigingSettings, asks_generic
 from ..models.interpolation.spectra import SpectrumKriging, SpectrumKrigingSettings
-from ..models.interpolation.strengths import (
-    EXACT,
-    POOLED_ONLY,
-    Strengths,
-    StrengthSettings,
-    unused_of_pooled,
-)
+from ..models.interpolation.strength_settings import POOLED_ONLY, StrengthSettings, unused_of_pooled
+from ..models.interpolation.strengths import EXACT, Strengths
 from ..models.model import Arrays, Fitted, Model, Problem, Session, known_positions
 from .engine import Engine
 from .residual import StrengthResidual

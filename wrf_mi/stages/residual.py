@@ -8,20 +8,18 @@ from functools import partial
 
 from ..core import Split
 from ..datasets.observations import rows_received
-from ..models.interpolation.strength_terms import Hyperparameters
-from ..models.interpolation.strength_trees import LEAST_STOPS
-from ..models.interpolation.strengths import (
+from ..models.interpolation.strength_settings import (
     DEFAULT,
     LIKELIHOOD,
     NONE,
     SHADOWINGS,
     TREES,
     Shadowing,
-    Strengths,
     StrengthSettings,
-    calibrated,
-    fit_strengths,
 )
+from ..models.interpolation.strength_terms import Hyperparameters
+from ..models.interpolation.strength_trees import LEAST_STOPS
+from ..models.interpolation.strengths import Strengths, calibrated, fit_strengths
 from ..models.model import Problem, Session
 from .stage import Option, Stage, State
 

@@ -10,25 +10,24 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray
-from ...core.settings import changed, names_of
+from ...core.settings import changed
 from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS
 from ...parallel.threads import one_blas_thread
 from ...tasks import require
 from ...training.session import OnProgress, quiet
 from ..error_prior import ErrorPrior, with_columns
-from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays
+from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
 from .by_receiver import finite_positions
-from .kriging import KrigingSettings
 from .strength_fit import (
     Fit,
     PriorMean,
@@ -38,7 +37,19 @@ from .strength_fit import (
     shift_of,
     widening,
 )
-from .strength_terms import OF_HEADINGS, Hyperparameters, Measured, Poses, Stops, stops_of
+from .strength_settings import (
+    DEFAULT,
+    DEFAULT_SETTINGS,
+    LIKELIHOOD,
+    NONE,
+    RECEIVER_SD_DB,
+    STOP_M,
+    STOP_RAD,
+    STOP_ROWS,
+    TREES,
+    StrengthSettings,
+)
+from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
 from .strength_trees import TREES as TREES_OF_ALL
 from .strength_trees import TREES_OF_FOLD, Forest
 
@@ -53,61 +64,13 @@ ROBUST_ROUNDS = 2
 LEAST_HEARD = 4  # receivers with more than a few rows that tell how well the others are predicted from them
 NO_SHADOW_DB = 1e-3  # standard deviation of shadowing where there is none: it has to be above zero
 SKEW_DB = 0.4  # shift of predictions a priori, as fades reach deeper than peaks
-STOP_M, STOP_RAD, STOP_ROWS = 0.1, 0.2, 20  # consecutive rows so near, so little turned and so many at most are joined
-RECEIVER_SD_DB = 4.0  # standard deviation of each receiver's offset from the common one: antennas and their mounting
 OFFSET_SD_DB = 10.0  # standard deviation of the common offset of all receivers about the transmit power a priori
 EXPONENT_SD = (1.0, 0.3)
 """Standard deviations of the exponent of distance about free space's: common, and of each receiver."""
 TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
 BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
-Shadowing = Literal["default", "likelihood", "none", "trees"]
-SHADOWINGS: tuple[Shadowing, ...] = ("default", "likelihood", "none", "trees")
-DEFAULT, LIKELIHOOD, NONE, TREES = SHADOWINGS
-"""Origins of shadowing, see `StrengthSettings.shadowing`."""
 EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
-
-
-@dataclass(frozen=True)
-class StrengthSettings(KrigingSettings, Hyperparameters):
-    """Settings of kriging of signal strengths.
-
-    Hyperparameters that are stated hold, whatever the likelihood of others.
-
-    Attributes:
-        transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
-            or 0 dBm without any.
-        shadowing: what is added to the mean: kriging with ``default`` hyperparameters or those of the greatest
-            ``likelihood``; ``none``; or randomised ``trees``; null: that whose predictions of held-out rows have the
-            smallest error.
-    """
-
-    transmit_dbm: float | None = None
-    shadowing: Shadowing | None = None
-    FIXED: ClassVar[Mapping[str, float]] = {
-        "receiver_sd_db": RECEIVER_SD_DB,
-        "search_rows": 500,
-        "stop_m": STOP_M,
-        "stop_rad": STOP_RAD,
-        "stop_rows": STOP_ROWS,
-    }
-
-    @property
-    def hyperparameters(self) -> Hyperparameters:
-        """Stated hyperparameters, and the default ones."""
-        return Hyperparameters(**{each.name: getattr(self, each.name) for each in fields(Hyperparameters)})
-
-
-POOLED_ONLY = names_of(StrengthSettings) - names_of(KrigingSettings)
-"""Settings that kriging of each receiver alone lacks."""
-
-
-def unused_of_pooled(problem: Problem) -> dict[str, str]:
-    """Settings without effect on pooled strengths: of headings that do not count."""
-    s, record = problem.settings, problem.record
-    if s.heading and record.tx_heading_rad is not None:
-        return {}
-    return dict.fromkeys(OF_HEADINGS, "heading=false" if not s.heading else "the data have no headings")
 
 
 @dataclass(eq=False, repr=False)
@@ -190,7 +153,7 @@ class Strengths(Fitted):
         field = self.field
         if not field.trees:
             return field.spread
-        return likely_deviations(field.prior, field.stops, StrengthSettings().hyperparameters, ())
+        return likely_deviations(field.prior, field.stops, Hyperparameters(), ())
 
     def error_prior(self, receiver: int) -> ErrorPrior:
         """Shadowing and the uncertain terms of the mean, about the stops of the training rows."""
@@ -301,7 +264,7 @@ def fit_strengths(
     record: Record,
     rows: IntArray,
     power_map: Traced | None = None,
-    settings: StrengthSettings = StrengthSettings(),
+    settings: StrengthSettings = DEFAULT_SETTINGS,
     on_progress: OnProgress = quiet,
     stated: Collection[str] | None = None,
     calibrate: bool = True,
@@ -391,7 +354,7 @@ def _deviations(strengths: Strengths, stated: Collection[str]) -> Hyperparameter
         return None
     if shadowing == TREES:
         # The noise about the shadowing, which the spread of the trees stands for.
-        noise = likely(StrengthSettings().hyperparameters, stated)
+        noise = likely(Hyperparameters(lever_m=h.lever_m), stated)
         return replace(h, drift_db=noise.drift_db, noise_db=noise.noise_db)
     return likely(h, {*stated, "shadow_db"} if shadowing == NONE else stated)
 
