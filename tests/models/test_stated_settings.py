@@ -99,7 +99,7 @@ OTHER |= {"transmit_dbm": ["20"], "penalty": ["0.3"], "softening_m": ["0.5"], "l
 OTHER |= {
     "heading_length": ["0.4"],
     "cone_deg": ["40"],
-    "shadowing": ["searched", "likelihood"],
+    "shadowing": ["searched", "likelihood", "trees", "none"],
     "likelihood_rows": ["8", "4"],
 }
 OTHER |= {"neighbours": ["2"]}
@@ -240,16 +240,13 @@ def test_accepted_setting_changes_the_fit(model: str, name: str, tmp_path: Any) 
 def test_stated_hyperparameters_hold_beside_those_that_are_chosen(
     stated: dict[str, float], extent_m: float, tmp_path: Any
 ) -> None:
-    record, search = (
-        strengths(extent_m),
-        {"shadowing": "searched" if extent_m < 40 and "shadow_db" not in stated else "likelihood"},
-    )
-    run = train(record, "kriging", settings=stated | search, out=tmp_path / "run", split="official")
+    record, likely = strengths(extent_m), {"shadowing": "likelihood"}
+    run = train(record, "kriging", settings=stated | likely, out=tmp_path / "run", split="official")
     fitted = run.metrics["fitted"]
     assert {name: fitted[name] for name in stated} == stated
     chosen = {"shadow_db", "shadow_m", *NOISE} - stated.keys()
     assert any(fitted[name] != getattr(Hyperparameters(), name) for name in chosen)
-    assert open_run(run.folder, record).problem.stated_settings == stated.keys() | search.keys()
+    assert open_run(run.folder, record).problem.stated_settings == stated.keys() | likely.keys()
 
 
 def test_stated_steps_are_those_of_a_field_in_the_hybrid() -> None:

@@ -17,6 +17,7 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import write_spectrum_folder
 from wrf_mi.stages.engine import Engine, Fold
 from wrf_mi.stages.scene import STAGES
+from wrf_mi.stages.stage import Stage
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.training.session import Interrupted
@@ -191,9 +192,9 @@ def test_scene_as_stated_is_kept_where_a_training_in_it_is_better(scenes, tmp_pa
     stated, judged = str(scenes["thought"]), Engine._scores
     best = ("calibrated in the scene as stated", "trained in the scene as stated")
 
-    def favouring(engine: Engine, fold: Fold, plan: tuple[str, ...]) -> np.ndarray:
+    def favouring(engine: Engine, fold: Fold, plan: tuple[str, ...], stage: Stage) -> np.ndarray:
         scene, paths = plan
-        return judged(engine, fold, plan) + 10.0 * (paths in best) + 1.0 * (scene == "calibrated")
+        return judged(engine, fold, plan, stage) + 10.0 * (paths in best) + 1.0 * (scene == "calibrated")
 
     monkeypatch.setattr(Engine, "_scores", favouring)
     record, split = measured(scenes, "spectrum", 16)

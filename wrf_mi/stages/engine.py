@@ -9,7 +9,7 @@ options/  in the session's folder: predictions of held-out rows by each chain, w
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import groupby
@@ -124,7 +124,9 @@ class Engine:
                 plan, why = (*plan, first.name), "the only option"
                 self.reports.append(OptionReport(stage.name, first.name, True, why))
                 continue
-            rows = 0 if fold is None else len(np.unique(fold.held_out.row))
+            rows = (
+                0 if fold is None else len(np.unique(fold.held_out.row[stage.judging(self._split, fold.held_out.row)]))
+            )
             if fold is None or rows < LEAST_ROWS:
                 why = f"default: {rows} rows can be held out, too few to choose by"
                 self.reports.append(OptionReport(stage.name, first.name, True, why))
@@ -132,12 +134,12 @@ class Engine:
                 continue
             scores, left = self._judged[stage.name], dict[str, str]()
             for done, option in enumerate(options):
-                if option.after and self._is_behind(option.after, options, scores):
-                    left[option.name] = f"not tried: {option.after} is behind"
+                if option.after and self._is_behind(option.after, scores):
+                    left[option.name] = f"not tried: {option.after} is clearly behind"
                     continue
                 self._session.report(f"{stage.name}: {option.name}", done / len(options))
                 try:
-                    scores[option.name] = self._scores(fold, (*plan, option.name, *later))
+                    scores[option.name] = self._scores(fold, (*plan, option.name, *later), stage)
                 except InputError as error:  # the default has to serve the data, others may not
                     if option is first:
                         raise
@@ -153,16 +155,10 @@ class Engine:
             plan = (*plan, best)
         return plan
 
-    def _is_behind(self, name: str, options: Sequence[Option], scores: dict[str, FloatArray]) -> bool:
-        """Whether an option is behind one of its freedom in the mean, or clearly behind another one."""
-        freedom, own = {option.name: option.freedom for option in options}, scores.get(name)
-        if own is None:
-            return True
-        return any(
-            other.mean() > own.mean() if freedom[rival] == freedom[name] else improves(other, own, True)
-            for rival, other in scores.items()
-            if rival != name
-        )
+    def _is_behind(self, name: str, scores: Mapping[str, FloatArray]) -> bool:
+        """Whether an option is clearly behind another one; few rows leave both open."""
+        own = scores.get(name)
+        return own is None or any(improves(other, own, True) for other in scores.values())
 
     def _best(self, options: Sequence[Option], scores: dict[str, FloatArray], confidence: float | None) -> str:
         """Name of the best option: the best mean of equal freedom, then the last clear gain of more freedom."""
@@ -185,12 +181,13 @@ class Engine:
         """Unit of each held-out observation: errors are independent between rows, or between receivers."""
         return fold.held_out.receiver if self._split.held_receivers else fold.held_out.row
 
-    def _scores(self, fold: Fold, plan: Plan) -> FloatArray:
-        """Mean scores of the independent units of held-out rows by a chain, the higher the better."""
+    def _scores(self, fold: Fold, plan: Plan, stage: Stage) -> FloatArray:
+        """Mean scores of the independent units of rows that judge a stage by a chain, the higher the better."""
         record, count = self._problem.record, len(fold.held_out)
         means = self._predicted(fold, plan).mean[None]
         of_each = task_of(record).mixtures(means, fold.held_out.observed(record))
-        return unit_means(of_each(np.ones((count, 1)), np.arange(count)), self._unit(fold))
+        judging = np.flatnonzero(stage.judging(self._split, fold.held_out.row))
+        return unit_means(of_each(np.ones((count, 1)), np.arange(count))[judging], self._unit(fold)[judging])
 
     def _path(self, plan: Plan, finish: bool = False) -> Path:
         return self._folder / f"{CHOSEN if finish else '+'.join(plan)}.npz"

@@ -157,8 +157,9 @@ def _add(parts: dict[str, tuple[Model, Problem]], name: str, problem: Problem, s
 
 FOLDER, KRIGING = "parts", "kriging"
 STATED_ROWS = 35
-"""Held-out rows that count as much as the deviations that parts state of strengths. The logarithm of the 90 % quantile of n errors
-in standard deviations has a standard error of 0.88 / sqrt(n); for stated deviations 0.15 is taken: (0.88 / 0.15)^2."""
+"""Held-out rows that count as much as the deviations that parts state of strengths. The logarithm of the 90 % quantile
+of n errors in standard deviations has a standard error of 0.88 / sqrt(n); for stated deviations 0.15 is taken:
+(0.88 / 0.15)^2."""
 
 
 class _Fit:

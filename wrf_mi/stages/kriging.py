@@ -9,13 +9,8 @@ from ..core import InputError, Split
 from ..models.interpolation.diffuse import ChannelKriging
 from ..models.interpolation.kriging import GENERIC_ONLY, GenericKriging, KrigingSettings, asks_generic
 from ..models.interpolation.spectra import SpectrumKriging, SpectrumKrigingSettings
-from ..models.interpolation.strengths import (
-    EXACT,
-    POOLED_ONLY,
-    Strengths,
-    StrengthSettings,
-    unused_of_pooled,
-)
+from ..models.interpolation.strength_settings import POOLED_ONLY, StrengthSettings, unused_of_pooled
+from ..models.interpolation.strengths import EXACT, Strengths
 from ..models.model import Arrays, Fitted, Model, Problem, Session, known_positions
 from .engine import Engine
 from .residual import StrengthResidual
@@ -53,7 +48,7 @@ class StrengthKriging(GenericKriging):
         return self.pools_receivers(problem)
 
     def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
-        """Settings of pooled receivers where each is kriged alone; of headings, and of a search that is not made."""
+        """Settings of pooled receivers where each is kriged alone; and of headings that do not count."""
         unused = super().unused_settings(problem, splits)
         if self.pools_receivers(problem):
             return {**unused, **unused_of_pooled(problem)}

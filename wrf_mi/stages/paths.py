@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core import InputError, Prediction, Record, Split
 from ..core.settings import with_settings
@@ -34,6 +35,7 @@ from .scene import (
     SURFACES,
     SceneStage,
     StageReport,
+    in_regions,
     in_scene,
     scene_reports,
     too_few,
@@ -120,6 +122,10 @@ class PathsStage(Stage):
             after = [(_named(TRAINED, of), _named(CALIBRATED, of)) for of in stated]
             options += [Option(name, self._trained, 1, earlier) for name, earlier in after]
         return options
+
+    def judging(self, split: Split, row: IntArray) -> NDArray[np.bool_]:
+        """The regions alone, as those that judge the scene, which is fitted to the other rows."""
+        return in_regions(split, row)
 
     def _as_traced(self, state: State, split: Split, session: Session) -> State:
         config = calibration_config(["gain"], task_of(state.problem.record).image)

@@ -12,10 +12,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..backend.device import release_memory
 from ..core import Record, Split
 from ..core.array_files import stored_arrays, write_arrays
-from ..core.types import FloatArray
+from ..core.types import FloatArray, IntArray
 from ..correction import CorrectionOptions, default_options, write_page, write_scene
 from ..correction.edits import fit_edit, refit_edit
 from ..correction.options import FRAME, HIDDEN, PLANES
@@ -69,6 +72,13 @@ def in_scene(problem: Problem, folder: Path) -> Problem:
     return replace(problem, scene=str(corrected), material=None) if (corrected / CORRECTION).exists() else problem
 
 
+def in_regions(split: Split, row: IntArray) -> NDArray[np.bool_]:
+    """Which held-out rows [q] lie in regions that are held out: validation rows lie among those that a scene is fitted
+    to, and add to few.
+    """
+    return np.asarray(~np.isin(row, split.validation) | bool(split.held_receivers))
+
+
 @dataclass(frozen=True)
 class Edited:
     """A scene and what was found of it, kept for a fit to all rows."""
@@ -93,18 +103,26 @@ class SceneStage(Stage):
         if CORRECTED not in wanted:
             how = replace(how, parts=tuple(part for part in how.parts if part not in OF_GEOMETRY))
         still = replace(how, parts=tuple(part for part in how.parts if part not in (PLANES, FRAME)))
-        options.append(Option(CALIBRATED, partial(self._fit, still), 1))
+        near = split.validation[:0] if split.held_receivers else split.validation
+        options.append(Option(CALIBRATED, partial(self._fit, still, near), 1))
         if still != how:
             # Other paths make good planes better. They do not mend those that fit training rows alone, and finding
             # them takes as long as all that was done before.
-            options += [Option(MOVED, partial(self._fit, how), 2), Option(ANEW, partial(self._fit, how), 2, MOVED)]
+            fit = partial(self._fit, how, near)
+            options += [Option(MOVED, fit, 2), Option(ANEW, fit, 2, MOVED)]
         return options
 
     def confidence(self, rows: int) -> float:
         """Fits with more freedom also fit what no surface explains."""
         return CONFIDENCE
 
-    def _fit(self, options: CorrectionOptions, state: State, split: Split, session: Session) -> State:
+    def judging(self, split: Split, row: IntArray) -> NDArray[np.bool_]:
+        """The regions alone (`in_regions`)."""
+        return in_regions(split, row)
+
+    def _fit(self, options: CorrectionOptions, near: IntArray, state: State, split: Split, session: Session) -> State:
+        if state.fold is not None:
+            split = replace(split, train=np.union1d(split.train, near), test=np.setdiff1d(split.test, near))
         before: Edited | None = state.kept.get(self.name)
         stated, place = before.stated if before else state.problem, session.folder / SCENE
         path = session.folder / EDIT

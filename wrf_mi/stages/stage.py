@@ -7,8 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..core import Split
-from ..core.types import FloatArray
+from ..core.types import FloatArray, IntArray
 from ..models.model import Fitted, Problem, Session
 
 
@@ -32,7 +35,7 @@ class Option(NamedTuple):
     #: Options of equal freedom compete by their mean score of held-out rows; one of more freedom is taken where its
     #: gain is clear (`wrf_mi.training.selection.last_gain`).
     freedom: int = 0
-    after: str = ""  # option that it goes on from: it is tried where that one is the best so far
+    after: str = ""  # option that it goes on from: it is tried where that one is not clearly behind another
 
 
 class Stage(ABC):
@@ -50,6 +53,10 @@ class Stage(ABC):
         None: options of the default's freedom compete with it by their mean, others gain by a standard error.
         """
         return None
+
+    def judging(self, split: Split, row: IntArray) -> NDArray[np.bool_]:
+        """Which held-out rows [q] judge the options of a fit to a split; all but those that its fits have seen."""
+        return np.ones(len(row), bool)
 
     def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
         """An option for all rows, given the state that the rows of a fold led to.

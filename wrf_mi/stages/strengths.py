@@ -18,7 +18,8 @@ import numpy as np
 from ..core import InputError, Receiver, Record, Split
 from ..core.types import IntArray
 from ..correction.options import STRENGTHS
-from ..models.interpolation.strengths import Strengths, StrengthSettings
+from ..models.interpolation.strength_settings import StrengthSettings
+from ..models.interpolation.strengths import Strengths
 from ..models.model import Arrays, Model, Problem, Session
 from ..scene.correction_data import read_correction_data
 from ..tracing.options import TraceOptions

@@ -113,14 +113,18 @@ class Trainer(TrainingLoop):
         finally:
             self.state, self._predictor = present, None
 
-    def go_on_from(self, params: Mapping[str, NDArray[np.float32]], chosen: FitState) -> None:
-        """Train what is left after a state was chosen by a fit to some of the rows, with parameters of that state.
+    def go_on_from(self, before: Trainer, params: Mapping[str, NDArray[np.float32]]) -> None:
+        """Train what is left after a fit to some of the rows has chosen a state, with parameters of that state.
 
-        Those of another shape in this scene keep their starting values, but for Gaussians on surfaces, which have
-        places of their own.
+        Parameters of paths change as much from what this scene states as they did there. Those of another shape here
+        keep their starting values, but for Gaussians on surfaces, which have places of their own.
         """
-        start = self.state.params()
+        start, chosen = self.state.params(), before.state
+        there, here = (trainer.graph.parameters(trainer.sides) for trainer in (before, self))
         same = {name: values for name, values in params.items() if name in start and values.shape == start[name].shape}
+        for name, stated in here.items():
+            if name in same and name in there and there[name].shape == stated.shape:
+                same[name] = stated + (same[name] - there[name])
         discs = {name: values for name, values in params.items() if name in (DISC, FACTOR)}
         self.state = FitState(start | same | discs, self.state.adam.beta_1)
         for name in ("chosen", "reach_m", "surface", "phase_error", *OF_FIT):

@@ -9,12 +9,14 @@ from changed_folders import needs
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.models.interpolation import strengths
 from wrf_mi.models.interpolation.pooled_process import PooledProcess, ReceiverObservations
 from wrf_mi.models.interpolation.strength_fit import folds, shift_of, widening
+from wrf_mi.models.interpolation.strength_settings import StrengthSettings
 from wrf_mi.models.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
-from wrf_mi.models.interpolation.strengths import Strengths, StrengthSettings, fit_strengths
+from wrf_mi.models.interpolation.strengths import Strengths, fit_strengths
 from wrf_mi.models.model import Inputs
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.power_map import trace_map
@@ -78,12 +80,14 @@ def test_posterior_and_likelihood_equal_those_of_one_dense_covariance_matrix() -
     bases = [rng.normal(size=(len(p), 2)) for p in places]
     values = [rng.normal(0, 4, len(p)) for p in places]
     noise = [rng.uniform(1, 3, len(p)) for p in places]
-    parts = [ReceiverObservations(*part) for part in zip(places, bases, values, noise, strict=True)]
+    every = Poses(*(np.concatenate([getattr(p, name) for p in places]) for name in ("position_m", "heading_rad")))
+    rows = np.arange(7), np.arange(7, 12)
+    parts = [ReceiverObservations(*part) for part in zip(rows, bases, values, noise, strict=True)]
     asked, basis = Poses(rng.uniform(0, 3, (4, 3)), rng.uniform(0, 6, 4)), rng.normal(size=(4, 2))
     all_bases, y = np.concatenate(bases), np.concatenate(values)
     for length_m in (0.5, 1.5):
         kernel = Hyperparameters(3.0, length_m, 1.0, 1.0, 1.0, 0.0, 0.0)
-        process = PooledProcess(parts, kernel.covariance, prior, kernel.variance(True))
+        process = PooledProcess(every, parts, kernel.covariance, prior, kernel.variance(True))
         mean, variance = process.predict(1, asked, basis)
         dense = all_bases @ np.diag(prior**2) @ all_bases.T + np.diag(np.concatenate(noise))
         dense[:7, :7] += kernel.covariance(places[0], places[0])
@@ -100,10 +104,10 @@ def test_posterior_and_likelihood_equal_those_of_one_dense_covariance_matrix() -
 def test_reweighting_is_robust_to_outliers() -> None:
     places = Poses(np.zeros((21, 3)), None)
     value = np.concatenate([np.zeros(20), [40.0]])
-    part = ReceiverObservations(places, np.ones((21, 1)), value, np.ones(21))
+    part = ReceiverObservations(np.arange(21), np.ones((21, 1)), value, np.ones(21))
     kernel = Hyperparameters(1e-3, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0)
     plain, robust = (
-        PooledProcess([part], kernel.covariance, np.array([10.0]), kernel.variance(False), rounds).beta[0]
+        PooledProcess(places, [part], kernel.covariance, np.array([10.0]), kernel.variance(False), rounds).beta[0]
         for rounds in (0, 3)
     )
     assert plain == pytest.approx(40 / 21, rel=0.02)
@@ -231,17 +235,24 @@ def test_search_lowers_the_held_out_error() -> None:
     settings = wrong, replace(wrong, shadowing="searched")
     before, after = (fit_strengths(record, np.arange(120), None, one, stated=()).facts()["fitted"] for one in settings)
     assert after["held_out_db"] < before["held_out_db"] - 0.1
-    assert after["shadow_db"] < 12
+    assert after["shadow_m"] > 0.2
+    held = replace(wrong, shadowing="searched")
+    fitted = fit_strengths(record, np.arange(120), None, held, stated=("shadow_m",)).facts()["fitted"]
+    assert fitted["shadow_m"] == 0.2
 
 
-def test_an_antenna_ahead_of_its_stated_position_is_found() -> None:
-    record = made(120, noise_db=0.5)
-    ahead = Poses(record.tx_pos_m, record.tx_heading_rad).moved(0.4).position_m
-    turn = record.tx_heading_rad[:, None]
-    np.testing.assert_allclose(ahead - record.tx_pos_m, 0.4 * np.hstack([np.cos(turn), np.sin(turn), 0 * turn]))
-    stated = replace(record, tx_pos_m=2 * record.tx_pos_m - ahead)  # the antenna is 0.4 m ahead of that
-    model = fit_strengths(stated, np.arange(120), settings=replace(DEFAULTS, shadowing="searched", noise_db=1.0))
-    assert model.facts()["fitted"]["lever_m"] == pytest.approx(0.4, abs=0.15)  # steps of the search
+def test_more_receivers_than_a_likelihood_takes_may_have_a_carrier_each() -> None:
+    rng = np.random.default_rng(2)
+    tx, places = rng.uniform(0, 20, (30, 3)), rng.uniform(0, 20, (14, 3))
+    hz = 2.4e9 + 1e7 * np.arange(14)
+    receivers = tuple(
+        Receiver(f"r{k}", place, np.array(UPRIGHT), frequency_hz=float(hz[k])) for k, place in enumerate(places)
+    )
+    power = -40 - 20 * np.log10(np.linalg.norm(places[:, None] - tx, axis=2)) + rng.normal(0, 2, (14, 30))
+    record = Record("cells", "rssi", tx, receivers, power.astype(np.float32), frequencies_hz=hz.mean(keepdims=True))
+    for origin in ("likelihood", "searched"):
+        fitted = fit_strengths(record, np.arange(30), settings=replace(DEFAULTS, shadowing=origin))
+        assert np.isfinite(fitted.predict(record.inputs(np.arange(3)), 13).mean).all()
 
 
 def test_stops_are_thinned_where_factors_would_fill_the_memory(turning, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,11 +283,13 @@ def test_folds_hold_all_readings_of_a_place_out(visits: str) -> None:
     assert (held == 1).all()
 
 
-def test_rows_of_one_place_hold_nothing_out_and_keep_the_start_of_a_search() -> None:
+def test_rows_of_one_place_hold_nothing_out() -> None:
     assert list(folds(np.zeros((30, 3)))) == []
     record = replace(made(30, 1.0), tx_pos_m=np.ones((30, 3)))
-    fitted = fit_strengths(record, np.arange(30), settings=replace(DEFAULTS, shadowing="searched"))
-    assert fitted.field.hyperparameters == DEFAULTS.hyperparameters
+    searched = fit_strengths(record, np.arange(30), settings=replace(DEFAULTS, shadowing="searched"))
+    assert searched.field.hyperparameters == DEFAULTS.hyperparameters
+    fitted = fit_strengths(record, np.arange(30))
+    assert fitted.shift_db == strengths.SKEW_DB
 
 
 def test_skewed_residuals_shift_and_widen() -> None:

@@ -282,7 +282,7 @@ class GaussianField(Model):
             assert order == sorted(order), "a fold leaves receivers out, and moves none"
             params, _ = of_all_receivers(trainer.state.mean_params(), None, placed, new)
             chosen, trainer = trainer, self._trainer(self._plan(problem, split), session)
-            trainer.go_on_from(params, chosen.state)
+            trainer.go_on_from(chosen, params)
             trainer.seconds = chosen.seconds
         return self._finished(trainer, problem, split, session)
 

@@ -76,7 +76,10 @@ class KrigingSystem:
         covariance[np.diag_indices(n)] += noise
         self._lower = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
         self.trend = np.zeros((n, 0)) if trend is None else trend
-        self._trend = self.whiten(self.trend)
+        # Columns of other receivers' terms are zero, and stay so.
+        self._used = np.flatnonzero(self.trend.any(axis=0))
+        self._trend = np.zeros(self.trend.shape, self._lower.dtype)
+        self._trend[:, self._used] = self.whiten(self.trend[:, self._used])
 
     def whiten(self, values: Values) -> Values:
         """L^-1 v of columns v [n, q], K = L L^H."""
@@ -94,7 +97,10 @@ class KrigingSystem:
     @property
     def information(self) -> FloatArray:
         """B^T K^-1 B [p, p]: inverse covariance of the trend's coefficients without a prior."""
-        return np.asarray(self._trend.conj().T @ self._trend)
+        used = self._trend[:, self._used]
+        total = np.zeros((self.trend.shape[1],) * 2, used.dtype)
+        total[np.ix_(self._used, self._used)] = used.conj().T @ used
+        return total
 
     def projected(self, values: Values) -> Values:
         """B^T K^-1 y [p, q] of observations [n, q]."""

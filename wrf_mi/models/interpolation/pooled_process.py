@@ -20,28 +20,33 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ...core.angles import FloatArray
-from ...parallel.threads import on_threads
+from ...core.types import IntArray
+from ...parallel.threads import on_threads, one_blas_thread
 from .kriging_equations import KrigingSystem
 
 Result = TypeVar("Result")
 Kernel = Callable[[Any, Any], FloatArray]
 """Covariance [n, m] of the field between two sets of inputs."""
 
-THREADED_ROWS = 1000  # rows of all receivers from which these are computed on threads
+THREADED_ROWS = 6000
+"""Rows of all receivers from which these are computed on threads; to start those takes more time for fewer."""
 JITTER = 1e-9  # noise added to coincident inputs, as a share of the field's variance
 DEGREES = 4.0  # degrees of freedom of the noise's Student-t distribution: fades are deep
 
 
 def of_each(work: Callable[[Any], Result], parts: Sequence[Any], rows: int) -> list[Result]:
     """Results of ``work(part)``, on threads where so many rows take longer than to start these."""
-    return on_threads(work, parts) if rows > THREADED_ROWS else [work(part) for part in parts]
+    if rows > THREADED_ROWS:
+        return on_threads(work, parts)
+    with one_blas_thread():
+        return [work(part) for part in parts]
 
 
 @dataclass(frozen=True)
 class ReceiverObservations:
-    """Observations of one receiver: inputs of the kernel, phi [n, k], y [n], variance of the noise [n]."""
+    """Observations of one receiver: numbers of their inputs [n], phi [n, k], y [n], variance of the noise [n]."""
 
-    inputs: Any
+    rows: IntArray
     basis: FloatArray
     value: FloatArray
     variance: FloatArray
@@ -50,7 +55,8 @@ class ReceiverObservations:
 class PooledProcess:
     """The posterior of all receivers.
 
-    ``parts`` are the observations of each receiver, possibly without rows; ``prior_sd`` [k] the standard deviations of
+    ``inputs`` are those of all observations, of which ``take`` gives some, such as `Poses`; ``parts`` the observations
+    of each receiver, possibly without rows; ``prior_sd`` [k] the standard deviations of
     beta, above zero; ``point_variance`` is k(x, x); ``rounds`` reweight rows for Student-t noise; ``beta`` [k] is the
     posterior mean of the shared coefficients.
 
@@ -60,22 +66,28 @@ class PooledProcess:
 
     def __init__(
         self,
+        inputs: Any,
         parts: Sequence[ReceiverObservations],
         kernel: Kernel,
         prior_sd: FloatArray,
         point_variance: float,
         rounds: int = 0,
     ) -> None:
-        self._kernel, self._prior_sd, self._point_variance = kernel, prior_sd, point_variance
-        self._solve(parts)
+        self._inputs, self._kernel, self._prior_sd, self._point_variance = inputs, kernel, prior_sd, point_variance
+        # Receivers that share inputs share their covariances, which cost as much as their factors.
+        shared = sum(len(part.rows) ** 2 for part in parts) > len(inputs) ** 2
+        every = kernel(inputs, inputs) if shared else None
+        self._solve(parts, every)
         for _ in range(rounds):
-            self._solve(self._reweighted([part.variance for part in parts]))
+            self._solve(self._reweighted([part.variance for part in parts]), every)
 
-    def _solve(self, parts: Sequence[ReceiverObservations]) -> None:
+    def _solve(self, parts: Sequence[ReceiverObservations], every: FloatArray | None) -> None:
         kernel, jitter, self._parts = self._kernel, JITTER * self._point_variance, parts
 
         def system(p: ReceiverObservations) -> KrigingSystem:
-            return KrigingSystem(kernel(p.inputs, p.inputs), p.variance + jitter, p.basis)
+            inputs = self._inputs.take(p.rows)
+            covariance = kernel(inputs, inputs) if every is None else every[np.ix_(p.rows, p.rows)]
+            return KrigingSystem(covariance, p.variance + jitter, p.basis)
 
         self._systems = of_each(system, parts, sum(len(p.value) for p in parts))
         pairs = list(zip(self._systems, parts, strict=True))
@@ -96,13 +108,18 @@ class PooledProcess:
 
     def predict(self, receiver: int, inputs: Any, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis`` [m, k]."""
-        cross = self._kernel(inputs, self._parts[receiver].inputs)
+        cross = self._kernel(inputs, self._inputs.take(self._parts[receiver].rows))
         mean = basis @ self.beta + cross @ self._weights[receiver]
         return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self._information)
 
     def weights(self, receiver: int) -> tuple[Any, FloatArray]:
         """Inputs of a receiver's observations, and weights [n] of the field's covariances with them in a mean."""
-        return self._parts[receiver].inputs, self._weights[receiver]
+        return self._inputs.take(self._parts[receiver].rows), self._weights[receiver]
+
+    def residual(self, receiver: int) -> tuple[IntArray, FloatArray]:
+        """Numbers of the inputs of a receiver's observations [n], and what phi . beta leaves of these [n]."""
+        part = self._parts[receiver]
+        return part.rows, part.value - part.basis @ self.beta
 
     def _reweighted(self, variance: Sequence[FloatArray]) -> list[ReceiverObservations]:
         """Parts with the noise variances that their residuals imply for Student-t noise.

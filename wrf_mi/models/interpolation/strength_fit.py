@@ -1,4 +1,4 @@
-"""Fit of signal strengths: expected power, folds, choice of hyperparameters, calibration of predictions.
+"""Fit of signal strengths: expected power, folds, likely hyperparameters, calibration of predictions.
 
 The processes of the receivers are those of `wrf_mi.models.interpolation.pooled_process`.
 """
@@ -19,7 +19,8 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...tasks.scores import REAL_90
 from .pooled_process import PooledProcess, ReceiverObservations, of_each
-from .strength_terms import NEAREST_M, NOISE, PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
+from .strength_terms import NEAREST_M, PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
+from .strength_trees import Forest
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced
@@ -30,16 +31,16 @@ STRETCH = (4, 150)
 """Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
 PLACE_M = 0.1  # grid whose cells are places: readings at a stop differ by what positions are known to
 BUFFER = 0.25  # share of a stretch that is left out on either side of it, as consecutive rows share noise
-SEARCHED, SEARCHED_OF_HEADINGS = ("shadow_db", "shadow_m", *PARTS_OF_NOISE), ("body_db", "body_m", "lever_m")
-"""Hyperparameters that the search may change, the latter where headings count."""
-LEAST_GAIN_DB = 0.005  # least reduction of the held-out error by which the search changes a parameter
-MOST_STEPS = 5  # steps of one parameter in one direction
 TRUST = 500.0  # number of held-out values that weigh as much as the prior in estimates from their distribution
 SKEW_TRUST = 2000.0  # the same number for the middle of their narrowest half, which is less certain than a mean
 RATIO = (0.5, 2.0)  # bounds of the ratio of a receiver's noise to that of all
 AREA_SHADOW_DB, AREA_NOISE_DB = 6.0, 2.0  # shadowing of areas a priori, and both parts of the noise
-LIKELIHOOD_STOPS, LIKELIHOOD_RECEIVERS, LIKELIHOOD_STEPS = 400, 12, 80
+LIKELIHOOD_STOPS, LIKELIHOOD_RECEIVERS, LIKELIHOOD_STEPS = 400, 12, 50
 """Largest numbers of stops and receivers in the likelihood, those with most rows, and of its evaluations."""
+DEVIATION_STOPS = 200  # the first of these where deviations alone are wanted
+SEARCH_STEP, MOST_STEPS, SEARCH_ROWS = 2.0, 4, 400
+"""Factor of a step of the search, most steps of one parameter in one direction, and most rows."""
+LEAST_GAIN_DB = 0.005  # least reduction of the held-out error by which the search changes a parameter
 COVERED = 0.9  # share of residuals that calibrated intervals cover
 
 
@@ -70,12 +71,18 @@ class PriorMean:
             power, level = at_1m - 10 * FREE_SPACE * np.log10(np.maximum(distance, NEAREST_M)), None
         return self.transmit_dbm + power, *basis(poses, receiver, self.receivers_m, level, self.sd, self.rx_sd_db)
 
+    def deviations(self, headings: bool) -> FloatArray:
+        """Prior standard deviations of the corrections [k], see `columns`."""
+        nowhere = Poses(np.zeros((0, 3)), np.zeros(0) if headings else None)
+        return self.columns(nowhere, 0)[2]
+
 
 class StrengthPosterior:
     """Posterior of the signal strengths, given stops (possibly none) and hyperparameters.
 
     ``ratio`` [n_rx] is that of each receiver's noise to the noise of all; ``rounds`` reweight for Student-t noise.
     Means are those of ``hyperparameters``, deviations those of ``spread`` (`likely_deviations`); None: the same.
+    ``trees`` is the number of trees of what the mean terms leave; ``forest``: trees that were grown already.
     """
 
     def __init__(
@@ -86,31 +93,51 @@ class StrengthPosterior:
         stops: Stops,
         rounds: int = 0,
         spread: Hyperparameters | None = None,
+        trees: int = 0,
+        forest: Forest | None = None,
     ) -> None:
         self.prior, self.hyperparameters, self.ratio, self.stops = prior, hyperparameters, ratio, stops
         self.spread, self.rounds = spread or hyperparameters, rounds
         self.headings = stops.poses.heading_rad is not None
         self._process = self._process_of(hyperparameters)
+        self.trees, self.forest = trees, forest
+        if trees and forest is None:
+            self.forest = Forest.grown(self._process, stops.poses, len(ratio), trees)
 
-    def _process_of(self, h: Hyperparameters) -> PooledProcess:
-        prior, stops, ratio, parts = self.prior, self.stops, self.ratio, []
-        for receiver in range(len(prior.receivers_m)):
-            received = np.isfinite(stops.value_dbm[receiver])
-            poses = stops.poses.take(received).moved(h.lever_m)
-            expected, columns, sd = prior.columns(poses, receiver)
+    @cached_property
+    def _moved(self) -> Poses:
+        return self.stops.poses.moved(self.hyperparameters.lever_m)
+
+    @cached_property
+    def _terms(self) -> list[tuple[IntArray, FloatArray, FloatArray]]:
+        """Of each receiver: numbers of its stops [n], columns of the mean [n, k], values less the expected [n]."""
+        terms = []
+        for receiver, values in enumerate(self.stops.value_dbm):
+            received = np.flatnonzero(np.isfinite(values))
+            expected, columns, _ = self.prior.columns(self._moved.take(received), receiver)
+            terms.append((received, columns, values[received] - expected))
+        return terms
+
+    def _process_of(self, h: Hyperparameters, prior: PriorMean | None = None) -> PooledProcess:
+        """The process of hyperparameters with this lever, and of deviations of a prior with this mean."""
+        parts = []
+        for (received, columns, value), count, ratio in zip(self._terms, self.stops.count, self.ratio, strict=True):
             # Reports of a stop average their own noise out, but not the fading that persists during the stop.
-            variance = (h.drift_db**2 + h.noise_db**2 / stops.count[receiver, received]) * ratio[receiver] ** 2
-            parts.append(ReceiverObservations(poses, columns, stops.value_dbm[receiver, received] - expected, variance))
-        return PooledProcess(parts, h.covariance, sd, h.variance(self.headings), self.rounds)
+            variance = (h.drift_db**2 + h.noise_db**2 / count[received]) * ratio**2
+            parts.append(ReceiverObservations(received, columns, value, variance))
+        sd = (prior or self.prior).deviations(self.headings)
+        return PooledProcess(self._moved, parts, h.covariance, sd, h.variance(self.headings), self.rounds)
 
     @cached_property
     def _spread_process(self) -> PooledProcess:
         return self._process if self.spread == self.hyperparameters else self._process_of(self.spread)
 
-    @property
-    def cost(self) -> float:
-        """Minus twice the logarithm of the marginal likelihood of the stops, up to a constant."""
-        return self._process.cost
+    def cost(self, prior: PriorMean, h: Hyperparameters) -> float:
+        """Minus twice the logarithm of the marginal likelihood of the stops, up to a constant.
+
+        ``h`` has the lever of these hyperparameters, and ``prior`` other deviations about this mean.
+        """
+        return self._process_of(h, prior).cost
 
     def predict(self, poses: Sequence[Poses], receiver: int) -> list[tuple[FloatArray, FloatArray]]:
         """Mean in dBm, and variance of the local mean power about it, [m] each, of several poses [m]."""
@@ -123,6 +150,9 @@ class StrengthPosterior:
             mean, variance = self._process.predict(receiver, moved[k], terms[k][1])
             if spread is not self._process:
                 variance = spread.predict(receiver, moved[k], terms[k][1])[1]
+            if self.forest is not None:
+                more = self.forest.predict(poses[k], receiver)
+                mean, variance = mean + more[0], variance + more[1]
             return terms[k][0] + mean, variance
 
         spread = self._spread_process  # computed here, not on threads
@@ -137,29 +167,31 @@ class StrengthPosterior:
         moved = poses.moved(self.hyperparameters.lever_m)
         expected, columns, _ = self.prior.columns(moved, receiver)
         field = self.hyperparameters.weighted_covariance(moved, *self._process.weights(receiver))
+        if self.forest is not None:
+            field = field + self.forest.predict(poses, receiver)[0]
         return expected + columns @ self._process.beta + field
 
 
 def by_likelihood(
-    prior: PriorMean, stops: Stops, start: Hyperparameters, stated: Collection[str] = ()
+    prior: PriorMean,
+    stops: Stops,
+    start: Hyperparameters,
+    stated: Collection[str] = (),
+    limit: int = LIKELIHOOD_STOPS,
 ) -> tuple[PriorMean, Hyperparameters]:
     """Mean and hyperparameters by the likelihood of the stops, for areas of any extent.
 
     Shadowing, noise and the deviation of the receivers' patterns, which may be sectors, have the greatest posterior
     density. The length is a priori the geometric mean of the stops' spacing and half of their extent, uncertain by a
-    factor e. Hyperparameters that are ``stated`` hold.
+    factor e. Hyperparameters that are ``stated`` hold. Of more than ``limit`` stops that many count.
     """
-    stops, few = stops.thinned(LIKELIHOOD_STOPS), prior
-    if prior.traced is None and len(prior.receivers_m) > LIKELIHOOD_RECEIVERS:
-        counts = np.isfinite(stops.value_dbm).sum(axis=1)
-        most = np.sort(np.argsort(-counts, kind="stable")[:LIKELIHOOD_RECEIVERS])
-        few = replace(prior, receivers_m=prior.receivers_m[most])
-        stops = replace(stops, value_dbm=stops.value_dbm[most], count=stops.count[most])
+    stops = stops.thinned(limit)
+    few, most = _most_heard(prior, stops.value_dbm)
+    stops = replace(stops, value_dbm=stops.value_dbm[most], count=stops.count[most])
     spacing_m, extent_m = scales(stops.poses.position_m)
     length_m = max(np.sqrt(spacing_m * extent_m / 2), NEAREST_M)  # rows may all be at one place
     middle = np.log([AREA_SHADOW_DB, length_m, AREA_NOISE_DB, prior.rx_sd_db])
     deviation = np.array([0.5, 1.0, 0.5, 1.0])
-    ratio = np.ones(len(few.receivers_m))
 
     def at(logarithms: FloatArray, prior: PriorMean) -> tuple[PriorMean, Hyperparameters]:
         shadow_db, shadow_m, noise_db, rx_sd_db = map(float, np.exp(logarithms))
@@ -175,13 +207,74 @@ def by_likelihood(
         logarithms[free] = chosen
         return logarithms
 
+    posterior = StrengthPosterior(few, start, np.ones(len(few.receivers_m)), stops)
+
     def cost(chosen: FloatArray) -> float:
-        fit = StrengthPosterior(*at(every(chosen), few), ratio, stops)
-        return fit.cost + float(np.square((chosen - middle[free]) / deviation[free]).sum())
+        penalty = float(np.square((chosen - middle[free]) / deviation[free]).sum())
+        return posterior.cost(*at(every(chosen), few)) + penalty
 
     simplex = np.vstack([middle[free], middle[free] + np.diag(deviation[free])])
     options = {"initial_simplex": simplex, "maxfev": LIKELIHOOD_STEPS, "xatol": 0.05, "fatol": 0.1}
     return at(every(minimize(cost, middle[free], method="Nelder-Mead", options=options).x), prior)
+
+
+def _most_heard(prior: PriorMean, value_dbm: FloatArray) -> tuple[PriorMean, IntArray]:
+    """The mean at the receivers with most of the values [n_rx, n], `LIKELIHOOD_RECEIVERS` at most, and their numbers.
+
+    About traced power, which is that of all receivers, all.
+    """
+    count = len(prior.receivers_m)
+    if prior.traced is not None or count <= LIKELIHOOD_RECEIVERS:
+        return prior, np.arange(count)
+    received = np.isfinite(value_dbm).sum(axis=1)
+    most = np.sort(np.argsort(-received, kind="stable")[:LIKELIHOOD_RECEIVERS])
+    frequency_hz = np.broadcast_to(prior.frequency_hz, count)[most]
+    return replace(prior, receivers_m=prior.receivers_m[most], frequency_hz=frequency_hz), most
+
+
+def by_search(
+    prior: PriorMean,
+    measured: Measured,
+    join: Callable[[Measured], Stops],
+    start: Hyperparameters,
+    stated: Collection[str] = (),
+) -> Hyperparameters:
+    """Hyperparameters that predict held-out stretches of the rows with the smallest mean absolute error.
+
+    Shadowing, its length and both parts of the noise are changed in turn, as long as the error falls by
+    `LEAST_GAIN_DB`; those that are ``stated`` hold. ``join`` makes stops of rows. Rows that are all at one place choose
+    nothing. Of more than `SEARCH_ROWS` rows and `LIKELIHOOD_RECEIVERS` receivers that many count.
+    """
+    spaced = np.unique(np.linspace(0, len(measured.rows) - 1, SEARCH_ROWS).round().astype(np.int64))
+    measured = measured.take(spaced)
+    prior, most = _most_heard(prior, measured.value_dbm)
+    precision = None if measured.precision is None else measured.precision[most]
+    measured = replace(measured, value_dbm=measured.value_dbm[most], precision=precision)
+    # Every second fold: all of them choose much the same.
+    parts = [
+        (join(measured.take(train)), measured.take(out)) for train, out in [*folds(measured.poses.position_m)][::2]
+    ]
+    ones = np.ones(len(most))
+
+    def error_db(hyperparameters: Hyperparameters) -> float:
+        errors = list[FloatArray]()
+        for stops, out in parts:
+            field = StrengthPosterior(prior, hyperparameters, ones, stops)
+            errors += [
+                np.abs(field.mean(out.poses, receiver) - out.value_dbm[receiver]) for receiver in range(len(most))
+            ]
+        return float(np.nanmean(np.concatenate(errors)))
+
+    found, best = start, error_db(start) if parts else 0.0
+    for names in (("shadow_m",), ("shadow_db",), PARTS_OF_NOISE) if parts else ():
+        free = [name for name in names if name not in stated]
+        for factor in (SEARCH_STEP, 1 / SEARCH_STEP) if free else ():
+            for _ in range(MOST_STEPS):
+                other = replace(found, **{name: getattr(found, name) * factor for name in free})
+                if (error := error_db(other)) > best - LEAST_GAIN_DB:
+                    break
+                found, best = other, error
+    return found
 
 
 def likely_deviations(
@@ -193,7 +286,7 @@ def likely_deviations(
     noise, and little on that. The likelihood tells both, by differences of rows at all distances, so that what a
     reading adds to the uncertainty of the mean is known. Parameters that are ``stated`` hold.
     """
-    return by_likelihood(prior, stops, hyperparameters, {*stated, "shadow_m"})[1]
+    return by_likelihood(prior, stops, hyperparameters, {*stated, "shadow_m"}, DEVIATION_STOPS)[1]
 
 
 def scales(position_m: FloatArray) -> tuple[float, float]:
@@ -229,13 +322,14 @@ def folds(position_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
 
 
 class Fit:
-    """Choices by held-out stretches of the training rows, of one fold in ``every``; ``join`` makes stops of rows."""
+    """Predictions of held-out stretches of the training rows; ``join`` makes stops of rows."""
 
-    def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops], every: int = 1) -> None:
+    def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops]) -> None:
         self._prior, self._measured = prior, measured
         self.ratio = np.ones(len(prior.receivers_m))
         self.spread: Hyperparameters | None = None
-        used = [*folds(measured.poses.position_m)][::every]
+        self.trees = 0  # number of trees of each fold
+        used = folds(measured.poses.position_m)
         self._folds = [(join(measured.take(train)), held_out) for train, held_out in used]
 
     def held_out(
@@ -251,7 +345,13 @@ class Fit:
             hidden = (np.arange(len(mean)) % 2 == number) & unheard
             value_dbm = np.where(hidden[:, None], np.nan, stops.value_dbm)
             field = StrengthPosterior(
-                self._prior, hyperparameters, self.ratio, replace(stops, value_dbm=value_dbm), rounds, self.spread
+                self._prior,
+                hyperparameters,
+                self.ratio,
+                replace(stops, value_dbm=value_dbm),
+                rounds,
+                self.spread,
+                self.trees,
             )
             predicts = hidden | (not unheard)
             measured_dbm = np.where(predicts[:, None], self._measured.value_dbm, np.nan)
@@ -270,45 +370,14 @@ class Fit:
                 mean[receiver, received[receiver]], std[receiver, received[receiver]] = value, np.sqrt(total)
         return mean, std
 
-    def _residual(self, hyperparameters: Hyperparameters) -> FloatArray:
-        return self.held_out(hyperparameters)[0] - self._measured.value_dbm
-
     def set_ratio(self, hyperparameters: Hyperparameters) -> None:
         """Set ``ratio`` by the spread of each receiver's held-out residuals."""
-        received = [row[np.isfinite(row)] for row in np.abs(self._residual(hyperparameters))]
+        residual_db = self.held_out(hyperparameters)[0] - self._measured.value_dbm
+        received = [row[np.isfinite(row)] for row in np.abs(residual_db)]
         spread = np.array([np.median(row) if len(row) else 1 for row in received])
         count = np.array([len(row) for row in received])
         # Shrunk towards 1 in the logarithm: the spread of few residuals is chance.
         self.ratio = np.clip(spread / np.median(spread), *RATIO) ** (count / (count + TRUST))
-
-    def search(
-        self, hyperparameters: Hyperparameters, stated: Collection[str], on_progress: Callable[[float], None]
-    ) -> Hyperparameters:
-        """Change one parameter at a time while that lowers the mean absolute held-out error by `LEAST_GAIN_DB`.
-
-        One pass through all parameters that are not ``stated``; ``on_progress`` takes the fraction done. Rows that are
-        all at one place hold nothing out and choose nothing.
-        """
-        if not self._folds:
-            return hyperparameters
-
-        def error_db(candidate: Hyperparameters) -> float:
-            return float(np.nanmean(np.abs(self._residual(candidate))))
-
-        names = ["shadow_db", "shadow_m", NOISE]
-        if self._measured.poses.heading_rad is not None:
-            names += SEARCHED_OF_HEADINGS
-        # Each error fits all folds anew, a Cholesky factor for every receiver: only a few steps are affordable.
-        best = error_db(hyperparameters)
-        for done, name in enumerate(names, start=1):
-            for sign in (1, -1):
-                for _ in range(MOST_STEPS):
-                    candidate = hyperparameters.changed(name, sign, stated)
-                    if candidate == hyperparameters or (error := error_db(candidate)) > best - LEAST_GAIN_DB:
-                        break
-                    best, hyperparameters = error, candidate
-            on_progress(done / len(names))
-        return hyperparameters
 
 
 def shift_of(residual_db: FloatArray, prior_db: float = 0.0) -> float:

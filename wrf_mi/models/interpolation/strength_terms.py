@@ -14,7 +14,6 @@ Source: Gudmundson, "Correlation model for shadow fading in mobile radio systems
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,9 +29,6 @@ HARMONICS = 3
 """Harmonics of the transmitter's pattern over psi; more changed the held-out error of flat-ble by under 0.005 dB."""
 RX_HARMONICS = 2
 GAP = 5  # a stop ends where so many rows of the record are not among the given rows
-SEARCH_STEP = 1.5  # factor of one step of the search for hyperparameters
-LEVER_STEP_M = 0.1
-NOISE = "noise"  # name of both noise terms in the search
 PARTS_OF_NOISE = ("drift_db", "noise_db")
 OF_HEADINGS = ("body_db", "body_m", "concentration", "lever_m")  # hyperparameters that count with headings alone
 MOST_PAIRS = 2
@@ -89,12 +85,6 @@ class Hyperparameters:
     drift_db: float = 2.8
     noise_db: Positive = 2.8
     lever_m: Finite = 0.0
-
-    def changed(self, name: str, sign: int, stated: Collection[str] = ()) -> Hyperparameters:
-        """One parameter a step up or down unless it is stated; `NOISE` stands for both parts of the noise."""
-        names = [key for key in (PARTS_OF_NOISE if name == NOISE else (name,)) if key not in stated]
-        step = {key: getattr(self, key) * SEARCH_STEP**sign for key in names}
-        return replace(self, **(step | {key: self.lever_m + sign * LEVER_STEP_M for key in names if key == "lever_m"}))
 
     def covariance(self, a: Poses, b: Poses) -> FloatArray:
         """Covariance of the field [n, m] between poses, dB^2."""
@@ -231,7 +221,10 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
     begins = np.searchsorted(number, np.arange(count + 1))
     value = np.full((len(value_dbm), count), np.nan)
     total = np.zeros((len(value_dbm), count))
-    for stop in range(count):
+    single = np.flatnonzero(size == 1)
+    value[:, single], total[:, single] = value_dbm[:, begins[single]], weight[:, begins[single]]
+    total[np.isnan(value)] = 0
+    for stop in np.flatnonzero(size > 1):
         chunk = slice(begins[stop], begins[stop + 1])
         for receiver, reports in enumerate(value_dbm[:, chunk]):
             known = np.isfinite(reports)

@@ -10,35 +10,50 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
-from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray
-from ...core.settings import changed, names_of
+from ...core.settings import changed
 from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS
 from ...parallel.threads import one_blas_thread
 from ...tasks import require
 from ...training.session import OnProgress, quiet
 from ..error_prior import ErrorPrior, with_columns
-from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays
+from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
 from .by_receiver import finite_positions
-from .kriging import KrigingSettings
 from .strength_fit import (
     Fit,
     PriorMean,
     StrengthPosterior,
     by_likelihood,
+    by_search,
     likely_deviations,
     shift_of,
     widening,
 )
-from .strength_terms import OF_HEADINGS, Hyperparameters, Measured, Poses, Stops, stops_of
+from .strength_settings import (
+    BY_SEARCH,
+    DEFAULT,
+    DEFAULT_SETTINGS,
+    LIKELIHOOD,
+    NONE,
+    RECEIVER_SD_DB,
+    STOP_M,
+    STOP_RAD,
+    STOP_ROWS,
+    TREES,
+    StrengthSettings,
+)
+from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
+from .strength_trees import TREES as TREES_OF_ALL
+from .strength_trees import TREES_OF_FOLD, Forest
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced, Tracer
@@ -49,62 +64,15 @@ MOST_COVARIANCES = 2e8
 """Covariances between stops over all receivers, whose factors take 1.6 GB; with more, stops are thinned."""
 ROBUST_ROUNDS = 2
 LEAST_HEARD = 4  # receivers with more than a few rows that tell how well the others are predicted from them
-WIDER = 2.0  # factor of the stops' extent during the search, which takes a third of the time for the same choice
+NO_SHADOW_DB = 1e-3  # standard deviation of shadowing where there is none: it has to be above zero
 SKEW_DB = 0.4  # shift of predictions a priori, as fades reach deeper than peaks
-STOP_M, STOP_RAD, STOP_ROWS = 0.1, 0.2, 20  # consecutive rows so near, so little turned and so many at most are joined
-RECEIVER_SD_DB = 4.0  # standard deviation of each receiver's offset from the common one: antennas and their mounting
 OFFSET_SD_DB = 10.0  # standard deviation of the common offset of all receivers about the transmit power a priori
 EXPONENT_SD = (1.0, 0.3)
 """Standard deviations of the exponent of distance about free space's: common, and of each receiver."""
 TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
 BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
-Shadowing = Literal["default", "searched", "likelihood"]
-SHADOWINGS: tuple[Shadowing, ...] = ("default", "searched", "likelihood")
-DEFAULT, BY_SEARCH, LIKELIHOOD = SHADOWINGS
-"""Origins of hyperparameters, see `StrengthSettings.shadowing`."""
 EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
-
-
-@dataclass(frozen=True)
-class StrengthSettings(KrigingSettings, Hyperparameters):
-    """Settings of kriging of signal strengths.
-
-    Hyperparameters that are stated hold; others are those at the start of a search, or priors of a likelihood.
-
-    Attributes:
-        transmit_dbm: transmit power a priori, gains of both antennas included; null: the level of the training rows,
-            or 0 dBm without any.
-        shadowing: where hyperparameters come from: ``default``, ``searched`` by stretches that are held out, or
-            ``likelihood``; null: the one whose predictions of held-out rows have the smallest error.
-    """
-
-    transmit_dbm: float | None = None
-    shadowing: Shadowing | None = None
-    FIXED: ClassVar[Mapping[str, float]] = {
-        "receiver_sd_db": RECEIVER_SD_DB,
-        "search_rows": 500,
-        "stop_m": STOP_M,
-        "stop_rad": STOP_RAD,
-        "stop_rows": STOP_ROWS,
-    }
-
-    @property
-    def hyperparameters(self) -> Hyperparameters:
-        """Stated hyperparameters, and the start of a search for the others."""
-        return Hyperparameters(**{each.name: getattr(self, each.name) for each in fields(Hyperparameters)})
-
-
-POOLED_ONLY = names_of(StrengthSettings) - names_of(KrigingSettings)
-"""Settings that kriging of each receiver alone lacks."""
-
-
-def unused_of_pooled(problem: Problem) -> dict[str, str]:
-    """Settings without effect on pooled strengths: of headings that do not count."""
-    s, record = problem.settings, problem.record
-    if s.heading and record.tx_heading_rad is not None:
-        return {}
-    return dict.fromkeys(OF_HEADINGS, "heading=false" if not s.heading else "the data have no headings")
 
 
 @dataclass(eq=False, repr=False)
@@ -163,7 +131,7 @@ class Strengths(Fitted):
         stops = _stops(_measured(record, rows, field.headings))
         with one_blas_thread():
             posterior = StrengthPosterior(
-                field.prior, field.hyperparameters, field.ratio, stops, field.rounds, field.spread
+                field.prior, field.hyperparameters, field.ratio, stops, field.rounds, field.spread, field.trees
             )
         return replace(self, field=posterior)
 
@@ -181,10 +149,18 @@ class Strengths(Fitted):
             for rows in parts
         ]
 
+    @cached_property
+    def _field_of_errors(self) -> Hyperparameters:
+        """Hyperparameters of the errors before anything is measured; those of trees are likely ones of a process."""
+        field = self.field
+        if not field.trees:
+            return field.spread
+        return likely_deviations(field.prior, field.stops, Hyperparameters(), ())
+
     def error_prior(self, receiver: int) -> ErrorPrior:
         """Shadowing and the uncertain terms of the mean, about the stops of the training rows."""
         field, widen = self.field, self.widen[receiver] ** 2
-        h, received = field.spread, np.isfinite(field.stops.value_dbm[receiver])
+        h, received = self._field_of_errors, np.isfinite(field.stops.value_dbm[receiver])
         # Headings of a plan are not known: the part of the field that depends on them is noise there.
         turned = h.body_db**2 if field.headings else 0.0
 
@@ -195,7 +171,7 @@ class Strengths(Fitted):
             turns = np.zeros(len(position_m)) if field.headings else None
             return field.prior.columns(Poses(position_m, turns), receiver)[1]
 
-        deviation = field.prior.columns(field.stops.poses.take(np.zeros(0, np.int64)), receiver)[2]
+        deviation = field.prior.deviations(field.headings)
         noise = h.drift_db**2 + h.noise_db**2 / field.stops.count[receiver, received]
         scale = widen * field.ratio[receiver] ** 2
         return ErrorPrior(
@@ -227,6 +203,8 @@ class Strengths(Fitted):
             **field_arrays(field.hyperparameters, "knob."),
             **field_arrays(field.spread, "spread."),
         }
+        if field.forest is not None:
+            arrays |= field.forest.arrays() | {"trees": field.trees}
         if prior.traced is not None:
             arrays |= field_arrays(prior.traced.local if prior.traced.exact else prior.traced, "map.")
             if prior.traced.exact:
@@ -256,7 +234,9 @@ class Strengths(Fitted):
         spread = hyperparameters  # earlier versions stored no other
         if "spread.shadow_m" in arrays:
             spread = from_field_arrays(Hyperparameters, arrays, "spread.")
-        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, int(arrays["rounds"]), spread)
+        rounds, trees = int(arrays["rounds"]), int(arrays.get("trees", 0))
+        forest = Forest.from_arrays(arrays)
+        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, rounds, spread, trees, forest)
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         shadowing = str(arrays.get("shadowing", DEFAULT))
         options = json.loads(str(arrays.get("options", "[]")))
@@ -286,7 +266,7 @@ def fit_strengths(
     record: Record,
     rows: IntArray,
     power_map: Traced | None = None,
-    settings: StrengthSettings = StrengthSettings(),
+    settings: StrengthSettings = DEFAULT_SETTINGS,
     on_progress: OnProgress = quiet,
     stated: Collection[str] | None = None,
     calibrate: bool = True,
@@ -299,8 +279,8 @@ def fit_strengths(
         power_map: traced power, a local mean or at positions themselves; None: free space is expected.
         settings: settings; hyperparameters whose origin they leave open are the default ones.
         on_progress: progress callback.
-        stated: names of the hyperparameters that hold, whatever a search or likelihood chooses for the others; None:
-            those that differ from their defaults.
+        stated: names of the hyperparameters that hold, whatever the likelihood of the others; None: those that differ
+            from their defaults.
         calibrate: whether deviations, shift and the receivers' noise come from held-out stretches, see `calibrated`.
 
     Raises:
@@ -318,13 +298,15 @@ def fit_strengths(
     if len(measured.rows) > 1 and shadowing == LIKELIHOOD:
         prior, hyperparameters = by_likelihood(prior, _stops(measured), hyperparameters, stated)
     elif len(measured.rows) > 1 and shadowing == BY_SEARCH:
-        search = Fit(prior, measured, partial(_stops, factor=WIDER), every=2)
-        search.set_ratio(hyperparameters)
-        hyperparameters = search.search(
-            hyperparameters, stated, lambda share: on_progress("strengths: hyperparameters", 0.8 * share)
-        )
-    ones = np.ones(len(measured.value_dbm))
-    field = StrengthPosterior(prior, hyperparameters, ones, _stops(measured), ROBUST_ROUNDS)
+        on_progress("strengths: search", 0.0)
+        hyperparameters = by_search(prior, measured, _stops, hyperparameters, stated)
+    elif shadowing in (TREES, NONE):
+        # What shadowing is left in the mean terms' residuals is noise to these.
+        h = hyperparameters
+        drift_db = float(np.linalg.norm([h.drift_db, h.shadow_db, h.body_db]))
+        hyperparameters = replace(h, drift_db=drift_db, shadow_db=NO_SHADOW_DB, body_db=0.0)
+    ones, trees = np.ones(len(measured.value_dbm)), TREES_OF_ALL * (shadowing == TREES)
+    field = StrengthPosterior(prior, hyperparameters, ones, _stops(measured), ROBUST_ROUNDS, trees=trees)
     # Traces at exact positions have no fades left in what they do not predict.
     shift = 0.0 if power_map is not None and power_map.exact else SKEW_DB
     strengths = Strengths(field, shift, ones, {"rows": float(len(measured.rows))}, shadowing)
@@ -345,9 +327,9 @@ def calibrated(
     if len(measured.rows) < 2:
         return strengths
     fit = Fit(prior, measured, _stops)
+    fit.trees = min(TREES_OF_FOLD, field.trees)
     fit.set_ratio(hyperparameters)
-    if strengths.shadowing != LIKELIHOOD:  # whose hyperparameters are those of a likelihood already
-        fit.spread = likely_deviations(prior, field.stops, hyperparameters, stated)
+    fit.spread = _deviations(strengths, stated)
     on_progress("strengths: held-out rows", 0.8)
     mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
     residual = values - mean
@@ -361,9 +343,25 @@ def calibrated(
     if np.isfinite(residual).any():
         facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
     on_progress("strengths: all rows", 0.9)
-    field = StrengthPosterior(prior, hyperparameters, fit.ratio, field.stops, ROBUST_ROUNDS, fit.spread)
+    # Trees are grown anew, of what the mean with these ratios leaves.
+    field = StrengthPosterior(
+        prior, hyperparameters, fit.ratio, field.stops, ROBUST_ROUNDS, fit.spread, trees=field.trees
+    )
     on_progress("strengths: all rows", 1.0)
     return replace(strengths, field=field, shift_db=shift, widen=widen, fit_facts=facts)
+
+
+def _deviations(strengths: Strengths, stated: Collection[str]) -> Hyperparameters | None:
+    """Hyperparameters of the deviations, see `likely_deviations`; None: those of the means."""
+    field, shadowing = strengths.field, strengths.shadowing
+    h, likely = field.hyperparameters, partial(likely_deviations, field.prior, field.stops)
+    if shadowing == LIKELIHOOD:  # whose hyperparameters are those of a likelihood already
+        return None
+    if shadowing == TREES:
+        # The noise about the shadowing, which the spread of the trees stands for.
+        noise = likely(Hyperparameters(lever_m=h.lever_m), stated)
+        return replace(h, drift_db=noise.drift_db, noise_db=noise.noise_db)
+    return likely(h, {*stated, "shadow_db"} if shadowing == NONE else stated)
 
 
 def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:
@@ -377,8 +375,8 @@ def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:
     return Measured(poses, values, rows, record.precision(rows))
 
 
-def _stops(measured: Measured, factor: float = 1.0) -> Stops:
-    stops = stops_of(measured, factor * STOP_M, factor * STOP_RAD, STOP_ROWS)
+def _stops(measured: Measured) -> Stops:
+    stops = stops_of(measured, STOP_M, STOP_RAD, STOP_ROWS)
     return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(measured.value_dbm))))
 
 

@@ -95,6 +95,10 @@ class GrownTrees:
         Raises:
             InputError: headings that the fit did not have, or the other way round.
         """
+        return np.asarray(self.of_each(tx_pos, tx_heading_rad).mean(axis=0), self.like.dtype)
+
+    def of_each(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> FloatArray:
+        """Values of each tree [trees, m], otherwise as `predict`."""
         # scikit-learn cuts features in single precision.
         single = _features(tx_pos, tx_heading_rad, self.like).astype(np.float32)
         rows = np.arange(len(single))
@@ -103,7 +107,7 @@ class GrownTrees:
         for _ in range(int(self.depth)):
             left = single[rows, self.feature[node]] <= self.threshold[node]
             node = np.where(left, self.left[node], self.right[node])
-        return np.asarray(self.value[node].mean(axis=0), self.like.dtype)
+        return np.asarray(self.value[node])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a run file."""
