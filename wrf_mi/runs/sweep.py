@@ -33,9 +33,9 @@ from ..models import MODELS
 from ..parallel import Scheduler, run_module
 from ..synthetic import load_record
 from ..tasks import TASKS
-from .api import plan_run
 from .evaluate import stored_metrics
 from .folder import CONFIG, METRICS, RunRequest, is_finished, package_versions
+from .plan import plan_run
 
 OPTIONS = (
     *("dataset", "model", "scene", "material", "evaluation", "split", "n-train", "min-rows", "seed"),
