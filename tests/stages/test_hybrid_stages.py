@@ -15,6 +15,7 @@ from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import write_spectrum_folder
+from wrf_mi.stages import paths
 from wrf_mi.stages.engine import Engine, Fold
 from wrf_mi.stages.scene import STAGES
 from wrf_mi.stages.stage import Stage
@@ -185,6 +186,15 @@ def test_few_rows_train_paths_and_hold_two_out(scenes: dict[str, Path], tmp_path
     run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=QUICK)
     assert [report["stage"] for report in run.metrics["stages"]] == ["surfaces", "residual"]
     assert run.metrics["inside_90"] > 0.5
+
+
+def test_rows_that_are_too_few_to_judge_train_all_the_same(scenes, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(paths, "LEAST_ROWS", 99)
+    record, split = measured(scenes, "spectrum", 16)
+    settings = ("stages=mean,calibration", "steps=20")
+    run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=settings)
+    assert taken(run)[-1] == ("paths", "paths", "trained")
+    assert run.fitted.parts["paths"].fitted.params
 
 
 def test_scene_as_stated_is_kept_where_a_training_in_it_is_better(scenes, tmp_path, monkeypatch) -> None:

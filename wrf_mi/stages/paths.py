@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Prediction, Record, Split
+from ..core import InputError, Prediction, Split
 from ..core.settings import with_settings
 from ..core.types import FloatArray, IntArray
 from ..models import model
@@ -22,7 +22,7 @@ from ..tasks import task_of
 from ..training.config import TrainConfig, calibration_config, task_settings
 from ..training.selection import hold_out
 from ..training.trainer import Trainer
-from .engine import Engine, Fold
+from .engine import LEAST_ROWS, Engine, Fold
 from .fitted import Residuals, left_over
 from .scene import (
     CALIBRATION,
@@ -37,6 +37,7 @@ from .scene import (
     StageReport,
     in_regions,
     in_scene,
+    of_rows,
     scene_reports,
     too_few,
 )
@@ -111,7 +112,9 @@ class PathsStage(Stage):
         tried, and all further stages in the better one.
         """
         wanted = {*problem.settings.wanted}
-        if hold_out(problem.record, split) is None or too_few(problem.record, split):
+        fold = hold_out(problem.record, split)
+        judging = 0 if fold is None else np.count_nonzero(in_regions(split, fold.test))
+        if judging < LEAST_ROWS or too_few(problem.record, split):
             return [Option(TRAINED, self._unjudged)]
         options = [Option(AS_TRACED, self._as_traced)]
         if task_of(problem.record).image and not wanted & {CALIBRATION, CORRECTED, SURFACES, FIELD}:
@@ -148,7 +151,7 @@ class PathsStage(Stage):
             if SceneStage.name not in state.kept:
                 raise InputError("the scene is as stated")
             problem = state.kept[SceneStage.name].stated
-        if fold is None or not _of_rows(problem.record, fold):
+        if fold is None or not of_rows(problem.record, fold):
             return self._unjudged(replace(state, problem=problem), split, session)
         rows = replace(split, train=split.all_train, validation=fold.test, test=fold.test[:0])
         inner = replace(problem, settings=config_of(problem, rows, False), checked=[])
@@ -190,13 +193,6 @@ class PathsStage(Stage):
 
 def _named(name: str, in_stated: bool) -> str:
     return name + IN_STATED * in_stated
-
-
-def _of_rows(record: Record, fold: Split) -> bool:
-    """Whether a fold holds out rows of receivers and carriers that train, by which a training can choose its state."""
-    carriers = record.carriers_hz
-    known = carriers is None or bool(np.isin(carriers[fold.test], carriers[fold.all_train]).all())
-    return known and not fold.held_receivers
 
 
 class TracedPaths(Model):

@@ -79,6 +79,13 @@ def in_regions(split: Split, row: IntArray) -> NDArray[np.bool_]:
     return np.asarray(~np.isin(row, split.validation) | bool(split.held_receivers))
 
 
+def of_rows(record: Record, fold: Split) -> bool:
+    """Whether a fold holds out rows of receivers and carriers that train, by which a training can choose its state."""
+    carriers = record.carriers_hz
+    known = carriers is None or bool(np.isin(carriers[fold.test], carriers[fold.all_train]).all())
+    return known and not fold.held_receivers
+
+
 @dataclass(frozen=True)
 class Edited:
     """A scene and what was found of it, kept for a fit to all rows."""
@@ -103,12 +110,11 @@ class SceneStage(Stage):
         if CORRECTED not in wanted:
             how = replace(how, parts=tuple(part for part in how.parts if part not in OF_GEOMETRY))
         still = replace(how, parts=tuple(part for part in how.parts if part not in (PLANES, FRAME)))
-        near = split.validation[:0] if split.held_receivers else split.validation
-        options.append(Option(CALIBRATED, partial(self._fit, still, near), 1))
+        options.append(Option(CALIBRATED, partial(self._fit, still, split.validation), 1))
         if still != how:
             # Other paths make good planes better. They do not mend those that fit training rows alone, and finding
             # them takes as long as all that was done before.
-            fit = partial(self._fit, how, near)
+            fit = partial(self._fit, how, split.validation)
             options += [Option(MOVED, fit, 2), Option(ANEW, fit, 2, MOVED)]
         return options
 
@@ -121,7 +127,7 @@ class SceneStage(Stage):
         return in_regions(split, row)
 
     def _fit(self, options: CorrectionOptions, near: IntArray, state: State, split: Split, session: Session) -> State:
-        if state.fold is not None:
+        if state.fold is not None and of_rows(state.problem.record, state.fold):
             split = replace(split, train=np.union1d(split.train, near), test=np.setdiff1d(split.test, near))
         before: Edited | None = state.kept.get(self.name)
         stated, place = before.stated if before else state.problem, session.folder / SCENE
