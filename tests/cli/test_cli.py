@@ -19,6 +19,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from calling import SET
+from changed_folders import needs
 from commands import Command, arrays_in, rows_of
 from made_spectra import SIZE
 
@@ -33,6 +34,7 @@ from wrf_mi.runs import api as runs
 from wrf_mi.runs.api import open_run
 from wrf_mi.training.checkpoint import read_checkpoint
 from wrf_mi.training.loop import Progress
+from wrf_mi.training.session import quiet
 
 SECONDS_TO_START = 120
 """Importing, compiling and a first step take some 3 s; a busy machine needs much longer."""
@@ -325,6 +327,15 @@ def test_watch_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys
     for text in ("fold0", "fold1", "first stage", "second stage"):
         assert text in shown
     assert "SSIM 0.500 (validation rows)  8 Gaussians  1:01 left" in shown
+
+
+@pytest.mark.slow
+@needs("flat-ble")
+def test_demo_fits_and_compares_the_measured_flat(tmp_path: Path) -> None:
+    shown = demo.Demo(tmp_path, quiet, lambda: False)
+    fitted = shown.measured_flat()
+    assert [run.metrics["model"] for run in fitted] == list(demo.MODELS)
+    assert all(Path(file).is_file() for file in shown.pages(fitted).values())
 
 
 def test_demo_finds_or_fetches_real_data(

@@ -206,8 +206,10 @@ def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray, as_wanted: bool) -
     return np.sort(rows[np.argsort(-distance[:, 1], kind="stable")[: 2 if len(rows) > 3 else 1]])
 
 
-def away_as(split: Split) -> str:
-    """How far from the others the rows of `hold_out` of signal strengths are, in words for a report."""
+def away_as(split: Split, as_wanted: bool) -> str:
+    """How far from the others the rows of `hold_out` are, in words for a report; ``as_wanted``: signal strengths."""
+    if not as_wanted:
+        return "in large clusters"
     if len(split.wanted_m):
         return "as far from the others as the wanted positions (transductive)"
     return "as far from the others as the test positions (transductive)" if len(split.test) else "in large clusters"
