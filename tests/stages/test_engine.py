@@ -117,7 +117,7 @@ def test_an_option_that_goes_on_from_another_is_tried_where_that_one_leads(level
     reports = {report.option: report for report in engine.reports}
     assert list(reports) == [name for name, _, _ in levels]
     assert reports["further"].taken is tried
-    assert ("not tried: found is clearly behind" in reports["further"].why) is not tried
+    assert ("found, which it goes on from, is clearly behind" in reports["further"].why) is not tried
 
 
 def test_an_option_is_judged_by_the_finished_chain(tmp_path: Path) -> None:

@@ -135,7 +135,7 @@ class Engine:
             scores, left = self._judged[stage.name], dict[str, str]()
             for done, option in enumerate(options):
                 if option.after and self._is_behind(option.after, scores):
-                    left[option.name] = f"not tried: {option.after} is clearly behind"
+                    left[option.name] = f"{option.after}, which it goes on from, is clearly behind"
                     continue
                 self._session.report(f"{stage.name}: {option.name}", done / len(options))
                 try:

@@ -214,7 +214,7 @@ class TracedPaths(Model):
         side = state.fitted
         assert isinstance(side, FittedPaths)
         side.problem, side.unseen, side.options = state.problem, engine.unseen, engine.stated_reports()
-        side.stages = tuple(_reports(engine, side.fitted))
+        side.stages = tuple(_reports(engine, side.fitted, task_of(problem.record).higher_is_better))
         # Reports of other carriers have residuals of their own.
         if RESIDUAL in problem.settings.wanted and problem.record.carriers_hz is None:
             side.with_residuals = engine.of_fold("with-residuals", partial(_with_residuals, problem))
@@ -249,11 +249,11 @@ def _with_residuals(problem: Problem, state: State, fold: Fold, mean: FloatArray
     return np.clip(result, 0, 1) if task_of(problem.record).image else result
 
 
-def _reports(engine: Engine, graph: FittedField) -> list[StageReport]:
+def _reports(engine: Engine, graph: FittedField, higher_is_better: bool) -> list[StageReport]:
     """Reports of the scene's stages and of those of the training; materials that the graph trained are a calibration
     where the scene's were not taken.
     """
-    reports = {report.stage: report for report in scene_reports(engine.reports)}
+    reports = {report.stage: report for report in scene_reports(engine.reports, higher_is_better)}
     if any(report.taken and report.option.endswith(IN_STATED) for report in engine.reports):
         unused = [replace(report, kept=False) for report in reports.values() if report.stage != MEAN]
         reports |= {report.stage: report for report in unused}

@@ -171,7 +171,7 @@ def _held(problem: Problem, split: Split) -> set[str]:
     return {problem.record.receivers[number].name for number in split.held_receivers}
 
 
-def scene_reports(options: Sequence[OptionReport]) -> list[StageReport]:
+def scene_reports(options: Sequence[OptionReport], higher_is_better: bool) -> list[StageReport]:
     """Reports of the stages mean, calibration and correction by those of the scene's options, none if none was tried.
 
     Materials and gains are the calibration, all further parts the correction.
@@ -184,8 +184,9 @@ def scene_reports(options: Sequence[OptionReport]) -> list[StageReport]:
     for stage, names in ((CALIBRATION, (CALIBRATED,)), (CORRECTED, (MOVED, ANEW))):
         of_stage = [tried[name] for name in names if name in tried]
         if of_stage:
-            # What was not taken is reported by the last that was tried.
-            best = next((report for report in of_stage if report.taken), of_stage[-1])
+            # What was not taken is reported by the best that it reached.
+            order = sorted(of_stage, key=lambda report: report.held_out or 0.0, reverse=higher_is_better)
+            best = next((report for report in of_stage if report.taken), order[0])
             kept = taken in names or (stage == CALIBRATION and taken in (MOVED, ANEW))
             reports.append(StageReport(stage, kept, best.held_out, sum(report.seconds or 0.0 for report in of_stage)))
     return reports

@@ -157,4 +157,4 @@ def _stage_reports(options: Sequence[OptionReport]) -> list[StageReport]:
     of_mean = [option for option in options if option.stage == MEAN]
     taken = next(option for option in of_mean if option.taken)
     seconds = sum(option.seconds or 0.0 for option in of_mean)
-    return [StageReport(MEAN, True, taken.held_out, seconds), *scene_reports(options)[1:]]
+    return [StageReport(MEAN, True, taken.held_out, seconds), *scene_reports(options, False)[1:]]
