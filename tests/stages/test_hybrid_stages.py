@@ -11,16 +11,18 @@ from traced_rooms import HEIGHT, SHOEBOX, WIDTH, write_xml
 from wrf_mi_scenes.build_laboratory import sheet
 
 import wrf_mi
-from wrf_mi.core import Receiver, Record, Split
+from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import write_spectrum_folder
 from wrf_mi.stages import paths
+from wrf_mi.stages import scene as scene_stage
 from wrf_mi.stages.engine import Engine, Fold
 from wrf_mi.stages.scene import STAGES
 from wrf_mi.stages.stage import Stage
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+from wrf_mi.training.selection import hold_out
 from wrf_mi.training.session import Interrupted
 
 HZ = 920e6
@@ -195,6 +197,25 @@ def test_rows_that_are_too_few_to_judge_train_all_the_same(scenes, tmp_path, mon
     run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=settings)
     assert taken(run)[-1] == ("paths", "paths", "trained")
     assert run.fitted.parts["paths"].fitted.params
+
+
+def test_regions_alone_judge_a_scene_that_rows_near_by_correct(scenes, tmp_path, monkeypatch) -> None:
+    """No test row and no row of a region is seen by a correction, but all others are."""
+    seen = list[np.ndarray]()
+
+    def noted(place: str, record: Record, split: Split, *_: object) -> None:
+        seen.append(split.all_train)
+        raise InputError("noted")
+
+    monkeypatch.setattr(scene_stage, "fit_edit", noted)
+    record, split = measured(scenes, "spectrum", 24)
+    split = replace(split, train=np.sort(split.train)[::2], validation=np.sort(split.train)[1::2])
+    wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=("steps=20",))
+    fold = hold_out(record, split)
+    judged = fold.test[scene_stage.SceneStage().judging(split, fold.test)]
+    assert len(judged)
+    assert len(judged) < len(fold.test)
+    assert all(set(rows) == set(split.all_train) - set(judged) for rows in seen)
 
 
 def test_scene_as_stated_is_kept_where_a_training_in_it_is_better(scenes, tmp_path, monkeypatch) -> None:
