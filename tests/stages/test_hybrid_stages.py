@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import write_spectrum_folder
+from wrf_mi.datasets.ble_folder import write_ble_folder
 from wrf_mi.stages import paths
 from wrf_mi.stages import scene as scene_stage
 from wrf_mi.stages.engine import Engine, Fold
@@ -40,7 +42,19 @@ STOPPED_IN = (
     ("kriging, held-out rows: signals", ""),
     ("choosing weights", ""),
 )
-"""Beginnings and ends of reports after which a fit is stopped, in their order."""
+"""Beginnings and ends of reports after which a fit of spectra is stopped, in their order."""
+STRENGTHS_STOPPED_IN = (
+    ("paths: choices", "(calibrated)"),
+    ("paths: least squares", "(calibrated)"),
+    ("paths: tracing a map", "(exact)"),
+    ("paths: search", "(searched)"),
+    ("paths: none", ""),
+    ("paths: all rows", ""),
+    ("kriging: search", "(searched)"),
+    ("kriging: none", ""),
+    ("choosing weights", ""),
+)
+"""The same of signal strengths."""
 FLOAT32_GREY = 1e-4  # of greys that a batch of transmitters and a single one give: sums in single precision
 CLEAR_DB = 0.3  # of strengths without noise in the true scene; the constant level and slope are fitted to 30 rows
 CLEAR_GREY = 0.05  # gain of the mean SSIM by the true materials of three of six walls: 0.1 with 30 rows
@@ -118,15 +132,24 @@ def test_fit_in_a_scene_is_restored_with_its_sides(spectra: tuple[wrf_mi.Run, Re
     assert all(opened.fitted.parts["paths"].problem.scene == str(scene) for opened in (run, again))
 
 
-def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(scenes: dict[str, Path], tmp_path: Path) -> None:
-    """Stopped in each option of the scene and of the paths, with all rows, and while it interpolates, in turn."""
-    record, split = measured(scenes, "spectrum", 16)
+@pytest.mark.parametrize(
+    ("task", "write", "settings", "stopped_in"),
+    [
+        ("spectrum", write_spectrum_folder, ("steps=20",), STOPPED_IN),
+        ("rssi", write_ble_folder, (), STRENGTHS_STOPPED_IN),
+    ],
+)
+def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(
+    task: str, write: Any, settings: tuple[str, ...], stopped_in: Any, scenes: dict[str, Path], tmp_path: Path
+) -> None:
+    """Stopped in each option of the scene and of what follows, with all rows, and while it interpolates, in turn."""
+    record, split = measured(scenes, task, 16 if task == "spectrum" else 48)
     record = replace(record, official=(split.train, split.test))
-    data, out = str(write_spectrum_folder(tmp_path / "room", record)), tmp_path / "stopped"
-    how = {"scene": scenes["thought"], "settings": ("steps=20",), "deterministic": True}
+    data, out = str(write(tmp_path / "room", record)), tmp_path / "stopped"
+    how = {"scene": scenes["thought"], "settings": settings, "deterministic": True}
     uninterrupted = wrf_mi.train(data, out=tmp_path / "whole", **how)
     sitting = partial(wrf_mi.train, data, out=out, **how)
-    for begin, end in STOPPED_IN:
+    for begin, end in stopped_in:
         reports = [("", 0.0)]
         with pytest.raises(Interrupted):
             sitting(
