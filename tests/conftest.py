@@ -26,7 +26,13 @@ if TYPE_CHECKING:
     from wrf_mi.core import Record
     from wrf_mi.parallel import Scheduler
 
-SLOW_NOTEBOOKS = ("few_measurements", "from_files_to_map", "without_measurements")
+SLOW_NOTEBOOKS = (
+    "few_measurements",
+    "from_files_to_map",
+    "without_measurements",
+    "run_as_mitsuba_scene",
+    "rssi_and_csi",
+)
 # Machines are shared: a case may take ten times as long as the one before.
 hypothesis.settings.register_profile("shared", deadline=None)
 hypothesis.settings.load_profile("shared")
