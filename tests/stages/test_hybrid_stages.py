@@ -1,8 +1,10 @@
 """The stages of a fit in a scene: what is kept, restored, resumed and refused, for every task."""
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,7 @@ from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.training.selection import hold_out
 from wrf_mi.training.session import Interrupted
+from wrf_mi.training.stage_selection import HeldOutReports
 
 HZ = 920e6
 SHAPES = {"spectrum": (24, 48), "rssi": (), "csi": (6,)}
@@ -166,6 +169,47 @@ def taken(run: wrf_mi.Run) -> list[tuple[str, str, str]]:
     """Parts, stages and options that held-out rows chose."""
     chosen = [report for report in run.metrics["options"] if report["taken"]]
     return [(report["part"], report["stage"], report["option"]) for report in chosen]
+
+
+def test_first_stage_of_a_training_that_went_further_is_continued_with_all_rows(scenes, tmp_path, monkeypatch) -> None:
+    """As if nothing had been trained after it: a resumed fit, which trains that anew, ends in the same model."""
+    judged = Engine._scores
+
+    def favouring(engine: Engine, fold: Fold, plan: tuple[str, ...], stage: Stage) -> np.ndarray:
+        return judged(engine, fold, plan, stage) + 10.0 * (plan[-1] == "calibrated") + 9.0 * (plan[-1] == "trained")
+
+    monkeypatch.setattr(Engine, "_scores", favouring)
+    record, split = measured(scenes, "spectrum", 16)
+    record = replace(record, official=(split.train, split.test))
+    data, out = str(write_spectrum_folder(tmp_path / "room", record)), tmp_path / "stopped"
+    how = {"scene": scenes["thought"], "settings": ("steps=20",), "deterministic": True}
+    whole = wrf_mi.train(data, out=tmp_path / "whole", **how)
+    assert taken(whole)[-1] == ("paths", "paths", "calibrated")
+    log = (whole.folder / "parts" / "paths" / "log.jsonl").read_text().splitlines()
+    assert json.loads(log[-1])["step"] == 20
+    reports = [""]
+    with pytest.raises(Interrupted):
+        wrf_mi.train(
+            data,
+            out=out,
+            on_progress=lambda what, *_: reports.append(what),
+            stop=lambda: reports[-1].startswith("paths: least squares") and reports[-1].endswith("parameters"),
+            **how,
+        )
+    position = record.tx_pos_m[:6]
+    np.testing.assert_array_equal(wrf_mi.resume(out).predict(position).mean, whole.predict(position).mean)
+
+
+def test_reports_of_held_out_rows_are_those_of_a_fit_without_them() -> None:
+    rows, report = np.array([7, 3, 5]), np.arange(3.0)
+    reports = HeldOutReports(np.array([0, 0, 1]), rows, report, {})
+    graph = SimpleNamespace(receivers=None, uses_heading=None, carriers_hz=None, held_out=reports)
+    side = paths.FittedPaths(graph, None)
+    assert side.predict_rows(np.array([3, 7]), 0) is None, "a fit to all rows has other predictions"
+    side.reports = reports
+    np.testing.assert_array_equal(side.predict_rows(np.array([3, 7]), 0).mean, [1, 0])
+    assert side.predict_rows(np.array([3, 5]), 0) is None
+    assert side.predict_rows(np.array([3, 8]), 0) is None
 
 
 @pytest.mark.parametrize("task", ["rssi", "csi"])

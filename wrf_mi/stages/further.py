@@ -12,16 +12,16 @@ from functools import partial
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core import Split
 from ..core.array_files import keyed, under
 from ..core.registry import Registry
 from ..models.error_prior import ErrorPrior
-from ..models.model import Arrays, Fitted, Inputs, Model, PredictAll, Problem, Session
+from ..models.model import Arrays, Fitted, Model, PredictAll, Problem, Session
 from .engine import Engine
 from .fitted import FittedHybrid
 from .scene import StageReport, stated_reports
+from .side import at_all_receivers
 from .stage import Option, Stage, State
 
 FURTHER = "further"  # array of the names of such stages in their order, and beginning of the names of their arrays
@@ -69,7 +69,7 @@ class Further(Fitted):
         if not last:
             return self.before.by_stage(split)
         count = len(first_of(self).problem.record.receivers)
-        return self.before.by_stage(split) | {last: partial(_at_all_receivers, self.before, count)}
+        return self.before.by_stage(split) | {last: partial(at_all_receivers, self.before, count)}
 
     def arrays(self) -> Arrays:
         """Arrays of the stages before and of this one."""
@@ -80,10 +80,6 @@ class Further(Fitted):
     def facts(self) -> dict[str, Any]:
         """As before."""
         return self.before.facts()
-
-
-def _at_all_receivers(fitted: Fitted, count: int, inputs: Inputs) -> NDArray[Any]:
-    return np.stack([fitted.predict_mean(inputs, receiver) for receiver in range(count)])
 
 
 def first_of(fitted: Fitted) -> FittedHybrid:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..backend.device import release_memory
 from ..core import InputError, Prediction, Split
 from ..core.settings import with_settings
 from ..core.types import FloatArray, IntArray
@@ -20,7 +21,9 @@ from ..models.gaussian.model import WRF_GS_PLUS, FittedField
 from ..models.model import Arrays, Model, Problem, Session
 from ..tasks import task_of
 from ..training.config import TrainConfig, calibration_config, task_settings
+from ..training.loop import FitState
 from ..training.selection import hold_out
+from ..training.stage_selection import HeldOutReports
 from ..training.trainer import Trainer
 from .engine import LEAST_ROWS, Engine, Fold
 from .fitted import Residuals, left_over
@@ -71,9 +74,13 @@ def config_of(problem: Problem, split: Split, few: bool) -> TrainConfig:
 
 
 class FittedPaths(SceneSide):
-    """The scene's side: a graph of paths, Gaussians on surfaces and those of a field."""
+    """The scene's side: a graph of paths, Gaussians on surfaces and those of a field.
+
+    ``reports`` are those of the held-out rows by a fit to the others, None of a fit to all rows.
+    """
 
     fitted: FittedField
+    reports: HeldOutReports | None = None
 
     def arrays(self) -> Arrays:
         """Arrays of the graph, and its settings."""
@@ -81,7 +88,7 @@ class FittedPaths(SceneSide):
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
         """Reports of held-out rows by which the training chose its state; None: other rows are among them."""
-        reports = self.fitted.held_out
+        reports = self.reports
         if reports is None:
             return None
         mine = np.flatnonzero(reports.receiver == receiver)
@@ -94,10 +101,11 @@ class FittedPaths(SceneSide):
 
 
 class _Training(NamedTuple):
-    """A training whose state held-out rows choose, and the problem with the scene of its paths."""
+    """A training whose state held-out rows choose."""
 
     trainer: Trainer
-    problem: Problem
+    state: FitState  # where it stood at the end of the option; a later one goes on with the same trainer
+    problem: Problem  # with the scene of its paths
 
 
 class PathsStage(Stage):
@@ -168,8 +176,9 @@ class PathsStage(Stage):
         return self._with(state, state.problem, graph, trainer)
 
     def _with(self, state: State, problem: Problem, graph: FittedField, trainer: Trainer) -> State:
-        kept = {**state.kept, self.name: _Training(trainer, problem)}
-        return replace(state, problem=problem, fitted=FittedPaths(graph, problem), kept=kept)
+        kept, side = {**state.kept, self.name: _Training(trainer, trainer.state, problem)}, FittedPaths(graph, problem)
+        side.reports = graph.held_out
+        return replace(state, problem=problem, fitted=side, kept=kept)
 
     def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
         """The training goes on from the chosen state with all rows."""
@@ -185,7 +194,8 @@ class PathsStage(Stage):
             if found is None:
                 return self._unjudged(replace(state, problem=problem), split, session)
             inner = replace(problem, settings=config_of(problem, split, False), checked=[])
-            graph = WRF_GS_PLUS.continued(found.trainer, found.problem.scene, inner, split, session)
+            of_fold = found.trainer, found.state, found.problem.scene
+            graph = WRF_GS_PLUS.continued(*of_fold, inner, split, session)
             return replace(state, problem=problem, fitted=FittedPaths(graph, problem))
 
         return option._replace(fit=fit)
@@ -218,6 +228,8 @@ class TracedPaths(Model):
         # Reports of other carriers have residuals of their own.
         if RESIDUAL in problem.settings.wanted and problem.record.carriers_hz is None:
             side.with_residuals = engine.of_fold("with-residuals", partial(_with_residuals, problem))
+        del engine, state  # with the trainings of the options
+        release_memory()
         return side
 
     def selects(self, problem: Problem, splits: Sequence[Split]) -> bool:

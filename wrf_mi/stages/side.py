@@ -80,19 +80,19 @@ def by_stage(problem: Problem, split: Split, side: SceneSide, used: Collection[s
         predictions[MEAN] = _traced(problem, split)
     if side.problem.scene != problem.scene:
         predictions |= {stage: _traced(side.problem, split) for stage in (CALIBRATION, CORRECTED) if stage in earlier}
-    field = side.fitted
+    field, count = side.fitted, len(problem.record.receivers)
     if isinstance(field, FittedField):
         if SURFACES in earlier:
             fitted = field.without_gaussians() if FIELD in used else side
-            predictions[SURFACES] = partial(_at_all_receivers, fitted)
+            predictions[SURFACES] = partial(at_all_receivers, fitted, count)
         if FIELD in earlier:
-            predictions[FIELD] = partial(_at_all_receivers, side)
+            predictions[FIELD] = partial(at_all_receivers, side, count)
     return predictions
 
 
-def _at_all_receivers(fitted: Fitted, inputs: Inputs) -> NDArray[np.generic]:
-    assert fitted.receivers is not None
-    return np.stack([fitted.predict_mean(inputs, receiver) for receiver in range(len(fitted.receivers))])
+def at_all_receivers(fitted: Fitted, count: int, inputs: Inputs) -> NDArray[Any]:
+    """Means of ``count`` receivers [n_rx, m, ...]."""
+    return np.stack([fitted.predict_mean(inputs, receiver) for receiver in range(count)])
 
 
 def _traced(problem: Problem, split: Split) -> PredictAll:

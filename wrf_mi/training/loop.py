@@ -310,12 +310,16 @@ class TrainingLoop(ABC):
         state.keep_best(score if self.higher_is_better else -score)
         if state.best is None or (state.waited < self.config.patience and state.step < self.schedule.joined):
             return False
-        # The steps that follow train on the validation rows, too, as many as led to the best state, in proportion.
-        self.state = state.go_back()
+        self.choose_best()
+        return True
+
+    def choose_best(self) -> None:
+        """Go on from the best state: steps that follow train on the validation rows, too."""
+        # As many as led to the best state, in proportion.
+        self.state = self.state.go_back()
         self.state.chosen = max(self.state.step, 1)  # 0 means that none is
         self.schedule, self.state.step = self.schedule.after(self.state.chosen)
         self.record_functions()
-        return True
 
     def _require_finite(self, trouble: NonFiniteReport) -> None:
         """Raise `NumericsError` after a step without finite values, or with parameters that are not finite."""

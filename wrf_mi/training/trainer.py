@@ -197,13 +197,22 @@ class Trainer(TrainingLoop):
             self.state.waited = -1
         if not super().choose(score):
             return False
-        self._restore_paths()
-        if self.plan.chooses_stages:
-            self.state.held_out = self.selection.choose_phase_error(self.predictor(), self.state)
         if self.state.reach_m == 0 and self.graph.scene is None:
             logger.warning("at no distance from training rows do the Gaussians predict held-out rows better than zero")
             self.state.step = self.config.steps  # further steps would train what is not used
         return True
+
+    def choose_best(self) -> None:
+        """Go on from the best state (`TrainingLoop`), with the phase error that predicts held-out rows best."""
+        super().choose_best()
+        self._restore_paths()
+        if self.plan.chooses_stages:
+            self.state.held_out = self.selection.choose_phase_error(self.predictor(), self.state)
+
+    def choose_at(self, state: FitState) -> None:
+        """Choose the best state up to one, whatever was trained after it."""
+        self.state, self.schedule, self.ends_at = state, self.plan.schedule, None
+        self.choose_best()
 
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """One optimiser step (`TrainingLoop`)."""

@@ -263,10 +263,15 @@ class GaussianField(Model):
         return self._finished(trainer, problem, split, session), trainer
 
     def continued(
-        self, trainer: Trainer, scene: str | None, problem: Problem, split: Split, session: Session
+        self, trainer: Trainer, state: FitState, scene: str | None, problem: Problem, split: Split, session: Session
     ) -> FittedField:
-        """The training of `chosen` in a ``scene`` goes on with all rows of a split, in the scene of a problem."""
+        """The training of `first_stage` or `chosen` in a ``scene`` goes on from the ``state`` in which either ended.
+
+        All rows of a split train, in the scene of a problem.
+        """
         folder, record, before = session.folder, problem.record, trainer.plan.graph.receivers
+        if not state.chosen:
+            trainer.choose_at(state)
         placed = placed_receivers(record, by_uplink=False)
         if problem.scene == scene and [each.name for each in placed] == [each.name for each in before]:
             if (folder / CHECKPOINT).exists():  # stopped in what follows
