@@ -23,8 +23,9 @@ from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.sionna.materials import BELOW_1_GHZ
 from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.config import calibration_config, default_config
+from wrf_mi.training.fit_plan import FitPlan
 from wrf_mi.training.loop import FitState
-from wrf_mi.training.trainer import Trainer
+from wrf_mi.training.trainer import Trainer, fit_curriculum
 
 ARRAY_M = planar_array(4, 4, 0.16)
 BAND_HZ = FREQUENCY_HZ + np.linspace(-10e6, 10e6, 4)
@@ -129,8 +130,7 @@ def test_permittivity_is_recovered_in_joint_training(rooms):
     own = ("batch=20", "traced.material=0.05", "traced.materials=named", "traced.surface=0", "initial.gaussians=40")
     small_field = ("steps=150", "network.width=32", "network.layers=2")
     config = with_settings(default_config("csi"), [*ONE_REFLECTION, *QUICK, *own, *small_field])
-    trainer = Trainer(record, all_of(record, 20), config, scene=rooms[1])
-    trainer.run()
+    trainer = fit_curriculum(FitPlan(record, all_of(record, 20), config, scene=rooms[1]))
     miss = trainer.predictor()(record.tx_pos_m[20:]) - record.observation[0, 20:]
     assert (np.abs(miss) ** 2).sum() < 0.1 * (np.abs(record.observation[0, 20:]) ** 2).sum()
     assert 1 + np.exp(trainer.state.params()[PERMITTIVITY]).item() == pytest.approx(TRUE_PERMITTIVITY, abs=0.2)
@@ -263,9 +263,8 @@ def thirds(record):
 def trained(record, scene, *settings):
     own = {"spectrum": SPECTRA, "csi": CHANNELS}.get(record.task, ())
     config = with_settings(default_config(record.task), [*SETTINGS, *own, *settings])
-    trainer = Trainer(record, thirds(record), config, scene=None if scene is None else open_scene(scene, FREQUENCY_HZ))
-    trainer.run()
-    return trainer
+    opened = None if scene is None else open_scene(scene, FREQUENCY_HZ)
+    return fit_curriculum(FitPlan(record, thirds(record), config, scene=opened))
 
 
 def score(record, trainer):

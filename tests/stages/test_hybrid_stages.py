@@ -28,7 +28,7 @@ from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.training.selection import hold_out
 from wrf_mi.training.session import Interrupted
-from wrf_mi.training.stage_selection import HeldOutReports
+from wrf_mi.training.validation import HeldOutReports
 
 HZ = 920e6
 SHAPES = {"spectrum": (24, 48), "rssi": (), "csi": (6,)}
@@ -40,7 +40,8 @@ STOPPED_IN = (
     ("paths: choices", "(corrected)"),
     ("paths: choices", "(corrected, paths found anew)"),
     ("paths: calibrated", ""),
-    ("paths: training", "(trained)"),
+    ("paths: training surfaces", "(surfaces)"),
+    ("paths: training field", "(field)"),
     ("paths: least squares", "parameters"),
     ("kriging, held-out rows: signals", ""),
     ("choosing weights", ""),
@@ -143,9 +144,17 @@ def test_fit_in_a_scene_is_restored_with_its_sides(spectra: tuple[wrf_mi.Run, Re
     ],
 )
 def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(
-    task: str, write: Any, settings: tuple[str, ...], stopped_in: Any, scenes: dict[str, Path], tmp_path: Path
+    task: str,
+    write: Any,
+    settings: tuple[str, ...],
+    stopped_in: Any,
+    scenes: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Stopped in each option of the scene and of what follows, with all rows, and while it interpolates, in turn."""
+    config_of = paths.config_of
+    monkeypatch.setattr(paths, "config_of", lambda *given: replace(config_of(*given), log_every=1))
     record, split = measured(scenes, task, 16 if task == "spectrum" else 48)
     record = replace(record, official=(split.train, split.test))
     data, out = str(write(tmp_path / "room", record)), tmp_path / "stopped"
@@ -176,7 +185,7 @@ def test_first_stage_of_a_training_that_went_further_is_continued_with_all_rows(
     judged = Engine._scores
 
     def favouring(engine: Engine, fold: Fold, plan: tuple[str, ...], stage: Stage) -> np.ndarray:
-        return judged(engine, fold, plan, stage) + 10.0 * (plan[-1] == "calibrated") + 9.0 * (plan[-1] == "trained")
+        return judged(engine, fold, plan, stage) + 10.0 * (plan[-1] == "calibrated") + 9.0 * (plan[-1] == "surfaces")
 
     monkeypatch.setattr(Engine, "_scores", favouring)
     record, split = measured(scenes, "spectrum", 16)
@@ -186,7 +195,7 @@ def test_first_stage_of_a_training_that_went_further_is_continued_with_all_rows(
     whole = wrf_mi.train(data, out=tmp_path / "whole", **how)
     assert taken(whole)[-1] == ("paths", "paths", "calibrated")
     log = (whole.folder / "parts" / "paths" / "log.jsonl").read_text().splitlines()
-    assert json.loads(log[-1])["step"] == 20
+    assert json.loads(log[-1])["step"] == 4  # 15 % of 20 steps without the held-out rows, and one with all rows
     reports = [""]
     with pytest.raises(Interrupted):
         wrf_mi.train(
@@ -202,7 +211,7 @@ def test_first_stage_of_a_training_that_went_further_is_continued_with_all_rows(
 
 def test_reports_of_held_out_rows_are_those_of_a_fit_without_them() -> None:
     rows, report = np.array([7, 3, 5]), np.arange(3.0)
-    reports = HeldOutReports(np.array([0, 0, 1]), rows, report, {})
+    reports = HeldOutReports(np.array([0, 0, 1]), rows, report)
     graph = SimpleNamespace(receivers=None, uses_heading=None, carriers_hz=None, held_out=reports)
     side = paths.FittedPaths(graph, None)
     assert side.predict_rows(np.array([3, 7]), 0) is None, "a fit to all rows has other predictions"
@@ -288,7 +297,7 @@ def test_regions_alone_judge_a_scene_that_rows_near_by_correct(scenes, tmp_path,
 def test_scene_as_stated_is_kept_where_a_training_in_it_is_better(scenes, tmp_path, monkeypatch) -> None:
     """Stages that are not wanted are not fitted."""
     stated, judged = str(scenes["thought"]), Engine._scores
-    best = ("calibrated in the scene as stated", "trained in the scene as stated")
+    best = ("calibrated in the scene as stated", "surfaces in the scene as stated")
 
     def favouring(engine: Engine, fold: Fold, plan: tuple[str, ...], stage: Stage) -> np.ndarray:
         scene, paths = plan

@@ -136,7 +136,7 @@ def test_progress_states_how_far_validation_and_test_rows_are_from_training_rows
     assert last.validation_rows == len(split.validation)
     assert (last.validation_m, last.test_m) == pytest.approx((np.median(validation_m), np.median(test_m)))
     assert 0 < np.count_nonzero(far) < len(far)
-    assert last.far_score == pytest.approx(np.median(trainer.selection.scores[far]))
+    assert last.far_score == pytest.approx(np.median(trainer.validation.scores[far]))
 
 
 @pytest.mark.parametrize("model", FIELDS)

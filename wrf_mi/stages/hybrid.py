@@ -198,7 +198,7 @@ class _Fit:
         ]
         stated = {"stages": stated_reports(self.reports), **chosen, "weights": weights}
         options = [{"part": name, **report} for name in self.fitted for report in self.fitted[name].options]
-        away = away_as(self.split, self.task.in_decibel)
+        away = away_as(self.split)
         stated |= {"options": options, "hold_out": away} if options else {}
         parts = {name: self._part(name) for name in used if name != RESIDUAL}
         residuals = self.residuals if RESIDUAL in used else None

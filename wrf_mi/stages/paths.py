@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,9 @@ from ..models.gaussian.model import WRF_GS_PLUS, FittedField
 from ..models.model import Arrays, Model, Problem, Session
 from ..tasks import task_of
 from ..training.config import TrainConfig, calibration_config, task_settings
-from ..training.loop import FitState
 from ..training.selection import hold_out
-from ..training.stage_selection import HeldOutReports
 from ..training.trainer import Trainer
+from ..training.validation import HeldOutReports
 from .engine import LEAST_ROWS, Engine, Fold
 from .fitted import Residuals, left_over
 from .scene import (
@@ -104,7 +103,6 @@ class _Training(NamedTuple):
     """A training whose state held-out rows choose."""
 
     trainer: Trainer
-    state: FitState  # where it stood at the end of the option; a later one goes on with the same trainer
     problem: Problem  # with the scene of its paths
 
 
@@ -117,7 +115,7 @@ class PathsStage(Stage):
         """All; trained ones alone where rows are too few to choose by.
 
         A training finds materials itself, from those of the scene as it is stated or as it is calibrated: both are
-        tried, and all further stages in the better one.
+        tried, and all further parameters in the better one.
         """
         wanted = {*problem.settings.wanted}
         fold = hold_out(problem.record, split)
@@ -128,10 +126,15 @@ class PathsStage(Stage):
         if task_of(problem.record).image and not wanted & {CALIBRATION, CORRECTED, SURFACES, FIELD}:
             return options  # images have no gain that could be trained
         stated = [False, True] if {CALIBRATION, CORRECTED} & wanted else [False]
-        options += [Option(_named(CALIBRATED, of), partial(self._calibrated, of), 1) for of in stated]
-        if {SURFACES, FIELD} & wanted:
-            after = [(_named(TRAINED, of), _named(CALIBRATED, of)) for of in stated]
-            options += [Option(name, self._trained, 1, earlier) for name, earlier in after]
+        before = ""
+        for freedom, name in enumerate((CALIBRATED, SURFACES, FIELD)):
+            if name == CALIBRATED or name in wanted:
+                fits = [partial(self._trained, of and not before) for of in stated]
+                options += [
+                    Option(_named(name, of), fit, 1 + freedom, before and _named(before, of))
+                    for of, fit in zip(stated, fits, strict=True)
+                ]
+                before = name
         return options
 
     def judging(self, split: Split, row: IntArray) -> NDArray[np.bool_]:
@@ -152,31 +155,19 @@ class PathsStage(Stage):
         inner = replace(state.problem, settings=config_of(state.problem, split, few), checked=[])
         return replace(state, fitted=FittedPaths(WRF_GS_PLUS.fit(inner, split, session), state.problem))
 
-    def _calibrated(self, in_stated: bool, state: State, split: Split, session: Session) -> State:
-        """The first stage of a training, or all where no rows are held out by which it could choose."""
-        problem, fold = state.problem, state.fold
+    def _trained(self, in_stated: bool, state: State, split: Split, session: Session) -> State:
+        """The next training of the curriculum, or all where no rows are held out by which it could choose."""
+        problem, fold, before = state.problem, state.fold, cast(_Training | None, state.kept.get(self.name))
         if in_stated:
             if SceneStage.name not in state.kept:
                 raise InputError("the scene is as stated")
             problem = state.kept[SceneStage.name].stated
         if fold is None or not of_rows(problem.record, fold):
-            return self._unjudged(replace(state, problem=problem), split, session)
+            return self._unjudged(replace(state, problem=problem), split, session) if before is None else state
         rows = replace(split, train=split.all_train, validation=fold.test, test=fold.test[:0])
         inner = replace(problem, settings=config_of(problem, rows, False), checked=[])
-        graph, trainer = WRF_GS_PLUS.first_stage(inner, rows, session)
-        return self._with(state, problem, graph, trainer)
-
-    def _trained(self, state: State, split: Split, session: Session) -> State:
-        """All stages of the training whose first one a state has."""
-        found: _Training | None = state.kept.get(self.name)
-        if found is None:
-            return state
-        rows = found.trainer.plan.split
-        graph, trainer = WRF_GS_PLUS.chosen(found.trainer, replace(state.problem, checked=[]), rows, session)
-        return self._with(state, state.problem, graph, trainer)
-
-    def _with(self, state: State, problem: Problem, graph: FittedField, trainer: Trainer) -> State:
-        kept, side = {**state.kept, self.name: _Training(trainer, trainer.state, problem)}, FittedPaths(graph, problem)
+        graph, trainer = WRF_GS_PLUS.train_part(before and before.trainer, inner, rows, session)
+        kept, side = {**state.kept, self.name: _Training(trainer, problem)}, FittedPaths(graph, problem)
         side.reports = graph.held_out
         return replace(state, problem=problem, fitted=side, kept=kept)
 
@@ -194,8 +185,7 @@ class PathsStage(Stage):
             if found is None:
                 return self._unjudged(replace(state, problem=problem), split, session)
             inner = replace(problem, settings=config_of(problem, split, False), checked=[])
-            of_fold = found.trainer, found.state, found.problem.scene
-            graph = WRF_GS_PLUS.continued(*of_fold, inner, split, session)
+            graph = WRF_GS_PLUS.continued(found.trainer, found.problem.scene, inner, split, session)
             return replace(state, problem=problem, fitted=FittedPaths(graph, problem))
 
         return option._replace(fit=fit)
@@ -266,15 +256,21 @@ def _reports(engine: Engine, graph: FittedField, higher_is_better: bool) -> list
     where the scene's were not taken.
     """
     reports = {report.stage: report for report in scene_reports(engine.reports, higher_is_better)}
-    if any(report.taken and report.option.endswith(IN_STATED) for report in engine.reports):
+    of_paths = {report.option: report for report in engine.reports if report.stage == PathsStage.name}
+    taken = next(name for name, report in of_paths.items() if report.taken)
+    if taken.endswith(IN_STATED):
         unused = [replace(report, kept=False) for report in reports.values() if report.stage != MEAN]
         reports |= {report.stage: report for report in unused}
-    scores: Mapping[str, float] = {} if graph.held_out is None else graph.held_out.score
     used = {SURFACES: any(name.startswith("surface.") for name in graph.params), FIELD: graph.field is not None}
-    if CALIBRATION in scores and not reports.get(CALIBRATION, StageReport(CALIBRATION, False)).kept:
-        reports[CALIBRATION] = StageReport(CALIBRATION, True, scores[CALIBRATION])
-    trained = [StageReport(name, used[name], scores.get(name)) for name in used if name in scores or used[name]]
-    if trained:
-        trained[-1] = replace(trained[-1], seconds=graph.train_seconds)
-    reports |= {report.stage: report for report in trained}
+    if taken == TRAINED:  # nothing could be judged
+        last = [name for name in used if used[name]]
+        return [*reports.values(), *(StageReport(name, True, None, graph.train_seconds) for name in last)]
+    for stage, name in ((CALIBRATION, CALIBRATED), (SURFACES, SURFACES), (FIELD, FIELD)):
+        tried = [of_paths[each] for each in (name, _named(name, True)) if each in of_paths and of_paths[each].seconds]
+        if not tried:
+            continue
+        best = (max if higher_is_better else min)(tried, key=lambda report: report.held_out or 0.0)
+        seconds, kept = sum(report.seconds or 0.0 for report in tried), used.get(stage, taken != AS_TRACED)
+        if stage not in reports or (kept and not reports[stage].kept):
+            reports[stage] = StageReport(stage, kept, best.held_out, seconds)
     return sorted(reports.values(), key=lambda report: STAGES.index(report.stage))

@@ -30,13 +30,6 @@ class Schedule:
     decay: NDArray[np.float64]  # decay of the running mean of the parameters at each step, [steps]
     density: frozenset[int]  # steps after which a round of density control follows
     joined: int  # first step that may train on the validation rows; ``steps`` if never
-    # first steps of the stages after the first, in ascending order; learning rates fall anew in each, and no state of
-    # the first stage is chosen before its end
-    stages: tuple[int, ...] = ()
-
-    def stage(self, step: int) -> int:
-        """Number of the stage of a step, from 0."""
-        return sum(step >= start for start in self.stages)
 
     def after(self, best: int) -> tuple[Schedule, int]:
         """The schedule that continues from the best state, of step ``best``, before the validation rows join.
@@ -60,14 +53,14 @@ def plan(
     everything: Sequence[IntArray],
     rng: np.random.Generator,
     density: frozenset[int] = frozenset(),
-    stages: tuple[int, ...] = (),
+    falls_by_choice: bool = False,
 ) -> Schedule:
     """The schedule of a fit, a function of settings, rows and seed only: a resumed run gets the same.
 
     Each epoch visits every row once at every receiver that observed it, in random order; a batch belongs to one
     receiver and is no larger than the rows of any. An epoch omits random rows that do not fill a batch. ``train`` are
     rows (conditions) of each receiver that train while validation rows are held out, ``everything`` all of them;
-    ``density`` and ``stages`` as in `Schedule`.
+    ``density`` as in `Schedule`; ``falls_by_choice``: learning rates fall before validation rows join, and once more.
 
     Raises:
         InputError: a receiver without rows that train.
@@ -82,10 +75,12 @@ def plan(
     plans = _epochs(train, joined, batch, rng), _epochs(everything, steps - joined, batch, rng)
     chosen, receiver = (np.concatenate(parts) for parts in zip(*plans, strict=True))
     t, o = np.arange(steps), config.optimiser
-    factor = np.concatenate([_falling(int(part), o) for part in np.diff([0, *stages, steps])])
+    factor = _falling(steps, o)
+    if falls_by_choice:
+        factor[:joined] = _falling(joined, o)
     # Shorten the window of the running mean early in training, or it would be mostly the starting values.
     decay = np.minimum(o.ema_decay, (t + 1) / (t + 10))
-    return Schedule(chosen, receiver, factor, decay, density, joined, stages)
+    return Schedule(chosen, receiver, factor, decay, density, joined)
 
 
 def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
@@ -97,12 +92,11 @@ def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
     return np.asarray(cosine * np.minimum(1.0, (t + 1) / max(1, optimiser.warm_up)))
 
 
-def density_rounds(config: DensityConfig, steps: int, before: int = 0) -> frozenset[int]:
-    """Steps after which a round of density control follows; before the last stage there are no Gaussians."""
-    left = steps - before
-    first, last = int(config.start * left), int(config.stop * left)
-    rounds = range(config.every, left, config.every) if config.every else ()
-    return frozenset(before + s for s in rounds if first <= s <= last)
+def density_rounds(config: DensityConfig, steps: int) -> frozenset[int]:
+    """Steps after which a round of density control follows."""
+    first, last = int(config.start * steps), int(config.stop * steps)
+    rounds = range(config.every, steps, config.every) if config.every else ()
+    return frozenset(s for s in rounds if first <= s <= last)
 
 
 def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:

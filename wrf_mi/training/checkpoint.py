@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-FORMAT = 7  # version of ``checkpoint.npz``
+FORMAT = 8  # version of ``checkpoint.npz``
 GROUPS = ("param", "mean", "first", "second")
 """Groups of arrays with equal names and shapes: parameters, their running mean, and Adam's moments."""
 CHECKPOINT, LOG = "checkpoint.npz", "log.jsonl"

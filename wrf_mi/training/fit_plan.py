@@ -6,6 +6,7 @@ A *condition* is the input of a field: a row's transmitter position, or the upli
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -258,8 +259,8 @@ def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128
     return np.ascontiguousarray(vectors[:, ::-1][:, :most].conj().T)
 
 
-CALIBRATION, SURFACES, FIELD = "calibration", "surfaces", "field"
-"""Stages of a training: parameters of paths; Gaussians on surfaces with them; and the field's Gaussians, too."""
+PATHS, SURFACES, FIELD = "paths", "surfaces", "field"
+"""Parameters that a training adds to those before: of paths, of Gaussians on surfaces, and of the field's Gaussians."""
 
 
 def check_rows(split: Split, record: Record, source: str) -> None:
@@ -273,11 +274,17 @@ def check_rows(split: Split, record: Record, source: str) -> None:
 class FitPlan:
     """Data, graph and schedule of a fit, a function of its arguments, those of `wrf_mi.training.trainer.Trainer`.
 
-    With ``held_out``, the validation rows of the split are those that choose stages and state; else some are chosen.
+    With ``held_out``, the validation rows of the split are those that choose the state; else some are chosen.
+
+    Beside the paths of a scene, parameters are trained in a curriculum of trainings, each of which goes on from the one
+    before (`part`).
 
     Attributes:
         config: settings with number of steps and scale of transmitters.
-        stages: names of the stages in their order.
+        curriculum: parameters that each training adds (`PATHS`, `SURFACES`, `FIELD`), in their order.
+        number: number of the training that this plan is for.
+        loop: its settings: steps, share of them in which validation rows are held out, and steps between two scores.
+        schedule: rows and learning rates of its steps.
         in_groups: whether the state is chosen on rows held out in groups, far from the training rows too.
         choosing: split of these rows, or, where Gaussians alone train, of validation rows as far from training rows as
             test rows (`hold_out_far`); ``split`` itself where there are none.
@@ -312,10 +319,11 @@ class FitPlan:
             check_memory(config, field)
         receivers = placed_receivers(record, by_uplink=bool(form.features))
         self.graph = Graph(field, receivers, form, scene, config.traced, record.tx_antenna, config.evaluation)
-        self.stages = self._stage_names()
+        self.curriculum = self._curriculum()
         # What corrects paths is chosen also on rows far from the training rows: near them, Gaussians that interpolate
         # always gain, whatever they do elsewhere.
-        wanted = (self.graph.corrects or len(self.stages) > 1) and config.patience > 0 < config.holdout_steps_fraction
+        chosen = config.patience > 0 and config.holdout_steps_fraction > 0
+        wanted = chosen and (self.graph.corrects or len(self.curriculum) > 1)
         self.choosing = hold_out_groups(split, record.tx_pos_m) if wanted and not held_out else split
         # Rows for a score alone: they choose no state, and are trained on in the end.
         shown = not config.patience and 0 < config.holdout_steps_fraction < 1
@@ -324,13 +332,34 @@ class FitPlan:
         self.in_groups = wanted and (held_out or self.choosing is not split or self.graph.corrects)
         # Without rows to choose by, Gaussians are not used at all (`Trainer`): paths alone are the safe answer.
         self.unjudged = self.in_groups and self.choosing is split and not held_out
-        self.schedule = self._planned()
+        self._take(0)
         # Sides are traced for all training rows at once, validation rows included, and addressed by these slots.
         self.known = [self.targets.at(port, rows) for port in range(self.targets.ports)]
 
+    def part(self, number: int) -> FitPlan:
+        """The plan of another training of the curriculum, of the same graph."""
+        plan = copy(self)
+        plan._take(number)
+        return plan
+
+    def _take(self, number: int) -> None:
+        self.number = number
+        self.loop = self._loop()
+        self.schedule = self._planned()
+
     @property
-    def chooses_stages(self) -> bool:
-        """Whether stages beside paths are chosen by groups of rows that are held out."""
+    def trains(self) -> str:
+        """Parameters that the training adds."""
+        return self.curriculum[self.number]
+
+    @property
+    def trains_surfaces(self) -> bool:
+        """Whether Gaussians on surfaces are trained."""
+        return bool(self.graph.surface) and self.trains != PATHS and not self.unjudged
+
+    @property
+    def chooses_beside_paths(self) -> bool:
+        """Whether the state is chosen by groups of rows that are held out, beside the paths of a scene."""
         return self.in_groups and self.graph.scene is not None
 
     def traced(self) -> list[TracedField | None]:
@@ -343,12 +372,12 @@ class FitPlan:
         receivers = range(len(record.receivers))
         return [side for r in receivers for side in self.graph.trace(record.tx_pos_m[rows], r, heading, carrier)]
 
-    def _stage_names(self) -> tuple[str, ...]:
+    def _curriculum(self) -> tuple[str, ...]:
         if self.graph.scene is None:
             return (FIELD,)
         traced = self.config.traced
-        more = (SURFACES,) * (traced.surface > 0) + (FIELD,) * (self.graph.field is not None)
-        return (CALIBRATION, *more) if traced.alone else (more or (CALIBRATION,))[-1:]
+        every = (PATHS, *(SURFACES,) * (traced.surface > 0), *(FIELD,) * (self.graph.field is not None))
+        return every if traced.alone else every[-1:]
 
     def _with_far_rows(self) -> Split:
         """The split of `hold_out_far`; the fit's own where a receiver would be left with less than a batch."""
@@ -360,25 +389,40 @@ class FitPlan:
         return far if least_far >= min(self.config.batch, least) else self.split
 
     def _planned(self) -> Schedule:
-        config, targets = self.config, self.targets
+        config, targets = self.loop, self.targets
         parts, ports = (self.choosing.all_train, self.choosing.train), range(targets.ports)
         everything, train = ([targets.received(port, rows) for port in ports] for rows in parts)
         # A receiver without training rows learns from its validation rows.
         train = [rows if len(rows) else every for rows, every in zip(train, everything, strict=True)]
-        ends = self._stage_ends()
-        density = density_rounds(config.density, config.steps, max(ends, default=0))
-        return plan(config, train, everything, np.random.default_rng([config.seed, 1]), density, ends)
+        density = density_rounds(config.density, config.steps) if self.trains == FIELD else frozenset[int]()
+        rng, is_last = np.random.default_rng([config.seed, 1, self.number]), self.number == len(self.curriculum) - 1
+        # The next training goes on from parameters that have converged.
+        return plan(config, train, everything, rng, density, falls_by_choice=not is_last)
 
-    def _stage_ends(self) -> tuple[int, ...]:
-        """Steps after which stages end, but the last: each has an equal share (InputError: beyond the hold-out)."""
-        config = self.config
+    def _loop(self) -> TrainConfig:
+        """Settings of the training: all but the last have ``traced.alone`` of the steps (InputError: beyond the
+        hold-out).
+        """
+        config, last = self.config, len(self.curriculum) - 1
+        if not last:
+            return config
         alone, holdout = config.traced.alone, config.holdout_steps_fraction
-        ends = tuple(round(k * alone * config.steps) for k in range(1, len(self.stages)))
-        if ends and config.patience and 0 < holdout * config.steps <= ends[-1]:
-            share = f"{alone} of the steps" + (", twice," if len(ends) > 1 else "")
+        begin, end = (round(number * alone * config.steps) for number in (self.number, self.number + 1))
+        if config.patience and 0 < holdout * config.steps <= round(last * alone * config.steps):
+            share = f"{alone} of the steps" + (", twice," if last > 1 else "")
             text = f"{share} are not less than holdout_steps_fraction, {holdout}"
             raise InputError(f"setting traced.alone: {text}, by whose rows Gaussians are chosen; choose less")
-        return ends
+        if self.number == last:
+            steps, held_out = max(config.steps - begin, 1), max(round(holdout * config.steps) - begin, 0)
+        elif self.in_groups:  # validation rows join a training that is chosen, for as large a share of its steps
+            held_out = max(end - begin, 1)
+            steps = round(held_out / holdout)
+        else:
+            steps = max(end - begin, 1)
+            held_out = steps * (holdout > 0)
+        # Paths converge within their steps, and a score costs a prediction of all held-out rows.
+        every = config.validate_every if self.number else max(held_out, 1)
+        return replace(config, steps=steps, holdout_steps_fraction=held_out / steps, validate_every=every)
 
     def ports(self, receiver: int) -> range:
         """Ports of a receiver."""

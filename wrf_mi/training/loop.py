@@ -23,8 +23,8 @@ from .config import LoopConfig
 
 Arrays = dict[str, NDArray[Any]]
 VIEW_GRADIENT = ("view_gradient_norm", "view_gradient_steps")
-OF_FIT = ("baseline", "best_scores", "stage_scores", "held_out")  # belong to a fit, not to one of its states
-KEPT = ("step", "chosen", *VIEW_GRADIENT, "reach_m", "searched_m", "surface", "phase_error", *OF_FIT)
+OF_FIT = ("best_scores", "held_out")  # belong to a fit, not to one of its states
+KEPT = ("step", "chosen", *VIEW_GRADIENT, "reach_m", "searched_m", "phase_error", *OF_FIT)
 """Attributes that a checkpoint stores under their names."""
 
 
@@ -40,11 +40,8 @@ class FitState:
         self.chosen = 0  # step from which the fit went on (`LoopConfig.patience`); 0: none was chosen
         self.reach_m = float(np.inf)  # reach of the Gaussians around training transmitters (`Reach`)
         self.searched_m = np.zeros((0, 3))  # position of each receiver at the last search for paths; empty: no scene
-        self.surface = False  # whether Gaussians on surfaces are trained
         self.phase_error = 0.0  # standard deviation of a reflection's phase in predictions, rad, once chosen
-        # Scores of the held-out rows by the best state before the present stage, and by the best state.
-        self.baseline, self.best_scores = np.zeros(0), np.zeros(0)
-        self.stage_scores = np.zeros(0)  # best mean score of the held-out rows in each stage so far
+        self.best_scores = np.zeros(0)  # scores of the held-out rows by the best state
         self.held_out = np.zeros(0)  # reports of the held-out rows by the chosen state
         self.best: Arrays | None = None  # arrays of the state with the best validation score
         self.best_score = -np.inf  # its score, the higher the better; kept once the fit went on from it
@@ -120,12 +117,13 @@ class FitState:
         of_fit = {name: np.asarray(getattr(self, name)) for name in OF_FIT}
         return FitState.from_arrays(self.best | of_fit | {"best_score": np.asarray(self.best_score)}, self.adam.beta_1)
 
-    def next_stage(self) -> FitState:
-        """The best state so far as the start of another stage, at the present step, without moments."""
-        # Moments of the former stage would push the first steps of this one where its loss fell.
-        state = self.go_back()
-        state.step, state.best, state.waited = self.step, self.best, 0
-        nothing = {name: np.zeros_like(values) for name, values in state.params().items()}
+    def restarted(self) -> FitState:
+        """The start of another training, with the scores of this state."""
+        # Moments of this training would push the first steps of the other one where the loss of this one fell.
+        params = self.params()
+        state, nothing = FitState(params, self.adam.beta_1), {name: np.zeros_like(v) for name, v in params.items()}
+        state.mean = {name: to_tensor(values) for name, values in self.mean_params().items()}
+        state.reach_m, state.searched_m, state.best_scores = self.reach_m, self.searched_m, self.best_scores
         state._set_moments(nothing, nothing, 0)
         return state
 
@@ -186,7 +184,6 @@ class TrainingLoop(ABC):
     schedule: Schedule  # rows and learning rates of each step
     state: FitState  # state between two steps
     until_chosen: bool = False  # whether steps end once a state is chosen, before the validation rows train
-    ends_at: int | None = None  # step at which they end before that
     seconds: float = 0.0  # training time so far, resumed runs included
     _origin_s: float  # reading of the clock at which ``seconds`` would have been 0
     label: str  # name of the validation score
@@ -243,10 +240,9 @@ class TrainingLoop(ABC):
 
     @property
     def _is_over(self) -> bool:
-        chosen, step = self.state.chosen > 0, self.state.step
-        if self.ends_at is not None and (chosen or step >= self.ends_at):
-            return True
-        return step == self.config.steps or (self.until_chosen and (chosen or step >= self.schedule.joined))
+        step = self.state.step
+        ends = self.until_chosen and (self.state.chosen > 0 or step >= self.schedule.joined)
+        return step == self.config.steps or ends
 
     def _sitting(
         self, on_progress: Callable[[Progress], None], save: Callable[[], None], stop: Callable[[], bool]
@@ -286,14 +282,11 @@ class TrainingLoop(ABC):
 
     def _due(self) -> tuple[bool, bool]:
         """Whether the state is scored at this step, and whether its score may choose it."""
-        step, stages, joined = self.state.step, self.schedule.stages, self.schedule.joined
-        # No state of the first stage is chosen before its end: paths converge within it, and a score costs a prediction
-        # of all held-out rows.
-        judged = step >= min(stages, default=0)
-        choosing = self.config.patience > 0 and judged and step <= joined and not self.state.chosen
-        # The last state of a stage counts, too, wherever its end falls between two scores.
-        at_end = step == self.config.steps or (choosing and step in (*stages, joined))
-        return at_end or (judged and step % self.config.validate_every == 0), choosing
+        step, joined = self.state.step, self.schedule.joined
+        choosing = self.config.patience > 0 and step <= joined and not self.state.chosen
+        # The last state before validation rows join counts, too, wherever it falls between two scores.
+        at_end = step == self.config.steps or (choosing and step == joined)
+        return at_end or step % self.config.validate_every == 0, choosing
 
     def _progress(self, loss: float, steps: int, before_s: float, scored: bool) -> Progress:
         """Progress with the mean loss since the last line, after so many steps in a sitting that began at a time."""

@@ -192,13 +192,13 @@ def hold_out(record: Record, split: Split) -> Split | None:
     carriers = record.carriers_hz
     if carriers is not None and len(split.test) and not np.isin(carriers[split.test], carriers[rows]).any():
         return _without_carrier(record.tx_pos_m, carriers, split)
-    out = _clusters_or_farthest(split, record.tx_pos_m, task_of(record).in_decibel)
+    out = _clusters_or_farthest(split, record.tx_pos_m)
     fold = _fold(split, out, out)
     return fold if rows_received(record, fold.all_train).max() >= LEAST_ROWS else None
 
 
-def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray, as_wanted: bool) -> IntArray:
-    groups, rows = (_as_far_as_wanted if as_wanted else hold_out_groups)(split, tx_pos_m), split.all_train
+def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray) -> IntArray:
+    groups, rows = _as_far_as_wanted(split, tx_pos_m), split.all_train
     if groups is not split and len(groups.validation) >= 2:
         return groups.validation
     # Where rows are sparsest, as far from the others as rows to be predicted may be.
@@ -206,10 +206,8 @@ def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray, as_wanted: bool) -
     return np.sort(rows[np.argsort(-distance[:, 1], kind="stable")[: 2 if len(rows) > 3 else 1]])
 
 
-def away_as(split: Split, as_wanted: bool) -> str:
-    """How far from the others the rows of `hold_out` are, in words for a report; ``as_wanted``: signal strengths."""
-    if not as_wanted:
-        return "in large clusters"
+def away_as(split: Split) -> str:
+    """How far from the others the rows of `hold_out` are, in words for a report."""
     if len(split.wanted_m):
         return "as far from the others as the wanted positions (transductive)"
     return "as far from the others as the test positions (transductive)" if len(split.test) else "in large clusters"

@@ -120,7 +120,7 @@ class Steps:
         t, targets = state.step, self._plan.targets
         port, rows = int(schedule.receiver[t]), schedule.rows[t]
         slots = mi.UInt32(np.searchsorted(self._plan.known[port], rows // targets.per_row).tolist())
-        function = self._function(port, state, schedule)
+        function = self._function(port, state)
         batch, step = self.places[port].batch(None, slots), ScheduledStep.of(schedule, t, trouble)
         state.mean, trouble, loss, view_gradient_norm = function(
             state.adam, state.mean, self._data, mi.UInt32(rows.tolist()), batch, step
@@ -130,19 +130,20 @@ class Steps:
         dr.schedule(state.view_gradient_norm)  # evaluated together with the loop's sum of losses
         return loss, trouble
 
-    def _function(self, port: int, state: FitState, schedule: Schedule) -> StepFunction:
+    def _function(self, port: int, state: FitState) -> StepFunction:
         """Recorded step of a port; without paths one serves all, else each search for paths needs another."""
         plan, side = self._plan, self._sides[port]
         graph, params = plan.graph, dict(state.adam.items())
         if side is not None and side.refresh(params):
             state.searched_m[port] = side.searched_at_m
-        learned = side is None or self._in_field_stage(state, schedule)
-        arrays = graph.arrays(port, side)
-        key = (None,) if side is None and not arrays else (port, side and side.searches, learned, state.surface)
+        # A chosen reach of 0 is that of no Gaussians.
+        learned = side is None or (plan.trains == FIELD and not (state.chosen and state.reach_m == 0))
+        arrays, surface = graph.arrays(port, side), plan.trains_surfaces
+        key = (None,) if side is None and not arrays else (port, side and side.searches, learned)
         if key not in self.recorded:
             # Recordings of an earlier search hold its paths: they are dropped with them.
             self.recorded = {k: v for k, v in self.recorded.items() if k[0] != port}
-            report, read = graph.report(port, side, learned, surface=state.surface), None
+            report, read = graph.report(port, side, learned, surface=surface), None
             if key != (None,):
                 # Arrays that are made from NumPy's memory at first use must exist before a recording.
                 first = plan.targets.condition[:, plan.targets.conditions(plan.known[port][:1])]
@@ -150,11 +151,6 @@ class Steps:
                 read = partial(graph.arrays, port, side)
             self.recorded[key] = self._recorded(report, self._rates(params), read)
         return self.recorded[key]
-
-    def _in_field_stage(self, state: FitState, schedule: Schedule) -> bool:
-        """Whether the field is evaluated beside paths: in its stage alone, and no more once a reach of 0 is chosen."""
-        stage = self._plan.stages[schedule.stage(state.chosen - 1 if state.chosen else state.step)]
-        return stage == FIELD and not (state.chosen and state.reach_m == 0)
 
     def _rates(self, names: Mapping[str, Any]) -> dict[str, float]:
         o, traced = self._plan.config.optimiser, self._plan.graph.traced

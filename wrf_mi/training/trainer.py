@@ -1,10 +1,9 @@
-"""Training of Gaussians, of the paths of a scene, or of both; choice of state, stages and reach by held-out rows."""
+"""Training of Gaussians, of the paths of a scene, or of both; held-out rows choose state and reach."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,15 +16,17 @@ from ..gaussians.initial import adapt, reset_opacity
 from ..graph.graph import Field, Graph
 from ..tasks import Loss
 from ..tracing.options import DISC, FACTOR
+from ..tracing.paths.traced_field import TracedField
 from .adam import NonFiniteReport
 from .by_distance import Reach
 from .config import TrainConfig
-from .fit_plan import SURFACES, FitPlan, check_params
+from .fit_plan import FitPlan, check_params
 from .initial import starting_values
 from .loop import OF_FIT, FitState, TrainingLoop
 from .predictor import Predictor
-from .stage_selection import StageSelection
+from .selection import last_gain
 from .step import Steps
+from .validation import Validation
 
 logger = logging.getLogger(__name__)
 
@@ -45,11 +46,12 @@ class Trainer(TrainingLoop):
         scene: scene of `wrf_mi.tracing.open_scene` at the record's carrier, whose paths are trained together with the
             Gaussians. None: Gaussians alone.
         plan: plan of the fit, of the arguments above; None: it is made of them.
+        before: training of the curriculum from whose state this one starts; None: from starting values.
 
     Attributes:
-        plan: data, graph, stages and schedule of the fit.
+        plan: data, graph and schedule of the fit.
         sides: traced side of each port; None without a scene.
-        selection: choice of states and stages by held-out rows.
+        validation: scores of held-out rows.
         steps: recorded optimiser steps.
 
     Raises:
@@ -71,22 +73,25 @@ class Trainer(TrainingLoop):
         loss: Loss | None = None,
         scene: Any | None = None,
         plan: FitPlan | None = None,
+        before: Trainer | None = None,
     ) -> None:
         plan = self.plan = plan or FitPlan(record, split, config, field, scene)
-        self.config, self.schedule = plan.config, plan.schedule
+        config = self.config = plan.loop
+        self.schedule = plan.schedule
         self.label, self.higher_is_better = plan.task.label, plan.task.higher_is_better
         if config.deterministic:
             # Sums over threads, and on a GPU, add in the order in which parts finish.
             init("llvm", threads=1)
         # Traced once: the positions of training rows do not change, only what the paths meet.
-        self.sides = plan.traced()
-        self.selection = StageSelection(plan, self.sides)
+        self.sides: list[TracedField | None] = plan.traced() if before is None else before.sides
+        self.validation = Validation(plan, self.sides)
         self.steps = Steps(plan, self.sides, loss or plan.loss)
         self._predictor: Predictor | None = None
-        if state is None:
+        if state is None and before is not None:
+            state, self.seconds = before.state.restarted(), before.seconds
+        elif state is None:
             plan.graph.check_polarization(record.tx_pos_m[split.all_train])
             state = FitState(starting_values(plan, self.sides, self.steps.places, initial))
-            state.surface = bool(plan.graph.surface) and not self.schedule.stages
             if plan.unjudged:
                 logger.warning("%d training rows do not suffice to choose a reach: no Gaussians", len(split.train))
                 state.reach_m = 0.0
@@ -98,20 +103,6 @@ class Trainer(TrainingLoop):
         if state.chosen:
             self.schedule, _ = self.schedule.after(state.chosen)
         self._restore_paths()
-
-    @contextmanager
-    def at_best(self) -> Iterator[None]:
-        """The best state so far in place of the present one, where stages are chosen and none is yet."""
-        present = self.state
-        if not self.plan.chooses_stages or present.chosen or present.best is None:
-            yield
-            return
-        self.state, self._predictor = present.go_back(), None
-        self.state.held_out = self.selection.choose_phase_error(self.predictor(), self.state)
-        try:
-            yield
-        finally:
-            self.state, self._predictor = present, None
 
     def go_on_from(self, before: Trainer, params: Mapping[str, NDArray[np.float32]]) -> None:
         """Train what is left after a fit to some of the rows has chosen a state, with parameters of that state.
@@ -127,7 +118,7 @@ class Trainer(TrainingLoop):
                 same[name] = stated + (same[name] - there[name])
         discs = {name: values for name, values in params.items() if name in (DISC, FACTOR)}
         self.state = FitState(start | same | discs, self.state.adam.beta_1)
-        for name in ("chosen", "reach_m", "surface", "phase_error", *OF_FIT):
+        for name in ("chosen", "reach_m", "phase_error", *OF_FIT):
             setattr(self.state, name, getattr(chosen, name))
         self.plan.graph.cover(self.sides, self.state.params())
         self.schedule, self.state.step = self.schedule.after(chosen.chosen)
@@ -169,32 +160,33 @@ class Trainer(TrainingLoop):
 
     def reach(self) -> Reach | None:
         """Reach around the rows that train now; None: the Gaussians are used everywhere."""
-        return self.selection.reach(bool(self.state.chosen), self.state.reach_m)
+        return self.validation.reach(bool(self.state.chosen), self.state.reach_m)
 
     def begin(self) -> None:
-        """Score the state that a fit beside paths starts from."""
-        if self.plan.chooses_stages and not self.state.step and self.state.best is None:
-            self.validate()
+        """Score the state that a training beside paths starts from."""
+        state = self.state
+        if self.plan.chooses_beside_paths and not state.step and state.best is None:
+            if not len(state.best_scores):  # those of the training before
+                self.validate()
+                state.best_scores = self.validation.scores
             # Trained parameters of paths may fit few rows and be wrong elsewhere: better stated ones stay.
-            if len(scores := self.selection.scores):
-                self.state.keep_best(float(np.nanmean(scores)) * (1 if self.higher_is_better else -1))
-                self.state.best_scores = scores
+            if len(state.best_scores):
+                state.keep_best(float(np.nanmean(state.best_scores)) * (1 if self.higher_is_better else -1))
 
     def validate(self) -> float:
         """Median score on the validation rows, all receivers pooled; NaN without such rows."""
-        return self.selection.score(self.predictor(), self.state)
+        return self.validation.score(self.predictor(), self.state)
 
     def validation_facts(self) -> dict[str, Any]:
         """Number and distance of the rows that were scored, and the score of those as far as test rows."""
-        return self.selection.facts(bool(self.state.chosen))
+        return self.validation.facts(bool(self.state.chosen))
 
     def choose(self, score: float) -> bool:
-        """Early stopping (`TrainingLoop`), beside paths by `StageSelection.stage_score` and in the last stage alone."""
-        if self.plan.in_groups and len(self.selection.scores):
-            score = self.selection.stage_score(self.state)
-        # A stage may end without a gain and the next one still have some: patience counts in the last stage alone.
-        if self.schedule.stage(self.state.step) < len(self.schedule.stages):
-            self.state.waited = -1
+        """Early stopping (`TrainingLoop`), by the mean score where rows are held out in groups."""
+        if self.plan.in_groups and len(scores := self.validation.scores):
+            score = float(np.nanmean(scores))  # a mean has less variance than a median
+            if (score if self.higher_is_better else -score) > self.state.best_score:
+                self.state.best_scores = scores
         if not super().choose(score):
             return False
         if self.state.reach_m == 0 and self.graph.scene is None:
@@ -206,24 +198,11 @@ class Trainer(TrainingLoop):
         """Go on from the best state (`TrainingLoop`), with the phase error that predicts held-out rows best."""
         super().choose_best()
         self._restore_paths()
-        if self.plan.chooses_stages:
-            self.state.held_out = self.selection.choose_phase_error(self.predictor(), self.state)
-
-    def choose_at(self, state: FitState) -> None:
-        """Choose the best state up to one, whatever was trained after it."""
-        self.state, self.schedule, self.ends_at = state, self.plan.schedule, None
-        self.choose_best()
+        if self.plan.chooses_beside_paths:
+            self.state.held_out = self.validation.choose_phase_error(self.predictor(), self.state)
 
     def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """One optimiser step (`TrainingLoop`)."""
-        if self.state.step in self.schedule.stages and not self.state.chosen:
-            # Go on from the best state so far; Gaussians on surfaces are trained from the second stage on.
-            self.state = self.state.next_stage()
-            begun = self.plan.stages[self.schedule.stage(self.state.step)]
-            if begun == SURFACES and self.graph.surface and not self.plan.unjudged:
-                self.state.surface = True
-            self._restore_paths()
-            self.record_functions()
         return self.steps.take(self.state, self.schedule, trouble)
 
     def adapt(self) -> None:
@@ -244,3 +223,37 @@ class Trainer(TrainingLoop):
         rounds, every = sorted(self.schedule.density), density.reset_every
         if every and "opacity" in names and (rounds.index(state.step) + 1) % every == 0:
             state.set_param("opacity", reset_opacity(change.parameters["opacity"]))
+
+
+def _trainer_of(plan: FitPlan, before: Trainer | None) -> Trainer:
+    return Trainer(plan.record, plan.split, plan.config, plan=plan, before=before)
+
+
+def fit_curriculum(
+    plan: FitPlan,
+    trainer_of: Callable[[FitPlan, Trainer | None], Trainer] = _trainer_of,
+    run: Callable[[Trainer], object] = Trainer.run,
+) -> Trainer:
+    """Run the trainings of a plan's curriculum, and the chosen one to its last step with all rows.
+
+    Args:
+        plan: plan of the first training.
+        trainer_of: the trainer of a plan, given that of the training before.
+        run: runs a trainer.
+
+    Returns:
+        The last training whose scores of held-out rows improve on those of the one kept before it.
+    """
+    trainers = list[Trainer]()
+    for number in range(len(plan.curriculum)):
+        trainer = trainer_of(plan.part(number) if number else plan, trainers[-1] if trainers else None)
+        trainer.until_chosen = plan.in_groups and len(plan.curriculum) > 1
+        run(trainer)
+        trainers.append(trainer)
+    chosen = trainers[-1]
+    if chosen.until_chosen:
+        scores = ((trainer, trainer.state.best_scores) for trainer in trainers)
+        chosen, seconds = last_gain(scores, chosen.higher_is_better), chosen.seconds
+        chosen.until_chosen, chosen.seconds = False, seconds
+        run(chosen)
+    return chosen

@@ -26,14 +26,14 @@ from ...tasks.conditions import placed_receivers, scene_carrier
 from ...tracing.options import without_effect
 from ...tracing.paths.edited_scene import parameters_in
 from ...training.by_distance import Reach
-from ...training.checkpoint import CHECKPOINT, append_log, cut_log, read_checkpoint, write_checkpoint
+from ...training.checkpoint import CHECKPOINT, LOG, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings, unused_of_loop, validates
 from ...training.fit_plan import FitPlan, check_params, field_of
 from ...training.initial import initial_gaussians, starting_values
 from ...training.loop import FitState, Progress
 from ...training.predictor import Predictor
-from ...training.stage_selection import HeldOutReports
-from ...training.trainer import Trainer
+from ...training.trainer import Trainer, fit_curriculum
+from ...training.validation import HeldOutReports
 from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session
 from .new_receivers import Params, of_all_receivers, trained_part, without_rows
 
@@ -56,7 +56,7 @@ class FittedField(Fitted):
 
     Attributes:
         field: field of Gaussians, see `wrf_mi.gaussians`; None: paths alone.
-        held_out: reports of training rows on which its stages were chosen; None after loading, or where none were.
+        held_out: reports of training rows by which its state was chosen; None after loading, or where none were.
     """
 
     held_out: HeldOutReports | None = None
@@ -136,12 +136,18 @@ def _used(trainer: Trainer) -> tuple[Params, Reach | None]:
     params, reach, graph = trainer.state.mean_params(), trainer.reach(), trainer.graph
     if graph.scene is None:
         return params, reach
-    # What no stage that was kept has trained is not stored: it would be evaluated in every prediction.
-    if not trainer.state.surface:
+    # What was not trained is not stored: it would be evaluated in every prediction.
+    if not trainer.plan.trains_surfaces:
         params = {name: values for name, values in params.items() if not name.startswith("surface.")}
     if graph.field is not None and reach is not None and reach.length_m == 0:
         return {name: values for name, values in params.items() if name.startswith(TRACED_NAMES)}, None
     return params, reach
+
+
+def _folder(session: Session, plan: FitPlan) -> Path:
+    """Folder of the checkpoint and log of a training; the last one of a curriculum has the session's."""
+    last = plan.number == len(plan.curriculum) - 1
+    return session.folder if last else session.folder / plan.trains
 
 
 def _scene(problem: Problem, split: Split) -> Any | None:
@@ -186,7 +192,7 @@ def _unused_of_gaussians(plan: FitPlan, name: str) -> dict[str, str]:
         unused |= {f"initial.{name}": f"Gaussians start from initial.{source}" for name in random}
     if not s.density.every:
         unused |= {f"density.{name}": "density.every=0" for name in names_of(type(s.density)) - {"every"}}
-    elif not plan.schedule.density:
+    elif not plan.part(len(plan.curriculum) - 1).schedule.density:
         rounds = ("growth_fraction", "max_gaussians", "reset_every")
         text = f"no round follows within {s.steps} steps by density.every={s.density.every}, .start and .stop"
         unused |= {f"density.{name}": text for name in rounds}
@@ -236,59 +242,56 @@ class GaussianField(Model):
             NumericsError: a value that is not finite.
         """
         # Receivers without rows would have parameters that nothing trains: they get those of the others afterwards.
-        trainer = self._trainer(self._plan(problem, split), session)
+        plan = self._plan(problem, split)
+        trainer = fit_curriculum(plan, partial(self._trainer, session), partial(self._run, session))
         fitted = self._finished(trainer, problem, split, session)
         del trainer
         release_memory()
         return fitted
 
-    def first_stage(self, problem: Problem, split: Split, session: Session) -> tuple[FittedField, Trainer]:
-        """The best state of the first of several stages by the validation rows of a split, and the training so far.
+    def train_part(
+        self, before: Trainer | None, problem: Problem, split: Split, session: Session
+    ) -> tuple[FittedField, Trainer]:
+        """The first training of the curriculum, or the one that goes on from ``before``.
+
+        The validation rows of a split choose its state.
 
         Raises:
             Interrupted, NumericsError: as `fit`.
         """
-        (record, rows), scene = trained_part(problem.record, split), _scene(problem, split)
-        trainer = self._trainer(FitPlan(record, rows, problem.settings, scene=scene, held_out=True), session)
-        trainer.ends_at = trainer.schedule.stages[0] if trainer.schedule.stages else None
+        if before is not None:
+            plan = before.plan.part(before.plan.number + 1)
+        else:
+            (record, rows), scene = trained_part(problem.record, split), _scene(problem, split)
+            plan = FitPlan(record, rows, problem.settings, scene=scene, held_out=True)
+        trainer = self._trainer(session, plan, before)
         trainer.until_chosen = True
-        return self._finished(trainer, problem, split, session), trainer
-
-    def chosen(self, trainer: Trainer, problem: Problem, split: Split, session: Session) -> tuple[FittedField, Trainer]:
-        """The training of `first_stage` goes on until the validation rows have chosen a state of all stages."""
-        if (session.folder / CHECKPOINT).exists():
-            trainer = self._trainer(trainer.plan, session)
-        session.folder.mkdir(parents=True, exist_ok=True)
-        trainer.ends_at, trainer.until_chosen = None, True
-        return self._finished(trainer, problem, split, session), trainer
+        self._run(session, trainer)
+        return self._fitted(trainer, problem, split, session.folder), trainer
 
     def continued(
-        self, trainer: Trainer, state: FitState, scene: str | None, problem: Problem, split: Split, session: Session
+        self, trainer: Trainer, scene: str | None, problem: Problem, split: Split, session: Session
     ) -> FittedField:
-        """The training of `first_stage` or `chosen` in a ``scene`` goes on from the ``state`` in which either ended.
-
-        All rows of a split train, in the scene of a problem.
-        """
-        folder, record, before = session.folder, problem.record, trainer.plan.graph.receivers
-        if not state.chosen:
-            trainer.choose_at(state)
+        """The training of `train_part` in a ``scene`` goes on with all rows of a split, in the scene of a problem."""
+        record, before = problem.record, trainer.plan.graph.receivers
+        stopped = (_folder(session, trainer.plan) / CHECKPOINT).exists()
         placed = placed_receivers(record, by_uplink=False)
         if problem.scene == scene and [each.name for each in placed] == [each.name for each in before]:
-            if (folder / CHECKPOINT).exists():  # stopped in what follows
-                trainer = self._trainer(trainer.plan, session)
+            if stopped:
+                trainer = self._trainer(session, trainer.plan, None)
             trainer.until_chosen = False
-            folder.mkdir(parents=True, exist_ok=True)
-        elif (folder / CHECKPOINT).exists():
-            trainer = self._trainer(self._plan(problem, split), session)
         else:
             names = [each.name for each in before]
             order = [names.index(each.name) for each in placed if each.name in names]
             new = tuple(number for number, each in enumerate(placed) if each.name not in names)
             assert order == sorted(order), "a fold leaves receivers out, and moves none"
             params, _ = of_all_receivers(trainer.state.mean_params(), None, placed, new)
-            chosen, trainer = trainer, self._trainer(self._plan(problem, split), session)
-            trainer.go_on_from(chosen, params)
-            trainer.seconds = chosen.seconds
+            plan = self._plan(problem, split).part(trainer.plan.number)
+            chosen, trainer = trainer, self._trainer(session, plan, None)
+            if not stopped:
+                trainer.go_on_from(chosen, params)
+                trainer.seconds = chosen.seconds
+        self._run(session, trainer)
         return self._finished(trainer, problem, split, session)
 
     def as_traced(self, problem: Problem, split: Split, session: Session) -> FittedField:
@@ -299,29 +302,39 @@ class GaussianField(Model):
         params = {} if plan.task.image else starting_values(plan, sides, (), None)
         return FittedField(self._arrays(plan, params, problem, split), plan.config, problem, session.folder)
 
-    def _trainer(self, plan: FitPlan, session: Session) -> Trainer:
-        """A trainer of a plan, at the last checkpoint in a folder or at the start."""
-        folder = session.folder
+    def _trainer(self, session: Session, plan: FitPlan, before: Trainer | None) -> Trainer:
+        """A trainer of a plan, at the last checkpoint in its folder or at the start."""
+        folder = _folder(session, plan)
         folder.mkdir(parents=True, exist_ok=True)
         stored = read_checkpoint(folder) if (folder / CHECKPOINT).exists() else None
         state = None if stored is None else FitState.from_arrays(stored)
-        trainer = Trainer(plan.record, plan.split, plan.config, state=state, plan=plan)
-        trainer.seconds = 0.0 if stored is None else float(stored["seconds"])
+        trainer = Trainer(plan.record, plan.split, plan.config, state=state, plan=plan, before=before)
+        if stored is not None:
+            trainer.seconds = float(stored["seconds"])
         cut_log(folder, trainer.state.step)  # a killed run has logged steps after its checkpoint
         return trainer
 
-    def _finished(self, trainer: Trainer, problem: Problem, split: Split, session: Session) -> FittedField:
-        """The field of a trainer after its last step (Interrupted: stopped before)."""
-        folder, steps = session.folder, trainer.config.steps
+    def _run(self, session: Session, trainer: Trainer) -> None:
+        """Train to the end (Interrupted: stopped before)."""
+        folder, steps = _folder(session, trainer.plan), trainer.config.steps
+        what = "training" if len(trainer.plan.curriculum) == 1 else f"training {trainer.plan.trains}"
+
+        folder.mkdir(parents=True, exist_ok=True)
 
         def on_progress(progress: Progress) -> None:
             append_log(folder, progress)
-            session.on_progress("training", progress.step / steps, progress)
+            session.on_progress(what, progress.step / steps, progress)
 
         if not trainer.run(on_progress, partial(write_checkpoint, folder, trainer), session.stop):
             raise session.interrupted(f"after step {trainer.state.step} of {steps}")
-        with trainer.at_best():
-            return self._fitted(trainer, problem, split, folder)
+
+    def _finished(self, trainer: Trainer, problem: Problem, split: Split, session: Session) -> FittedField:
+        """The field after the last step of the chosen training, whose log is that of the fit."""
+        folder = _folder(session, trainer.plan)
+        if folder != session.folder:
+            (folder / LOG).replace(session.folder / LOG)
+        session.discarded.extend(session.folder / name for name in trainer.plan.curriculum[:-1])
+        return self._fitted(trainer, problem, split, session.folder)
 
     def _fitted(self, trainer: Trainer, problem: Problem, split: Split, folder: Path) -> FittedField:
         params, reach = of_all_receivers(*_used(trainer), placed_of(problem, trainer.plan), without_rows(split))
@@ -332,8 +345,8 @@ class GaussianField(Model):
             arrays["known_counts"] = np.array([len(positions_m) for positions_m in reach.known_m])
         if trainer.state.phase_error:
             arrays[PHASE_ERROR] = np.asarray(trainer.state.phase_error)
-        fitted = FittedField(arrays, trainer.config, problem, folder)
-        fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.selection.reports(trainer.state)
+        fitted = FittedField(arrays, trainer.plan.config, problem, folder)
+        fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.validation.reports(trainer.state)
         return fitted
 
     def _arrays(self, plan: FitPlan, params: Params, problem: Problem, split: Split) -> Arrays:

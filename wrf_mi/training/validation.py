@@ -1,8 +1,8 @@
-"""Choice of state, stages and reach of a fit beside the paths of a scene, by held-out rows."""
+"""Scores of a training's held-out rows, and what they choose beside its state: reach and phase error."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from ..core.types import IntArray
 from ..tracing.paths.traced_field import TracedField
 from .by_distance import Reach, choose_reach
 from .evaluator import Request
-from .fit_plan import FitPlan
+from .fit_plan import FIELD, FitPlan
 from .loop import FitState
 from .predictor import Predictor
 from .selection import improves
@@ -30,11 +30,10 @@ class HeldOutReports:
     receiver: IntArray  # number of the receiver of each [q]
     row: IntArray  # row of the record [q]
     report: NDArray[Any]  # reports [q, ...] as observations
-    score: Mapping[str, float]  # best mean score of these rows by the stages' names
 
 
-class StageSelection:
-    """Scores and reports of a fit's held-out rows; ``sides`` are the traced sides of the ports, None without a scene.
+class Validation:
+    """Scores and reports of held-out rows; ``sides`` are the traced sides of the ports, None without a scene.
 
     Attributes:
         scores: scores of the held-out rows at the last validation, port by port.
@@ -50,7 +49,7 @@ class StageSelection:
         if not plan.graph.corrects:
             return None
         # Once a state is chosen, the held-out rows train, too, unless they stay out to the end.
-        joined = chosen and plan.schedule.joined < plan.config.steps
+        joined = chosen and plan.schedule.joined < plan.loop.steps
         rows = plan.split.all_train if joined else plan.choosing.train
         positions_m = [plan.record.tx_pos_m[plan.targets.received(port, rows)] for port in range(plan.targets.ports)]
         receivers = range(len(plan.record.receivers))
@@ -98,7 +97,7 @@ class StageSelection:
         if not len(test):
             return facts
         # Validation rows are compared with test rows as they are predicted: by a field that all of these rows trained.
-        known = split.all_train if plan.schedule.joined < plan.config.steps else split.train
+        known = split.all_train if plan.schedule.joined < plan.loop.steps else split.train
         facts["test_m"] = float(np.median(cKDTree(record.tx_pos_m[known]).query(record.tx_pos_m[test])[0]))
         far = (away_m >= facts["test_m"]) & np.isfinite(self.scores)
         if not far.any():
@@ -127,32 +126,12 @@ class StageSelection:
         positions_m = [plan.record.tx_pos_m[port_rows] for port_rows in rows]
         lengths = [reach.length_m]
         if plan.in_groups and not state.chosen:
-            # Before the last stage the field has not been trained.
-            trained = plan.schedule.stage(state.step - 1) == len(plan.schedule.stages)
-            lengths = reach.lengths(positions_m) if trained else [0.0]
+            lengths = reach.lengths(positions_m) if plan.trains == FIELD and state.step else [0.0]
         # The state keeps the reach with which it is scored, so that the best state has the best reach.
         state.reach_m, scores = choose_reach(
             reach, lengths, positions_m, lambda port, w: self._scores(predict, port, rows[port], w), self._higher
         )
         return scores
-
-    def stage_score(self, state: FitState) -> float:
-        """Mean of `scores`, which decides beside paths; the worst one where a state is no better than stages before."""
-        # A mean has less variance than a median. The best mean score of the present stage is noted in the state.
-        plan, score = self.plan, float(np.nanmean(self.scores))
-        if not len(state.stage_scores):
-            state.stage_scores = np.full(len(plan.stages), np.nan)
-        # A score right at the end of a stage is that of its last state.
-        stage, better = plan.schedule.stage(state.step - 1), np.fmax if self._higher else np.fmin
-        state.stage_scores[stage] = better(state.stage_scores[stage], score)
-        # A stage's first gain over the stages before may be chance: by less than its standard error it does not count.
-        if len(state.baseline) and not improves(self.scores, state.baseline, self._higher):
-            score = -np.inf if self._higher else np.inf
-        if (score if self._higher else -score) > state.best_score:
-            state.best_scores = self.scores
-        if state.step in plan.schedule.stages:
-            state.baseline = state.best_scores
-        return score
 
     def choose_phase_error(self, predict: Predictor, state: FitState) -> NDArray[Any]:
         """Reports of all rows on which a state was chosen, port by port, by the phase error that predicts them best.
@@ -188,9 +167,8 @@ class StageSelection:
     def reports(self, state: FitState) -> HeldOutReports | None:
         """Reports of held-out rows by the state that was chosen on them; None: none was chosen in groups."""
         plan = self.plan
-        if not plan.in_groups or plan.graph.scene is None or not len(state.held_out):
+        if not plan.chooses_beside_paths or not len(state.held_out):
             return None
         rows = self._held_out(False)
         receiver = [np.full(len(port_rows), port // plan.graph.carriers) for port, port_rows in enumerate(rows)]
-        best = {name: float(score) for name, score in zip(plan.stages, state.stage_scores, strict=True)}
-        return HeldOutReports(np.concatenate(receiver), np.concatenate(rows), state.held_out, best)
+        return HeldOutReports(np.concatenate(receiver), np.concatenate(rows), state.held_out)
