@@ -41,9 +41,9 @@ from ..datasets import load_split, save_split
 from ..datasets.folder_files import shown
 from ..datasets.observations import count_not_finite
 from ..models import Model, known_model
-from ..models.calibrated import WithIntervals
 from ..models.few_rows import with_few_rows
 from ..models.model import Arrays
+from ..stages.mixture import WithIntervals
 from ..tasks import TASKS
 from ..training.fit_plan import check_rows
 from ..version import __version__
