@@ -90,7 +90,7 @@ def test_seed_of_a_trace_without_rays_is_that_of_a_drawn_split(flat_folder: Path
         ("--depth 3", "--depth belongs to --model ray-tracing, not to hybrid; omit it"),
         ("--model idw --stages mean", "--stages belongs to --model hybrid, not to idw; omit it"),
         ("--stages mean,surfaces", "--stages mean,surfaces: mean has no effect: it is of a scene; give --scene"),
-        ("--stages mean,field --scene {room}", "field has no effect: strengths are kriged about the local mean"),
+        ("--stages mean,surfaces --scene {room}", "surfaces has no effect: strengths are kriged about the local mean"),
         ("--set steps=9", "setting steps=9: no effect on hybrid of .*: no stage is trained step by step"),
         ("--model idw --set power=1 --set power=2", "setting power: stated as 1 and as 2; give one of both"),
         ("--model wrf-gs --seed 1 --set seed=2", "setting seed: 2, where the argument is 1; give one of both"),

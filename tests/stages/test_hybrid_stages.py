@@ -232,6 +232,14 @@ def test_strengths_and_channels_are_fitted_in_stages(task: str, scenes: dict[str
     assert_restored(run, record)
 
 
+def test_field_beside_paths_is_a_part_of_strengths_where_it_is_named(scenes: dict[str, Path], tmp_path: Path) -> None:
+    record, split = measured(scenes, "rssi")
+    settings = ("stages=mean,field,residual", "steps=20")
+    run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=settings)
+    assert set(run.metrics["held_out"]) == {"paths", "field-scene", "kriging", "hybrid"}
+    assert_restored(run, record)
+
+
 def test_strengths_at_exact_positions_are_those_of_the_trace(scenes: dict[str, Path], tmp_path: Path) -> None:
     """Local means are off by the ripple of two paths and more, 1 to 3 dB at 920 MHz."""
     record, split = measured(scenes, "rssi")

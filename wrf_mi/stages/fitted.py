@@ -86,7 +86,8 @@ class Residuals:
 PATHS = "paths"
 UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
 """Models of a downlink, the first of which is the mean that others have to improve on."""
-TRACED = (PATHS, "r2f2-scene")  # parts that are given the scene
+FIELD_IN_SCENE = "field-scene"  # field beside the paths of a scene, of signal strengths
+TRACED = (PATHS, FIELD_IN_SCENE, "r2f2-scene")  # parts that are given the scene
 NEGLIGIBLE = 1e-3  # weight below which a part is not evaluated: its share of the prediction
 DEVIATIONS = "deviations"  # array of the names of the parts whose standard deviations count
 STATED, PREDICTED = "stated", "predicted"

@@ -29,7 +29,7 @@ from ..models.model import Arrays, Fitted, HeldOutPrediction, Model, Problem, Se
 from ..tasks import task_of
 from ..training.by_distance import GAPS
 from ..training.selection import away_as
-from .fitted import PATHS, TRACED, UPLINK_PARTS, FittedMixture, Residuals, left_over
+from .fitted import FIELD_IN_SCENE, PATHS, TRACED, UPLINK_PARTS, FittedMixture, Residuals, left_over
 from .further import FURTHER_STAGES, first_of, fit_further, load_further
 from .mixture import MixtureFit, Part
 from .paths import TracedPaths
@@ -47,8 +47,8 @@ class HybridSettings(CheckedSettings):
     """Settings of the hybrid."""
 
     #: stages that may be used, separated by commas, of mean, calibration, correction, surfaces, field and residual, and
-    #: of those that installed packages add; null: all that the data allow; without a scene the field, which takes
-    #: minutes and which interpolation surpasses near measurements, is used where it is named
+    #: of those that installed packages add; null: all that the data allow; without a scene and for signal strengths the
+    #: field, which takes minutes and which interpolation surpasses near measurements, is used where it is named
     stages: str | None = None
     #: optimiser steps of the graph of paths and Gaussians, or, without a scene, of the field; null: the default of
     #: `TrainConfig` for the task
@@ -82,7 +82,7 @@ def _stages_of(problem: Problem) -> dict[str, str]:
     if problem.scene is None:
         return dict.fromkeys(set(STAGES) - {FIELD, RESIDUAL}, "it is of a scene; give --scene")
     if isinstance(scene_side(record), TracedStrengths):
-        return dict.fromkeys((SURFACES, FIELD), "strengths are kriged about the local mean of traced power")
+        return {SURFACES: "strengths are kriged about the local mean of traced power"}
     return {}
 
 
@@ -106,8 +106,12 @@ def _means(problem: Problem) -> list[tuple[str, bool]]:
         means = of_uplink if MEAN in settings.wanted else []
     elif with_scene and task_of(problem.record).receiver_with_scene and {*settings.wanted} & {*STAGES} - {RESIDUAL}:
         means = [(PATHS, True)]
-    if not with_scene and settings.stages is not None and FIELD in settings.wanted:
-        means.append((FIELD, False))
+    if settings.stages is not None and FIELD in settings.wanted:
+        # The graph of paths has a field itself; beside kriged strengths it is a part of its own, which takes minutes.
+        if not with_scene:
+            means.append((FIELD, False))
+        elif isinstance(scene_side(problem.record), TracedStrengths):
+            means.append((FIELD_IN_SCENE, True))
     return means
 
 
@@ -115,11 +119,12 @@ def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
     """Entry and problem of a part, with or without the scene."""
     if name == PATHS:
         return scene_side(problem.record), problem
-    model = {FIELD: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
+    model = {FIELD: "wrf-gs+", FIELD_IN_SCENE: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
     entry = MODELS[model].serving(problem.record.task, scene)
     arguments = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
-    # Without a scene the hybrid's steps are those of the field.
-    steps = [f"steps={problem.settings.steps}"] if name == FIELD and problem.settings.steps else []
+    # Those of the hybrid are steps of a field that is a part.
+    is_field = name in (FIELD, FIELD_IN_SCENE)
+    steps = [f"steps={problem.settings.steps}"] if is_field and problem.settings.steps else []
     settings = default_settings(entry, steps, arguments)
     inner = replace(problem, dataset=problem.record, settings=settings, stated=frozenset())
     entry = with_few_rows(entry, problem.record.task)
@@ -231,8 +236,8 @@ class Hybrid(Model):
     def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
         """Steps where no stage trains step by step."""
         idle = _stages_of(problem)
-        trained = [name for name, _ in _means(problem) if name == FIELD or (name == PATHS and FIELD not in idle)]
-        return {} if trained else {"steps": "no stage is trained step by step"}
+        trained = [name for name, _ in _means(problem) if name != PATHS or SURFACES not in idle]
+        return {} if {*trained} & {PATHS, FIELD, FIELD_IN_SCENE} else {"steps": "no stage is trained step by step"}
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse unknown positions, and data that no part can be fitted to."""
