@@ -18,8 +18,7 @@ from wrf_mi_scenes.build_laboratory import sheet
 
 import wrf_mi
 from wrf_mi.core import InputError
-from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
-from wrf_mi.correction.correct import _errors, _last_is_best
+from wrf_mi.correction import Correction, CorrectionOptions, default_options, write_page
 from wrf_mi.correction.edits import error_ratio
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.options import PARTS
@@ -30,6 +29,7 @@ from wrf_mi.scene.correction_data import read_correction_data
 from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.stages.correct import _held_out_ratio, correct_scene
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene
@@ -115,11 +115,12 @@ def test_error_ratio_is_the_larger_one_of_equal_rows(held, left_out, expected):
     fitted[5] = np.nan
     # Rows that were not held out have errors of another size.
     fitted[[0, 2, 4, 6]] *= 10
-    record = SimpleNamespace(receivers=("a", "b"))
+    record = SimpleNamespace(receivers=(SimpleNamespace(name="a"), SimpleNamespace(name="b")))
     final = SimpleNamespace(record=record, rows=np.array([2, 4, 6, 8]), residual=lambda vector: fitted)
-    unseen = SimpleNamespace(rows=np.array([4, 8]), residual=lambda vector: -held * fitted[[1, 3, 5, 7]])
-    errors = _errors(unseen, np.zeros(1), final, np.zeros(1), left_out * fitted)
-    assert error_ratio(errors) == pytest.approx(expected)
+    rows = np.array([4, 8])
+    unseen = SimpleNamespace(record=record, rows=rows, residual=lambda vector: -held * fitted[[1, 3, 5, 7]])
+    held_out = _held_out_ratio(unseen, np.zeros(1), final, np.zeros(1))
+    assert max(error_ratio(left_out * fitted, fitted), held_out) == pytest.approx(expected)
 
 
 def test_planes_alone_are_corrected(true, corrected):
@@ -378,13 +379,3 @@ def test_unknown_parts_and_few_rows_are_refused(tmp_path):
     record = channels(scene, 18)
     with pytest.raises(InputError, match=r"training rows are too few to hold some out"):
         correct_scene(scene, record, make_splits(record, "official", n_train=5)[0])
-
-
-@pytest.mark.parametrize(
-    ("higher_is_better", "last", "best"), [(True, 2.0, True), (True, 1.2, False), (False, 1.2, True)]
-)
-def test_paths_are_searched_anew_for_the_best_stage_alone(higher_is_better, last, best):
-    """Of scores whose differences vary; a row that was not received does not count."""
-    noise = np.array([0.1, -0.1, 0.2, np.nan])
-    scores = {"": 1.3 + noise, "materials": 1.5 - noise, "planes": np.full(4, last)}
-    assert _last_is_best(scores, higher_is_better) == best

@@ -20,8 +20,8 @@ from ..core import Record, Split
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.types import FloatArray, IntArray
 from ..correction import CorrectionOptions, default_options, write_page, write_scene
-from ..correction.edits import fit_edit, refit_edit
-from ..correction.options import FRAME, HIDDEN, PLANES
+from ..correction.edits import TracedScene, fit_edit, refit_edit
+from ..correction.options import FRAME, HIDDEN, MATERIALS, PHASES, PLANES
 from ..correction.state import SceneEdit
 from ..models.model import Problem, Session
 from ..scene.correction_data import FILE as CORRECTION
@@ -96,26 +96,31 @@ class Edited:
 
 
 class SceneStage(Stage):
-    """Correction of the scene."""
+    """Correction of the scene.
+
+    ``options`` are those of the correction; None: by the task and the stages that the problem's settings want.
+    """
 
     name = "scene"
 
+    def __init__(self, options: CorrectionOptions | None = None) -> None:
+        self._options = options
+
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
         """The scene as it is stated, and where rows suffice and settings allow it, calibrated and corrected."""
-        options, wanted = [Option(AS_STATED, lambda state, split, session: state)], {*problem.settings.wanted}
-        enough = split.held_receivers or not too_few(problem.record, split)
-        if {CALIBRATION, CORRECTED}.isdisjoint(wanted) or not enough:
-            return options
-        how = default_options(problem.record)
-        if CORRECTED not in wanted:
-            how = replace(how, parts=tuple(part for part in how.parts if part not in OF_GEOMETRY))
-        still = replace(how, parts=tuple(part for part in how.parts if part not in (PLANES, FRAME)))
-        options.append(Option(CALIBRATED, partial(self._fit, still, split.validation), 1))
-        if still != how:
+        how = self._options or _wanted_options(problem)
+        if how is None or not (split.held_receivers or not too_few(problem.record, split)):
+            return [Option(AS_STATED, lambda state, split, session: state)]
+        parts = [part for part in how.parts if part != PHASES]
+        still = [part for part in parts if part not in (PLANES, FRAME)]
+        fit = partial(self._fit, how, split.validation)
+        options = [Option(AS_STATED, partial(fit, ()))]
+        if still == parts or MATERIALS in still:
+            options.append(Option(CALIBRATED, partial(fit, still), 1))
+        if still != parts:
             # Other paths make good planes better. They do not mend those that fit training rows alone, and finding
             # them takes as long as all that was done before.
-            fit = partial(self._fit, how, split.validation)
-            options += [Option(MOVED, fit, 2), Option(ANEW, fit, 2, MOVED)]
+            options += [Option(MOVED, partial(fit, parts), 2), Option(ANEW, partial(fit, parts), 2, MOVED)]
         return options
 
     def confidence(self, rows: int) -> float:
@@ -126,20 +131,31 @@ class SceneStage(Stage):
         """The regions alone (`in_regions`)."""
         return in_regions(split, row)
 
-    def _fit(self, options: CorrectionOptions, near: IntArray, state: State, split: Split, session: Session) -> State:
-        if state.fold is not None and of_rows(state.problem.record, state.fold):
-            split = replace(split, train=np.union1d(split.train, near), test=np.setdiff1d(split.test, near))
+    def _fit(
+        self,
+        options: CorrectionOptions,
+        near: IntArray,
+        parts: Collection[str],
+        state: State,
+        split: Split,
+        session: Session,
+    ) -> State:
+        """Some parts of the options fitted, from an edit that the state may have; none leave the scene as stated."""
+        if not parts:
+            return state
         before: Edited | None = state.kept.get(self.name)
         stated, place = before.stated if before else state.problem, session.folder / SCENE
         path = session.folder / EDIT
         if not path.exists():
             assert stated.scene is not None
-            of_fit = stated.scene, stated.record, split, options, stated.material, session.report
-            correction = fit_edit(*of_fit, before and before.edit)
+            rows = with_near(state, split, near)
+            traced = TracedScene(stated.scene, stated.record, rows, options, stated.material, session.report)
+            edit = before.edit if before else None
+            fitted = fit_edit(traced.fitted_posterior(traced.record, traced.split.all_train, edit), parts, edit)
             session.folder.mkdir(parents=True, exist_ok=True)
-            write_scene(correction, place)
-            write_arrays(path, correction.state.edit.arrays())
-            del correction
+            write_scene(fitted, traced.kinds, place)
+            write_arrays(path, fitted.edit.arrays())
+            del fitted, traced
             release_memory()
         edited = Edited(stated, options, SceneEdit.from_arrays(stored_arrays(path)))
         problem = replace(stated, scene=str(place), material=None)
@@ -157,14 +173,34 @@ class SceneStage(Stage):
             problem, place = state.problem, session.folder / SCENE
             if not (place / CORRECTION).exists():  # a resumed fit finds it
                 assert problem.scene is not None
-                of_fit = problem.scene, problem.record, split, edited.options, edited.edit
-                names = [name for name in out if name not in _held(problem, split)]
+                how = edited.options, problem.material, session.report
+                traced = TracedScene(problem.scene, problem.record, split, *how)
+                facts = {
+                    "held_out": len(next(iter(scores.values()))),
+                    "held_out_receivers": [name for name in out if name not in _held(problem, split)],
+                }
                 named = {"" if name == AS_STATED else name: score for name, score in scores.items()}
-                write_page(refit_edit(*of_fit, named, names, problem.material, session.report), place, replace=True)
+                write_page(refit_edit(traced, edited.edit, named, facts), place, replace=True)
                 release_memory()
             return replace(state, problem=in_scene(problem, session.folder))
 
         return option._replace(fit=fit)
+
+
+def _wanted_options(problem: Problem) -> CorrectionOptions | None:
+    """Options of a correction by the stages that a problem's settings want; None: neither of its stages."""
+    wanted, how = {*problem.settings.wanted}, default_options(problem.record)
+    if CORRECTED in wanted:
+        return how
+    parts = tuple(part for part in how.parts if part not in OF_GEOMETRY)
+    return replace(how, parts=parts) if CALIBRATION in wanted else None
+
+
+def with_near(state: State, split: Split, near: IntArray) -> Split:
+    """The split of a fold with the held-out rows ``near`` to those that train, which do not judge (`in_regions`)."""
+    if state.fold is None or not of_rows(state.problem.record, state.fold):
+        return split
+    return replace(split, train=np.union1d(split.train, near), test=np.setdiff1d(split.test, near))
 
 
 def _held(problem: Problem, split: Split) -> set[str]:
