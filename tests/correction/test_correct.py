@@ -17,7 +17,7 @@ from wrf_mi_scenes import scenes
 from wrf_mi_scenes.build_laboratory import sheet
 
 import wrf_mi
-from wrf_mi.core import InputError
+from wrf_mi.core import InputError, Split
 from wrf_mi.correction import Correction, CorrectionOptions, default_options, write_page
 from wrf_mi.correction.edits import error_ratio
 from wrf_mi.correction.misfit import Misfit
@@ -36,6 +36,7 @@ from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
+from wrf_mi.training.selection import hold_out_groups
 
 PLANE_M, PLANE_RAD = 1e-3, 1e-3
 STEP = 2e-4
@@ -263,6 +264,19 @@ def test_strengths_correct_materials_by_a_bounded_number_of_rows(powers):
     stated, kept = mean_scores(found)
     assert kept < stated
     np.testing.assert_allclose(again.scores[again.kept], found.scores[found.kept], atol=0.05)
+
+
+def test_regions_judge_wherever_test_and_validation_rows_are(powers):
+    """Rows of other regions than those of the test rows, and no validation row, which is fitted to."""
+    record, _, scene = powers
+    rows = np.random.default_rng(0).permutation(len(record))
+    train, validation, test = map(np.sort, np.split(rows, [50, 60]))
+    splits = [Split("mine", 0, train, validation, tested) for tested in (test, test[:0])]
+    options = replace(default_options(record), rays=4096, depth=2)
+    found, other = (correct_scene(scene, record, split, options) for split in splits)
+    np.testing.assert_array_equal(other.vector, found.vector)
+    groups = hold_out_groups(splits[0], record.tx_pos_m)
+    assert found.facts["held_out"] == len(groups.validation) - 10
 
 
 def test_receivers_that_a_split_holds_out_are_not_used(powers):

@@ -139,12 +139,6 @@ def checked(record: Record, split: Split, options: CorrectionOptions | None) -> 
     return record, split, options
 
 
-def kinds_of(folder: Path) -> dict[str, Kind]:
-    """Kinds of the surfaces of a scene folder; other scenes state none."""
-    entries = read_scene_folder(folder).materials.surfaces if (folder / MATERIALS_FILE).is_file() else {}
-    return {name: entry for name, entry in entries.items() if entry in KINDS}
-
-
 class TracedScene:
     """The stated scene with the faces that a scan may have missed, and posteriors of rows over the paths in it.
 
@@ -168,7 +162,10 @@ class TracedScene:
     ) -> None:
         record, split, options = checked(record, split, options)
         self.record, self.split = record, split
-        self._scene, self._on_stage, self.kinds = scene, on_stage, kinds_of(Path(scene))
+        self._scene, self._on_stage, folder = scene, on_stage, Path(scene)
+        # A scene folder states kinds; other scenes state none.
+        entries = read_scene_folder(folder).materials.surfaces if (folder / MATERIALS_FILE).is_file() else {}
+        self.kinds: dict[str, Kind] = {name: entry for name, entry in entries.items() if entry in KINDS}
         carrier_hz = scene_carrier(record, split.all_train)
         completed = with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext((scene, Boxes([], [])))
         with completed as (place, boxes):

@@ -52,7 +52,7 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
     """
     facts = _facts(correction)
     with atomic_folder(Path(folder), replace=replace) as part:
-        _write_scene(correction.state, correction.kinds, part)
+        write_scene(correction.state, correction.kinds, part)
         plain = json.dumps(facts, indent=1, default=lambda x: x.tolist() if hasattr(x, "tolist") else str(x))
         write_atomically(part / FILE, plain + "\n")
         lines = [*_scores_text(correction, facts), *_frame_text(facts["frame"])]
@@ -68,11 +68,6 @@ def write_scene(state: State, kinds: Mapping[str, Kind], folder: Path) -> None:
 
     ``kinds`` are those of the objects of the stated scene.
     """
-    with atomic_folder(folder, replace=True) as part:
-        _write_scene(state, kinds, part)
-
-
-def _write_scene(state: State, kinds: Mapping[str, Kind], folder: Path) -> None:
     opened = state.posterior.misfit.sides[0].scene
     how: dict[str, Any] = {"kinds": kinds, "absent": state.absent(), "replace": True}
     write_corrected_scene(folder, opened, state.scene_parameters(), grouping="surface", **how)

@@ -28,10 +28,9 @@ from ..models.model import Arrays, Fitted, Problem, Session
 from ..tracing.paths.instrument_parameters import gain_name
 from ..training.selection import last_gain
 from .engine import CONFIDENCE, Engine
-from .scene import Edited, SceneStage, in_regions, too_few, with_near
+from .scene import Change, Edited, SceneStage, in_regions, too_few, with_near
 from .stage import Option, Stage, State
 
-NO_PAIRS = np.zeros((0, 2), np.int64)  # no rows that a split leaves to receivers which it holds out
 LEAST_RECEIVERS = 4  # fewest trained receivers of which half decide what is kept, where a split holds receivers out
 
 
@@ -64,12 +63,14 @@ def correct_scene(
     begun = time.perf_counter()
     traced = TracedScene(scene, record, split, options, material, on_stage)
     judging, of_scene, reports = _judging(traced), _SharedScene(traced), _Reports(traced)
+    enough = judging.held_receivers or not too_few(traced.record, judging)
     problem = Problem(traced.record, None, split.seed, str(scene), material)
     with TemporaryDirectory() as place:
         session = Session(Path(place), Path(place), lambda stage, share, _=None, /: on_stage(stage, share))
-        chosen = Engine(None, (of_scene, reports), problem, judging, session).choose()
+        chosen = Engine(None, (of_scene, reports), problem, judging, session).choose() if enough else None
     if chosen is None:
-        raise _too_few(traced)
+        text = f"{len(traced.split.train)} training rows are too few to hold some out; give more"
+        raise InputError(f"{traced.record.name}: {text}")
     best = chosen.fitted
     assert isinstance(best, _Reported)
     if not moves_planes(best.edit.stage):
@@ -80,9 +81,8 @@ def correct_scene(
     if correction.data is not None:
         # Rows held out of every choice are few; residuals of rows left out of least squares alone are of all rows.
         after = _with_mean_gain(correction.vector, correction.misfit, reports.heard)
-        held_out = _held_out_ratio(best.misfit, best.vector, correction.misfit, after)
-        ratio = max(correction.data.error_ratio, held_out)
-        correction.data = replace(correction.data, error_ratio=ratio)
+        ratio = _held_out_ratio(best.misfit, best.vector, correction.misfit, after)
+        correction.data = replace(correction.data, error_ratio=max(correction.data.error_ratio, ratio))
     correction.seconds = time.perf_counter() - begun
     return correction
 
@@ -93,18 +93,10 @@ def _judging(traced: TracedScene) -> Split:
     Rows that judge have to be like what the scene shall serve, anywhere: new receivers, or else regions as large as
     possible, wherever the test rows are.
     """
-    split, record = traced.split, traced.record
-    split = replace(split, test=split.test[:0], wanted_m=split.wanted_m[:0])
-    if len(record.receivers) - len(split.held_receivers) < LEAST_RECEIVERS:
-        split = replace(split, held_receivers=(), left=NO_PAIRS)
-    if not split.held_receivers and too_few(record, split):
-        raise _too_few(traced)
-    return split
-
-
-def _too_few(traced: TracedScene) -> InputError:
-    rows = len(traced.split.train)
-    return InputError(f"{traced.record.name}: {rows} training rows are too few to hold some out; give more")
+    split = replace(traced.split, test=traced.split.test[:0], wanted_m=traced.split.wanted_m[:0])
+    if len(traced.record.receivers) - len(split.held_receivers) >= LEAST_RECEIVERS:
+        return split
+    return replace(split, held_receivers=(), left=split.left[:0])
 
 
 class _SharedScene(SceneStage):
@@ -116,26 +108,18 @@ class _SharedScene(SceneStage):
         super().__init__(traced.options)
         self._traced = traced
 
-    def _fit(
-        self,
-        options: CorrectionOptions,
-        near: IntArray,
-        parts: Collection[str],
-        state: State,
-        split: Split,
-        session: Session,
-    ) -> State:
+    def _fit(self, change: Change, state: State, split: Split, session: Session) -> State:
         """As of `SceneStage`; the scene as stated has the gains of the observations. Nothing is written."""
-        record, rows = state.problem.record, with_near(state, split, near).all_train
+        record, rows = state.problem.record, with_near(state, split, change.near).all_train
         before: Edited | None = state.kept.get(self.name)
-        if not parts:
+        if not change.parts:
             self.trial = self._traced.fitted_posterior(record, rows)
-            edit = self.trial.start("").edit
+            fitted = self.trial.start("")
         elif before:
-            edit = fit_edit(self._traced.posterior(record, rows, before.edit), parts, before.edit).edit
+            fitted = fit_edit(self._traced.posterior(record, rows, before.edit), change.parts, before.edit)
         else:
-            edit = fit_edit(self.trial, parts).edit
-        return replace(state, kept={**state.kept, self.name: Edited(state.problem, options, edit)})
+            fitted = fit_edit(self.trial, change.parts)
+        return replace(state, kept={**state.kept, self.name: Edited(state.problem, change.options, fitted.edit)})
 
 
 class _Reported(Fitted):
@@ -209,13 +193,6 @@ class _Reports(Stage):
             return _Reported(edit, stated, self.heard)
         return _Reported(edit, self._traced.posterior(stated.record, stated.rows, edit).misfit, self.heard)
 
-    def units(self, score: FloatArray) -> FloatArray:
-        """Independent scores: those of rows, or the mean of each receiver that is held out."""
-        if not self.out:
-            return score
-        by_receiver = score.reshape(len(self.stated.misfit.record.receivers), -1)
-        return np.array([np.nanmean(row) for row in by_receiver if np.isfinite(row).any()])
-
 
 def _by_uncertain_phases(trial: ScenePosterior, reports: _Reports, best: _Reported) -> _Reported:
     """What is kept where planes are not resolved: ``best``, or materials by uncertain phases."""
@@ -228,12 +205,14 @@ def _by_uncertain_phases(trial: ScenePosterior, reports: _Reports, best: _Report
     # The engine judges by predictions. Predicted channels of wrong phases say nothing of materials: their likelihood
     # with uncertain phases decides.
     unseen = UncertainPhases(reports.stated, fit.noise)
-    before, after = (reports.units(unseen.scores(each.vector)) for each in (best, other))
-    gain = (after - before)[np.isfinite(after - before)]
+    gain = unseen.scores(other.vector) - unseen.scores(best.vector)
+    if reports.out:  # errors are independent between receivers
+        of_receivers = gain.reshape(len(unseen.misfit.record.receivers), -1)
+        gain = np.array([np.nanmean(rows) for rows in of_receivers if np.isfinite(rows).any()])
+    gain = gain[np.isfinite(gain)]
     # Signed ranks (Wilcoxon, 1945): rows of which a path is missing in the scene have gains and losses of any size.
     ranks = np.sign(gain) * rankdata(np.abs(gain))
-    units = (best, np.zeros(len(gain))), (other, ranks)
-    return last_gain(units, higher_is_better=True, confidence=CONFIDENCE)
+    return last_gain([(best, 0 * ranks), (other, ranks)], higher_is_better=True, confidence=CONFIDENCE)
 
 
 def _with_mean_gain(vector: FloatArray, misfit: Misfit, heard: Collection[str]) -> FloatArray:

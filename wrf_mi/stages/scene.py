@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +95,14 @@ class Edited:
     edit: SceneEdit
 
 
+class Change(NamedTuple):
+    """What an option of the stage changes."""
+
+    parts: Collection[str]  # parts that are fitted; none leave the scene as stated
+    options: CorrectionOptions
+    near: IntArray  # validation rows, which are fitted to, too: they do not judge (`in_regions`)
+
+
 class SceneStage(Stage):
     """Correction of the scene.
 
@@ -113,14 +121,15 @@ class SceneStage(Stage):
             return [Option(AS_STATED, lambda state, split, session: state)]
         parts = [part for part in how.parts if part != PHASES]
         still = [part for part in parts if part not in (PLANES, FRAME)]
-        fit = partial(self._fit, how, split.validation)
-        options = [Option(AS_STATED, partial(fit, ()))]
+        changes = (Change(names, how, split.validation) for names in ((), still, parts))
+        stated, calibrated, moved = (partial(self._fit, change) for change in changes)
+        options = [Option(AS_STATED, stated)]
         if still == parts or MATERIALS in still:
-            options.append(Option(CALIBRATED, partial(fit, still), 1))
+            options.append(Option(CALIBRATED, calibrated, 1))
         if still != parts:
             # Other paths make good planes better. They do not mend those that fit training rows alone, and finding
             # them takes as long as all that was done before.
-            options += [Option(MOVED, partial(fit, parts), 2), Option(ANEW, partial(fit, parts), 2, MOVED)]
+            options += [Option(MOVED, moved, 2), Option(ANEW, moved, 2, MOVED)]
         return options
 
     def confidence(self, rows: int) -> float:
@@ -131,33 +140,25 @@ class SceneStage(Stage):
         """The regions alone (`in_regions`)."""
         return in_regions(split, row)
 
-    def _fit(
-        self,
-        options: CorrectionOptions,
-        near: IntArray,
-        parts: Collection[str],
-        state: State,
-        split: Split,
-        session: Session,
-    ) -> State:
-        """Some parts of the options fitted, from an edit that the state may have; none leave the scene as stated."""
-        if not parts:
+    def _fit(self, change: Change, state: State, split: Split, session: Session) -> State:
+        """Some parts fitted, from an edit that the state may have."""
+        if not change.parts:
             return state
         before: Edited | None = state.kept.get(self.name)
         stated, place = before.stated if before else state.problem, session.folder / SCENE
         path = session.folder / EDIT
         if not path.exists():
             assert stated.scene is not None
-            rows = with_near(state, split, near)
-            traced = TracedScene(stated.scene, stated.record, rows, options, stated.material, session.report)
-            edit = before.edit if before else None
-            fitted = fit_edit(traced.fitted_posterior(traced.record, traced.split.all_train, edit), parts, edit)
+            how = with_near(state, split, change.near), change.options, stated.material, session.report
+            traced, edit = TracedScene(stated.scene, stated.record, *how), before.edit if before else None
+            posterior = traced.fitted_posterior(traced.record, traced.split.all_train, edit)
+            fitted = fit_edit(posterior, change.parts, edit)
             session.folder.mkdir(parents=True, exist_ok=True)
             write_scene(fitted, traced.kinds, place)
             write_arrays(path, fitted.edit.arrays())
-            del fitted, traced
+            del posterior, fitted, traced
             release_memory()
-        edited = Edited(stated, options, SceneEdit.from_arrays(stored_arrays(path)))
+        edited = Edited(stated, change.options, SceneEdit.from_arrays(stored_arrays(path)))
         problem = replace(stated, scene=str(place), material=None)
         return replace(state, problem=problem, kept={**state.kept, self.name: edited})
 
@@ -173,12 +174,11 @@ class SceneStage(Stage):
             problem, place = state.problem, session.folder / SCENE
             if not (place / CORRECTION).exists():  # a resumed fit finds it
                 assert problem.scene is not None
-                how = edited.options, problem.material, session.report
-                traced = TracedScene(problem.scene, problem.record, split, *how)
-                facts = {
-                    "held_out": len(next(iter(scores.values()))),
-                    "held_out_receivers": [name for name in out if name not in _held(problem, split)],
-                }
+                how = split, edited.options, problem.material, session.report
+                traced = TracedScene(problem.scene, problem.record, *how)
+                held = {problem.record.receivers[number].name for number in split.held_receivers}
+                names = [name for name in out if name not in held]
+                facts = {"held_out": len(next(iter(scores.values()))), "held_out_receivers": names}
                 named = {"" if name == AS_STATED else name: score for name, score in scores.items()}
                 write_page(refit_edit(traced, edited.edit, named, facts), place, replace=True)
                 release_memory()
@@ -197,14 +197,10 @@ def _wanted_options(problem: Problem) -> CorrectionOptions | None:
 
 
 def with_near(state: State, split: Split, near: IntArray) -> Split:
-    """The split of a fold with the held-out rows ``near`` to those that train, which do not judge (`in_regions`)."""
+    """The split of a fold with rows ``near`` to those that train among these, where a training can choose by them."""
     if state.fold is None or not of_rows(state.problem.record, state.fold):
         return split
     return replace(split, train=np.union1d(split.train, near), test=np.setdiff1d(split.test, near))
-
-
-def _held(problem: Problem, split: Split) -> set[str]:
-    return {problem.record.receivers[number].name for number in split.held_receivers}
 
 
 def scene_reports(options: Sequence[OptionReport], higher_is_better: bool) -> list[StageReport]:
