@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 from wrf_mi_scenes.random_rooms import random_room
 
-from wrf_mi.correction import correct_scene, default_options, write_page
+from wrf_mi.correction import default_options, write_page
 from wrf_mi.correction.options import PHASES
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.channel import rssi_dbm
 from wrf_mi.runs.sweep import markdown_table
+from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi_bench.random_room import OPTIONS, Survey, random_room_record

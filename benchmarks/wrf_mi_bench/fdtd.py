@@ -20,7 +20,7 @@ import wrf_mi
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.types import FloatArray, IntArray
-from wrf_mi.correction import CorrectionOptions, correct_scene, write_page
+from wrf_mi.correction import CorrectionOptions, write_page
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.path_lengths import lengths_and_slopes
 from wrf_mi.correction.state import ScenePosterior, material_places
@@ -33,6 +33,7 @@ from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import Materials
 from wrf_mi.scene.mesh.files import mesh_parts
 from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.options import TraceOptions
 from wrf_mi.tracing.paths.solve import Prepared

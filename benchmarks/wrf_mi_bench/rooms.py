@@ -22,10 +22,11 @@ from wrf_mi_scenes.random_rooms import random_room
 import wrf_mi
 from wrf_mi.core import Receiver, Record
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.correction import correct_scene, write_page
+from wrf_mi.correction import write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.instruments import SpectrumInstrument
 from wrf_mi.runs.sweep import markdown_table
+from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tasks import TASKS, instrument_of, task_of
 from wrf_mi.tracing import TraceResult
 from wrf_mi.tracing.options import TraceOptions

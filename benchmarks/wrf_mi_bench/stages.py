@@ -20,12 +20,13 @@ import numpy as np
 
 from wrf_mi.core import Record
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.correction import correct_scene, default_options, write_page
+from wrf_mi.correction import default_options, write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.runs.api import resume, train
 from wrf_mi.runs.folder import CONFIG, is_finished
 from wrf_mi.runs.results import Results, read_run
 from wrf_mi.runs.sweep import markdown_table
+from wrf_mi.stages.correct import correct_scene
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS

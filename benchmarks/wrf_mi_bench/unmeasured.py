@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from wrf_mi.core import Record, Split
-from wrf_mi.correction import CorrectionOptions, correct_scene, default_options, write_page
+from wrf_mi.correction import CorrectionOptions, default_options, write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.runs.api import train
 from wrf_mi.runs.results import Observations, Results, read_run
 from wrf_mi.runs.sweep import markdown_table
+from wrf_mi.stages.correct import correct_scene
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_receivers import NAME as FLOOR
 from wrf_mi.synthetic.furnished_room import BANDS

@@ -12,9 +12,10 @@ from wrf_mi_scenes.mitsuba_xml import PERFECT
 from wrf_mi_scenes.random_rooms import CLEAR_M, FEWEST, HEIGHTS_M, LEAST_M, MOST, MOST_M, MOUNTED_M, MOUNTS, random_room
 
 from wrf_mi.core import Record
-from wrf_mi.correction import CorrectionOptions, correct_scene, write_page
+from wrf_mi.correction import CorrectionOptions, write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.scene.folder import read_scene_folder
+from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing.tracer import RayTracer
 

@@ -16,10 +16,11 @@ from wrf_mi_scenes.mitsuba_xml import Parts, write_scene
 from wrf_mi.core import Receiver, Record
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.correction import CorrectionOptions, correct_scene, write_page
+from wrf_mi.correction import CorrectionOptions, write_page
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.state import LEAST_PATHS
 from wrf_mi.datasets import make_splits, read_spectrum_folder, write_spectrum_folder
+from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.paths.scene_parameters import SHIFT

@@ -17,9 +17,8 @@ from wrf_mi_scenes import scenes
 from wrf_mi_scenes.build_laboratory import sheet
 
 import wrf_mi
-from wrf_mi.core import InputError
-from wrf_mi.correction import Correction, CorrectionOptions, correct_scene, default_options, write_page
-from wrf_mi.correction.correct import _errors, _last_is_best
+from wrf_mi.core import InputError, Split
+from wrf_mi.correction import Correction, CorrectionOptions, default_options, write_page
 from wrf_mi.correction.edits import error_ratio
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.options import PARTS
@@ -30,12 +29,14 @@ from wrf_mi.scene.correction_data import read_correction_data
 from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.stages.correct import _held_out_ratio, correct_scene
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import instrument_of, task_of
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
+from wrf_mi.training.selection import hold_out_groups
 
 PLANE_M, PLANE_RAD = 1e-3, 1e-3
 STEP = 2e-4
@@ -115,11 +116,12 @@ def test_error_ratio_is_the_larger_one_of_equal_rows(held, left_out, expected):
     fitted[5] = np.nan
     # Rows that were not held out have errors of another size.
     fitted[[0, 2, 4, 6]] *= 10
-    record = SimpleNamespace(receivers=("a", "b"))
+    record = SimpleNamespace(receivers=(SimpleNamespace(name="a"), SimpleNamespace(name="b")))
     final = SimpleNamespace(record=record, rows=np.array([2, 4, 6, 8]), residual=lambda vector: fitted)
-    unseen = SimpleNamespace(rows=np.array([4, 8]), residual=lambda vector: -held * fitted[[1, 3, 5, 7]])
-    errors = _errors(unseen, np.zeros(1), final, np.zeros(1), left_out * fitted)
-    assert error_ratio(errors) == pytest.approx(expected)
+    rows = np.array([4, 8])
+    unseen = SimpleNamespace(record=record, rows=rows, residual=lambda vector: -held * fitted[[1, 3, 5, 7]])
+    held_out = _held_out_ratio(unseen, np.zeros(1), final, np.zeros(1))
+    assert max(error_ratio(left_out * fitted, fitted), held_out) == pytest.approx(expected)
 
 
 def test_planes_alone_are_corrected(true, corrected):
@@ -264,6 +266,19 @@ def test_strengths_correct_materials_by_a_bounded_number_of_rows(powers):
     np.testing.assert_allclose(again.scores[again.kept], found.scores[found.kept], atol=0.05)
 
 
+def test_regions_judge_wherever_test_and_validation_rows_are(powers):
+    """Rows of other regions than those of the test rows, and no validation row, which is fitted to."""
+    record, _, scene = powers
+    rows = np.random.default_rng(0).permutation(len(record))
+    train, validation, test = map(np.sort, np.split(rows, [50, 60]))
+    splits = [Split("mine", 0, train, validation, tested) for tested in (test, test[:0])]
+    options = replace(default_options(record), rays=4096, depth=2)
+    found, other = (correct_scene(scene, record, split, options) for split in splits)
+    np.testing.assert_array_equal(other.vector, found.vector)
+    groups = hold_out_groups(splits[0], record.tx_pos_m)
+    assert found.facts["held_out"] == len(groups.validation) - 10
+
+
 def test_receivers_that_a_split_holds_out_are_not_used(powers):
     record, _, scene = powers
     second = replace(record.receivers[0], name="second", position_m=np.array([5.0, 3.5, 2.0]))
@@ -378,13 +393,3 @@ def test_unknown_parts_and_few_rows_are_refused(tmp_path):
     record = channels(scene, 18)
     with pytest.raises(InputError, match=r"training rows are too few to hold some out"):
         correct_scene(scene, record, make_splits(record, "official", n_train=5)[0])
-
-
-@pytest.mark.parametrize(
-    ("higher_is_better", "last", "best"), [(True, 2.0, True), (True, 1.2, False), (False, 1.2, True)]
-)
-def test_paths_are_searched_anew_for_the_best_stage_alone(higher_is_better, last, best):
-    """Of scores whose differences vary; a row that was not received does not count."""
-    noise = np.array([0.1, -0.1, 0.2, np.nan])
-    scores = {"": 1.3 + noise, "materials": 1.5 - noise, "planes": np.full(4, last)}
-    assert _last_is_best(scores, higher_is_better) == best

@@ -8,11 +8,12 @@ import pytest
 from correction_rooms import CARRIER_HZ, TRUE_MATERIALS, channels, stated_scene
 
 from wrf_mi.core import Antenna, Record
-from wrf_mi.correction import CorrectionOptions, correct_scene, write_page
+from wrf_mi.correction import CorrectionOptions, write_page
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.state import ABSENT, ABSENT_VALUES, ScenePosterior, State, material_places
 from wrf_mi.datasets import make_splits
 from wrf_mi.scene.folder import read_scene_folder
+from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.paths.scene_parameters import EXPONENT, SURFACE, name_of

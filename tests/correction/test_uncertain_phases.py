@@ -8,11 +8,12 @@ from scipy.integrate import quad
 from scipy.special import i0e, i1e
 
 from wrf_mi.core import InputError
-from wrf_mi.correction import CorrectionOptions, correct_scene
+from wrf_mi.correction import CorrectionOptions
 from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.state import ScenePosterior
 from wrf_mi.correction.uncertain_phases import UncertainPhases, moments
 from wrf_mi.datasets import make_splits
+from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.paths.corrected_scene import write_corrected_scene
 from wrf_mi.tracing.paths.scene_parameters import SHIFT

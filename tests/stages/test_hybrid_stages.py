@@ -291,7 +291,7 @@ def test_regions_alone_judge_a_scene_that_rows_near_by_correct(scenes, tmp_path,
         seen.append(split.all_train)
         raise InputError("noted")
 
-    monkeypatch.setattr(scene_stage, "fit_edit", noted)
+    monkeypatch.setattr(scene_stage, "TracedScene", noted)
     record, split = measured(scenes, "spectrum", 24)
     split = replace(split, train=np.sort(split.train)[::2], validation=np.sort(split.train)[1::2])
     wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=("steps=20",))

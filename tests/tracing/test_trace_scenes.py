@@ -15,7 +15,7 @@ from wrf_mi_scenes.mitsuba_xml import ABSORBER
 
 from wrf_mi.cli.main import main
 from wrf_mi.core import InputError
-from wrf_mi.correction import correct_scene, default_options
+from wrf_mi.correction import default_options
 from wrf_mi.correction.page import write_page
 from wrf_mi.datasets.splits import make_splits
 from wrf_mi.receivers.instruments import PowerInstrument
@@ -24,6 +24,7 @@ from wrf_mi.scene.edit import Move, edit_scene
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import read_materials
 from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tracing import RayTracer, TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.search.devices import before_surfaces, check_devices, clear_m, winding_number
 from wrf_mi.tracing.search.surfaces import find_planes, scene_surfaces

@@ -8,7 +8,7 @@ found where planes have moved.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -85,59 +85,33 @@ def default_options(record: Record, n_train: int | float | None = None) -> Corre
 
 
 @threadpool_limits.wrap(1, "blas")  # type: ignore[untyped-decorator]
-def fit_edit(
-    scene: str | Path,
-    record: Record,
-    split: Split,
-    options: CorrectionOptions,
-    material: str | None = None,
-    on_stage: OnStage = lambda what, share: None,
-    edit: SceneEdit | None = None,
-) -> Correction:
-    """All parts of some options fitted to the training rows of a split, whether they gain or not.
+def fit_edit(posterior: ScenePosterior, parts: Collection[str], edit: SceneEdit | None = None) -> State:
+    """Some parts of the options fitted to the rows of a posterior, whether they gain or not.
 
-    Arguments and errors are those of `wrf_mi.correction.correct_scene`. Given an ``edit`` that was found along the
-    paths of the stated scene, the search goes on along those of the edited one.
+    Given an ``edit`` that was found along other paths, such as those of the stated scene, the search goes on from it.
     """
-    begun = time.perf_counter()
-    record, split, options = checked(record, split, options)
-    traced = TracedScene(scene, record, split, options, material, on_stage)
-    posterior = traced.posterior(record, split.all_train, edit)
-    check_paths(posterior, scene)
-    stage = "+".join(posterior.options.parts)
-    state = Moves(posterior, stage).continued(edit) if edit else Moves(posterior, stage).best()
-    facts = {"rows": len(split.all_train), "paths": len(posterior.misfit.paths.row)}
-    nothing = np.zeros(len(posterior.stated))
-    return Correction(state, nothing, {}, kinds_of(Path(scene)), None, time.perf_counter() - begun, facts)
+    search = Moves(posterior, "+".join(part for part in posterior.options.parts if part in parts))
+    return search.continued(edit) if edit else search.best()
 
 
 @threadpool_limits.wrap(1, "blas")  # type: ignore[untyped-decorator]
 def refit_edit(
-    scene: str | Path,
-    record: Record,
-    split: Split,
-    options: CorrectionOptions,
-    edit: SceneEdit,
-    scores: Mapping[str, FloatArray],
-    out: Sequence[str] = (),
-    material: str | None = None,
-    on_stage: OnStage = lambda what, share: None,
+    traced: TracedScene, edit: SceneEdit, scores: Mapping[str, FloatArray], facts: Mapping[str, Any]
 ) -> Correction:
-    """An ``edit`` that was found and judged by some rows, fitted to all training rows of a split.
+    """An ``edit`` that was found and judged by some rows, fitted to all training rows along the paths of its scene.
 
-    Arguments and errors are those of `wrf_mi.correction.correct_scene`; ``scores`` are those of the rows that judged
-    it, by what was changed, "" for nothing, and ``out`` the names of the receivers that did, if receivers were held
-    out.
+    ``scores`` are those of the rows that judged it, by what was changed, "" for nothing, and ``facts`` what the page
+    states of these rows: their number ``held_out``, and names of the receivers that did, ``held_out_receivers``.
     """
-    begun = time.perf_counter()
-    record, split, options = checked(record, split, options)
-    final = TracedScene(scene, record, split, options, material, on_stage).posterior(record, split.all_train, edit)
-    state, deviation, left_out = by_all_rows(edit, final)
-    ratio = error_ratio([(left_out, np.abs(final.misfit.residual(state.vector)))])
-    facts: dict[str, Any] = {"rows": len(split.all_train), "held_out": len(next(iter(scores.values())))}
-    facts |= {"held_out_receivers": list(out), "paths": len(final.misfit.paths.row)}
-    data = CorrectionData(record.name, split.all_train, ratio)
-    return Correction(state, deviation, scores, kinds_of(Path(scene)), data, time.perf_counter() - begun, facts)
+    begun, record, rows = time.perf_counter(), traced.record, traced.split.all_train
+    final = traced.posterior(record, rows, edit if edit.stage else None)
+    state, data, deviation = final.start(""), None, np.zeros(len(final.stated))
+    if edit.stage:
+        state, deviation, left_out = by_all_rows(edit, final)
+        ratio = error_ratio(left_out, final.misfit.residual(state.vector))
+        data = CorrectionData(record.name, rows, ratio)
+    facts = {"rows": len(rows), **facts, "paths": len(final.misfit.paths.row)}
+    return Correction(state, deviation, scores, traced.kinds, data, time.perf_counter() - begun, facts)
 
 
 def checked(record: Record, split: Split, options: CorrectionOptions | None) -> tuple[Record, Split, CorrectionOptions]:
@@ -165,25 +139,34 @@ def checked(record: Record, split: Split, options: CorrectionOptions | None) -> 
     return record, split, options
 
 
-def kinds_of(folder: Path) -> dict[str, Kind]:
-    """Kinds of the surfaces of a scene folder; other scenes state none."""
-    entries = read_scene_folder(folder).materials.surfaces if (folder / MATERIALS_FILE).is_file() else {}
-    return {name: entry for name, entry in entries.items() if entry in KINDS}
-
-
 class TracedScene:
-    """The stated scene with the faces that a scan may have missed, and posteriors of rows over the paths in it."""
+    """The stated scene with the faces that a scan may have missed, and posteriors of rows over the paths in it.
+
+    Arguments and errors are those of `wrf_mi.stages.correct.correct_scene`.
+
+    Attributes:
+        record: observations that may be used, of the receivers with enough training rows.
+        split: split of that record, with at most the rows of the options.
+        options: options that suit the task and the scene.
+        kinds: kinds of the scene's objects.
+    """
 
     def __init__(
         self,
         scene: str | Path,
         record: Record,
         split: Split,
-        options: CorrectionOptions,
+        options: CorrectionOptions | None,
         material: str | None,
         on_stage: OnStage,
     ) -> None:
-        carrier_hz, self._on_stage = scene_carrier(record, split.all_train), on_stage
+        record, split, options = checked(record, split, options)
+        self.record, self.split = record, split
+        self._scene, self._on_stage, folder = scene, on_stage, Path(scene)
+        # A scene folder states kinds; other scenes state none.
+        entries = read_scene_folder(folder).materials.surfaces if (folder / MATERIALS_FILE).is_file() else {}
+        self.kinds: dict[str, Kind] = {name: entry for name, entry in entries.items() if entry in KINDS}
+        carrier_hz = scene_carrier(record, split.all_train)
         completed = with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext((scene, Boxes([], [])))
         with completed as (place, boxes):
             opened, self._copy = (open_scene(place, carrier_hz, material=material) for _ in range(2))
@@ -212,15 +195,15 @@ class TracedScene:
         misfit = Misfit(record, rows, self._prepared, self.options, searched, surfaces)
         return ScenePosterior(misfit, self.options, self._on_stage, self._hidden, self._boxes.members)
 
-
-def check_paths(posterior: ScenePosterior, scene: str | Path) -> None:
-    """Refuse rows that no path reaches, or whose paths tell of no surface."""
-    name = posterior.misfit.record.name
-    if not any(side.exists.any() for side in posterior.misfit.sides):
-        raise InputError(f"{name}: no path reaches a receiver in {scene}; trace more interactions")
-    if not len(posterior.free("+".join(posterior.options.parts))):
-        text = f"no surface is met by {LEAST_PATHS} paths; give more training rows or interactions"
-        raise InputError(f"{name}: {text}")
+    def fitted_posterior(self, record: Record, rows: IntArray, edit: SceneEdit | None = None) -> ScenePosterior:
+        """The `posterior` of rows that are fitted to (InputError: no path reaches them, or none tells of a surface)."""
+        posterior = self.posterior(record, rows, edit)
+        if not any(side.exists.any() for side in posterior.misfit.sides):
+            raise InputError(f"{record.name}: no path reaches a receiver in {self._scene}; trace more interactions")
+        if not len(posterior.free("+".join(posterior.options.parts))):
+            text = f"no surface is met by {LEAST_PATHS} paths; give more training rows or interactions"
+            raise InputError(f"{record.name}: {text}")
+        return posterior
 
 
 def by_all_rows(best: SceneEdit, final: ScenePosterior) -> tuple[State, FloatArray, FloatArray]:
@@ -240,15 +223,11 @@ def moves_planes(stage: str) -> bool:
     return not {PLANES, FRAME}.isdisjoint(stage.split("+"))
 
 
-def error_ratio(errors: Sequence[tuple[FloatArray, FloatArray]]) -> float:
+def error_ratio(without: FloatArray, with_rows: FloatArray) -> float:
     """Error of reports that a correction does not know over that of the same reports once it does, 1 or more.
 
-    The largest of the ratios of quantiles of some ``errors`` without and with knowledge of the reports.
+    The ratio of quantiles of errors of the same shape without and with knowledge of the reports, NaN for no report.
     """
-    ratios = [1.0]
-    for without, with_rows in errors:
-        without = np.abs(without)
-        observed = np.isfinite(without) & np.isfinite(with_rows)
-        larger, smaller = (float(np.quantile(values[observed], LEVEL)) for values in (without, with_rows))
-        ratios.append(larger / max(smaller, float(np.finfo(np.float32).tiny)))
-    return max(ratios)
+    observed = np.isfinite(without) & np.isfinite(with_rows)
+    larger, smaller = (float(np.quantile(np.abs(values[observed]), LEVEL)) for values in (without, with_rows))
+    return max(1.0, larger / max(smaller, float(np.finfo(np.float32).tiny)))

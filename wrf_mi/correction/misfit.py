@@ -319,19 +319,21 @@ class Misfit:
         slopes[:, ~np.isfinite(self.observed).all(axis=1)] = 0
         return Jacobian(slopes)
 
-    def scores(self, vector: FloatArray) -> FloatArray:
-        """Scores of the task of complete reports, [n_rx * rows]; NaN where nothing was received."""
-        task, params = self._task, self._device(vector)
-        stored = self.record.observation[:, self.rows]
-        stored = stored.reshape(-1, *stored.shape[2:])
-        scores = np.full(len(stored), np.nan)
+    def reports(self, vector: FloatArray) -> NDArray[Any]:
+        """Complete reports of a vector [p] as observations [n_rx, rows, ...]; NaN of receivers that have none."""
+        params, stored = self._device(vector), self.record.observation[:, self.rows]
+        kind = complex if np.iscomplexobj(stored) else float
+        reports = np.full((len(self.observed), *stored.shape[2:]), np.nan, kind)
         for port in self.ports:
             with dr.suspend_grad():
-                report = port.complete(port.side(params), None).numpy()
-            truth, pairs = stored[port.places], np.asarray(report, float)
-            values = pairs.view(complex) if np.iscomplexobj(truth) else pairs
-            scores[port.places] = task.of_rows(values.reshape(truth.shape)[None], truth[None])[0]
-        return scores
+                values = np.asarray(port.complete(port.side(params), None).numpy(), float)
+            reports[port.places] = values.view(kind).reshape(-1, *stored.shape[2:])
+        return reports.reshape(stored.shape)
+
+    def scores(self, vector: FloatArray) -> FloatArray:
+        """Scores of the task of complete reports, [n_rx * rows]; NaN where nothing was received."""
+        pairs = zip(self.reports(vector), self.record.observation[:, self.rows], strict=True)
+        return np.concatenate([self._task.of_rows(report[None], truth[None])[0] for report, truth in pairs])
 
     def accept(self, vector: FloatArray) -> None:
         """Nothing, as residuals are exact at all vectors (`wrf_mi.correction.path_sum.PathSum.accept`)."""

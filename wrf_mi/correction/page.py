@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +28,13 @@ from ..core.angles import FloatArray
 from ..core.files import atomic_folder, listed, write_atomically, write_figure
 from ..scene.correction_data import FILE
 from ..scene.correction_data import KEY as DATA
+from ..scene.mesh.surfaces import Kind
 from ..tasks import task_of
 from ..tracing.paths.corrected_scene import moved_triangles, write_corrected_scene
 from ..tracing.paths.scene_parameters import QUANTITIES, SHIFT, SURFACE, TILT, name_of
 from .edits import Correction
 from .options import FRAME, MATERIALS, PHASES
-from .state import LEAST_PATHS, rigid_motion, scene_entries
+from .state import LEAST_PATHS, State, rigid_motion, scene_entries
 
 PAGE, PICTURE = "correction.md", "correction.png"
 SUPPORTED = 0.5  # largest ratio of standard deviations after and before at which a quantity counts as measured
@@ -51,7 +52,7 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
     """
     facts = _facts(correction)
     with atomic_folder(Path(folder), replace=replace) as part:
-        _write_scene(correction, part)
+        write_scene(correction.state, correction.kinds, part)
         plain = json.dumps(facts, indent=1, default=lambda x: x.tolist() if hasattr(x, "tolist") else str(x))
         write_atomically(part / FILE, plain + "\n")
         lines = [*_scores_text(correction, facts), *_frame_text(facts["frame"])]
@@ -62,15 +63,13 @@ def write_page(correction: Correction, folder: str | Path, replace: bool = False
     return facts
 
 
-def write_scene(correction: Correction, folder: Path) -> None:
-    """Write a corrected scene without its page atomically, in place of what is there (InputError: no surface left)."""
-    with atomic_folder(folder, replace=True) as part:
-        _write_scene(correction, part)
+def write_scene(state: State, kinds: Mapping[str, Kind], folder: Path) -> None:
+    """Write a corrected scene without its page atomically, in place of what is there (InputError: no surface left).
 
-
-def _write_scene(correction: Correction, folder: Path) -> None:
-    opened, state = correction.misfit.sides[0].scene, correction.state
-    how: dict[str, Any] = {"kinds": correction.kinds, "absent": state.absent(), "replace": True}
+    ``kinds`` are those of the objects of the stated scene.
+    """
+    opened = state.posterior.misfit.sides[0].scene
+    how: dict[str, Any] = {"kinds": kinds, "absent": state.absent(), "replace": True}
     write_corrected_scene(folder, opened, state.scene_parameters(), grouping="surface", **how)
 
 

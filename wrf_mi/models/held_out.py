@@ -63,15 +63,16 @@ def fit_model(entry: Model, problem: Problem, split: Split, session: Session) ->
     return entry.fit(problem, split, session), problem
 
 
-def fold_of(entry: Model, problem: Problem, fold: Split, session: Session) -> tuple[Problem, Split, IntArray]:
+def fold_of(entry: Model | None, problem: Problem, fold: Split, session: Session) -> tuple[Problem, Split, IntArray]:
     """What a fit to a fold of the training rows may see: problem and split of the receivers with enough rows, their
-    numbers, ascending.
+    numbers, ascending. Places that nobody surveyed are estimated for a model that uses them, ``entry``.
     """
     numbers, left_out = fitted_receivers(problem.record, [fold])
     if left_out:
         problem = replace(problem, dataset=problem.record.at_receivers(numbers), antennas=AS_STATED)
         fold = fold.at_receivers(numbers)
-    return placed_problem(problem.seen(fold), fold, entry, session.report), fold, numbers
+    problem = problem.seen(fold)
+    return problem if entry is None else placed_problem(problem, fold, entry, session.report), fold, numbers
 
 
 def fit_fold(entry: Model, problem: Problem, fold: Split, session: Session) -> tuple[Fitted, IntArray]:

@@ -104,7 +104,8 @@ class Scene:
         """
         if deterministic:  # before anything is read: reading a data set may choose the GPU
             init("llvm", threads=1)
-        from ..correction import CorrectionOptions, correct_scene, default_options, write_page
+        from ..correction import CorrectionOptions, default_options, write_page
+        from ..stages.correct import correct_scene
 
         def corrected(place: Path) -> None:
             record = data if isinstance(data, Record) else load_record(data, progress)

@@ -59,7 +59,7 @@ class Engine:
     """Fit of stages to the rows of a split.
 
     Args:
-        entry: model of these stages.
+        entry: model of these stages; None: one that uses no position of a receiver that nobody surveyed.
         stages: stages in their order; the last ones predict.
         problem: problem of the fit.
         split: split whose training rows are held out and fitted.
@@ -70,7 +70,9 @@ class Engine:
         reports: what became of each option.
     """
 
-    def __init__(self, entry: Model, stages: Sequence[Stage], problem: Problem, split: Split, session: Session) -> None:
+    def __init__(
+        self, entry: Model | None, stages: Sequence[Stage], problem: Problem, split: Split, session: Session
+    ) -> None:
         self._entry, self._problem, self._split, self._session = entry, problem, split, session
         listed = [(stage, stage.options(problem, split)) for stage in stages]
         self._stages = [stage for stage, options in listed if options]
@@ -87,10 +89,15 @@ class Engine:
         # Places of receivers that nobody surveyed are estimated once, for all options.
         return Fold(rows.held_out, *fold_of(self._entry, self._problem, rows.fold, self._session))
 
+    def choose(self) -> State | None:
+        """The chosen options fitted to all rows but those held out, which chose them; None: none can be held out."""
+        self._plan, fold = self._chosen(), self._fold
+        return None if fold is None else self._state(fold, self._plan)
+
     def fit(self) -> State:
         """The chosen options fitted to all rows."""
-        plan, fold = self._chosen(), self._fold
-        self._plan = plan
+        self.choose()
+        plan, fold = self._plan, self._fold
         if fold is not None:
             self.unseen = self._predicted(fold, plan, finish=True)
         state = State(self._problem)
@@ -182,11 +189,10 @@ class Engine:
 
     def _scores(self, fold: Fold, plan: Plan, stage: Stage) -> FloatArray:
         """Mean scores of the independent units of rows that judge a stage by a chain, the higher the better."""
-        record, count = self._problem.record, len(fold.held_out)
-        means = self._predicted(fold, plan).mean[None]
-        of_each = task_of(record).mixtures(means, fold.held_out.observed(record))
-        judging = np.flatnonzero(stage.judging(self._split, fold.held_out.row))
-        return unit_means(of_each(np.ones((count, 1)), np.arange(count))[judging], self._unit(fold)[judging])
+        record, judging = self._problem.record, np.flatnonzero(stage.judging(self._split, fold.held_out.row))
+        means = self._predicted(fold, plan).mean[None, judging]
+        of_each = task_of(record).mixtures(means, fold.held_out.observed(record)[judging])
+        return unit_means(of_each(np.ones((len(judging), 1)), np.arange(len(judging))), self._unit(fold)[judging])
 
     def _path(self, plan: Plan, finish: bool = False) -> Path:
         return self._folder / f"{CHOSEN if finish else '+'.join(plan)}.npz"

@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,8 @@ from ..core import Record, Split
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.types import FloatArray, IntArray
 from ..correction import CorrectionOptions, default_options, write_page, write_scene
-from ..correction.edits import fit_edit, refit_edit
-from ..correction.options import FRAME, HIDDEN, PLANES
+from ..correction.edits import TracedScene, fit_edit, refit_edit
+from ..correction.options import FRAME, HIDDEN, MATERIALS, PHASES, PLANES
 from ..correction.state import SceneEdit
 from ..models.model import Problem, Session
 from ..scene.correction_data import FILE as CORRECTION
@@ -95,27 +95,41 @@ class Edited:
     edit: SceneEdit
 
 
+class Change(NamedTuple):
+    """What an option of the stage changes."""
+
+    parts: Collection[str]  # parts that are fitted; none leave the scene as stated
+    options: CorrectionOptions
+    near: IntArray  # validation rows, which are fitted to, too: they do not judge (`in_regions`)
+
+
 class SceneStage(Stage):
-    """Correction of the scene."""
+    """Correction of the scene.
+
+    ``options`` are those of the correction; None: by the task and the stages that the problem's settings want.
+    """
 
     name = "scene"
 
+    def __init__(self, options: CorrectionOptions | None = None) -> None:
+        self._options = options
+
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
         """The scene as it is stated, and where rows suffice and settings allow it, calibrated and corrected."""
-        options, wanted = [Option(AS_STATED, lambda state, split, session: state)], {*problem.settings.wanted}
-        enough = split.held_receivers or not too_few(problem.record, split)
-        if {CALIBRATION, CORRECTED}.isdisjoint(wanted) or not enough:
-            return options
-        how = default_options(problem.record)
-        if CORRECTED not in wanted:
-            how = replace(how, parts=tuple(part for part in how.parts if part not in OF_GEOMETRY))
-        still = replace(how, parts=tuple(part for part in how.parts if part not in (PLANES, FRAME)))
-        options.append(Option(CALIBRATED, partial(self._fit, still, split.validation), 1))
-        if still != how:
+        how = self._options or _wanted_options(problem)
+        if how is None or not (split.held_receivers or not too_few(problem.record, split)):
+            return [Option(AS_STATED, lambda state, split, session: state)]
+        parts = [part for part in how.parts if part != PHASES]
+        still = [part for part in parts if part not in (PLANES, FRAME)]
+        changes = (Change(names, how, split.validation) for names in ((), still, parts))
+        stated, calibrated, moved = (partial(self._fit, change) for change in changes)
+        options = [Option(AS_STATED, stated)]
+        if still == parts or MATERIALS in still:
+            options.append(Option(CALIBRATED, calibrated, 1))
+        if still != parts:
             # Other paths make good planes better. They do not mend those that fit training rows alone, and finding
             # them takes as long as all that was done before.
-            fit = partial(self._fit, how, split.validation)
-            options += [Option(MOVED, fit, 2), Option(ANEW, fit, 2, MOVED)]
+            options += [Option(MOVED, moved, 2), Option(ANEW, moved, 2, MOVED)]
         return options
 
     def confidence(self, rows: int) -> float:
@@ -126,22 +140,25 @@ class SceneStage(Stage):
         """The regions alone (`in_regions`)."""
         return in_regions(split, row)
 
-    def _fit(self, options: CorrectionOptions, near: IntArray, state: State, split: Split, session: Session) -> State:
-        if state.fold is not None and of_rows(state.problem.record, state.fold):
-            split = replace(split, train=np.union1d(split.train, near), test=np.setdiff1d(split.test, near))
+    def _fit(self, change: Change, state: State, split: Split, session: Session) -> State:
+        """Some parts fitted, from an edit that the state may have."""
+        if not change.parts:
+            return state
         before: Edited | None = state.kept.get(self.name)
         stated, place = before.stated if before else state.problem, session.folder / SCENE
         path = session.folder / EDIT
         if not path.exists():
             assert stated.scene is not None
-            of_fit = stated.scene, stated.record, split, options, stated.material, session.report
-            correction = fit_edit(*of_fit, before and before.edit)
+            how = with_near(state, split, change.near), change.options, stated.material, session.report
+            traced, edit = TracedScene(stated.scene, stated.record, *how), before.edit if before else None
+            posterior = traced.fitted_posterior(traced.record, traced.split.all_train, edit)
+            fitted = fit_edit(posterior, change.parts, edit)
             session.folder.mkdir(parents=True, exist_ok=True)
-            write_scene(correction, place)
-            write_arrays(path, correction.state.edit.arrays())
-            del correction
+            write_scene(fitted, traced.kinds, place)
+            write_arrays(path, fitted.edit.arrays())
+            del posterior, fitted, traced
             release_memory()
-        edited = Edited(stated, options, SceneEdit.from_arrays(stored_arrays(path)))
+        edited = Edited(stated, change.options, SceneEdit.from_arrays(stored_arrays(path)))
         problem = replace(stated, scene=str(place), material=None)
         return replace(state, problem=problem, kept={**state.kept, self.name: edited})
 
@@ -157,18 +174,33 @@ class SceneStage(Stage):
             problem, place = state.problem, session.folder / SCENE
             if not (place / CORRECTION).exists():  # a resumed fit finds it
                 assert problem.scene is not None
-                of_fit = problem.scene, problem.record, split, edited.options, edited.edit
-                names = [name for name in out if name not in _held(problem, split)]
+                how = split, edited.options, problem.material, session.report
+                traced = TracedScene(problem.scene, problem.record, *how)
+                held = {problem.record.receivers[number].name for number in split.held_receivers}
+                names = [name for name in out if name not in held]
+                facts = {"held_out": len(next(iter(scores.values()))), "held_out_receivers": names}
                 named = {"" if name == AS_STATED else name: score for name, score in scores.items()}
-                write_page(refit_edit(*of_fit, named, names, problem.material, session.report), place, replace=True)
+                write_page(refit_edit(traced, edited.edit, named, facts), place, replace=True)
                 release_memory()
             return replace(state, problem=in_scene(problem, session.folder))
 
         return option._replace(fit=fit)
 
 
-def _held(problem: Problem, split: Split) -> set[str]:
-    return {problem.record.receivers[number].name for number in split.held_receivers}
+def _wanted_options(problem: Problem) -> CorrectionOptions | None:
+    """Options of a correction by the stages that a problem's settings want; None: neither of its stages."""
+    wanted, how = {*problem.settings.wanted}, default_options(problem.record)
+    if CORRECTED in wanted:
+        return how
+    parts = tuple(part for part in how.parts if part not in OF_GEOMETRY)
+    return replace(how, parts=parts) if CALIBRATION in wanted else None
+
+
+def with_near(state: State, split: Split, near: IntArray) -> Split:
+    """The split of a fold with rows ``near`` to those that train among these, where a training can choose by them."""
+    if state.fold is None or not of_rows(state.problem.record, state.fold):
+        return split
+    return replace(split, train=np.union1d(split.train, near), test=np.setdiff1d(split.test, near))
 
 
 def scene_reports(options: Sequence[OptionReport], higher_is_better: bool) -> list[StageReport]:

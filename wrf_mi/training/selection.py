@@ -253,7 +253,7 @@ def _without_receivers(record: Record, split: Split) -> Split | None:
     trained = np.setdiff1d(np.arange(len(record.receivers)), split.held_receivers)
     if len(trained) < 2:
         return None
-    # The half that judges a correction (`wrf_mi.correction.correct`): offsets differ, and few say little of others.
+    # Half of them, which judge corrections of a scene, too: offsets differ, and few say little of others.
     group = np.random.default_rng([split.seed, 9]).permutation(trained)[: len(trained) // 2].tolist()
     # As many rows are left to each as the split leaves to its own held-out receivers.
     each = len(split.left) // len(split.held_receivers)
