@@ -86,7 +86,7 @@ def predicted_rows(fitted: Fitted, record: Record, rows: IntArray, receiver: int
     return fitted.predict_rows(rows, receiver) or fitted.predict(inputs_of(record, rows), receiver)
 
 
-def as_unseen(mean: NDArray[Any], problem: Problem, held_out: HeldOut) -> NDArray[Any]:
+def with_error_ratio(mean: NDArray[Any], problem: Problem, held_out: HeldOut) -> NDArray[Any]:
     """Predictions [q, ...] whose errors are as large as if the scene did not know the held-out rows."""
     record, data = problem.record, read_correction_data(problem.scene)
     if data is None:
@@ -130,7 +130,7 @@ def stored_held_out(path: Path, problem: Problem, held_out: HeldOut) -> HeldOutP
     arrays = stored_arrays(path)
     every = under(EVERY, arrays)
     pairs = Prediction(every["mean"], every.get("std")) if every else None
-    return HeldOutPrediction(as_unseen(arrays["mean"], problem, held_out), arrays.get("std"), every=pairs)
+    return HeldOutPrediction(with_error_ratio(arrays["mean"], problem, held_out), arrays.get("std"), every=pairs)
 
 
 def _of_pairs(fitted: Fitted, record: Record, numbers: IntArray, receiver: IntArray, row: IntArray) -> Arrays:

@@ -22,7 +22,7 @@ from ..models.reception import Reception
 from ..tasks import task_of
 from ..training.by_distance import LEAST, Intervals, Mixture, expected_size
 from ..training.selection import RowDistance, rows_at_receiver
-from .side import SceneSide, by_stage
+from .side import FittedInScene, by_stage
 
 LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
 LeftOver = Mapping[int, tuple[IntArray, NDArray[Any]]]
@@ -346,7 +346,7 @@ class FittedMixture(Fitted):
             self.parts.get(PATHS),
             [report["stage"] for report in self.stated.get("stages", []) if report["kept"]],
         )
-        return by_stage(self.problem, split, side, used) if isinstance(side, SceneSide) and used else {}
+        return by_stage(self.problem, split, side, used) if isinstance(side, FittedInScene) and used else {}
 
     def facts(self) -> dict[str, Any]:
         """Entries of ``metrics.json``, and those of the reception."""

@@ -34,7 +34,7 @@ from .further import FURTHER_STAGES, first_of, fit_further, load_further
 from .mixture import MixtureFit, Part
 from .paths import TracedPaths
 from .scene import FAST, FIELD, MEAN, RESIDUAL, STAGES, SURFACES, StageReport, inside, stated_reports
-from .side import SceneSide
+from .side import FittedInScene
 from .strengths import TracedStrengths
 
 logger = logging.getLogger(__name__)
@@ -155,7 +155,7 @@ def _fitted(problem: Problem, split: Split, session: Session) -> FittedMixture:
     for name in parts:
         fit.predict_held_out(name)
         side = fit.fitted.get(name)
-        if isinstance(side, SceneSide):
+        if isinstance(side, FittedInScene):
             reports += side.stages
             begun = time.perf_counter()  # of the stage residual
             if side.with_residuals is not None and fit.rows is not None:

@@ -43,7 +43,7 @@ from .scene import (
     scene_reports,
     too_few,
 )
-from .side import SceneSide
+from .side import FittedInScene
 from .stage import Option, Stage, State
 
 AS_TRACED, CALIBRATED, TRAINED = "as traced", "calibrated", "trained"
@@ -72,7 +72,7 @@ def config_of(problem: Problem, split: Split, few: bool) -> TrainConfig:
     return with_settings(config, of_hybrid).resolved(problem.record.tx_pos_m[split.all_train])
 
 
-class FittedPaths(SceneSide):
+class FittedPaths(FittedInScene):
     """The scene's side: a graph of paths, Gaussians on surfaces and those of a field.
 
     ``reports`` are those of the held-out rows by a fit to the others, None of a fit to all rows.

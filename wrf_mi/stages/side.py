@@ -24,7 +24,7 @@ from .scene import CALIBRATION, CORRECTED, FIELD, MEAN, STAGES, SURFACES, StageR
 OFFSET_ROWS = 400  # most training rows whose traces tell the offset of a receiver
 
 
-class SceneSide(Fitted):
+class FittedInScene(Fitted):
     """A part of the hybrid that predicts from the scene, by a model fitted in it.
 
     ``problem`` is the hybrid's with that scene, ``stages`` are reports of those that were tried, none after loading;
@@ -54,13 +54,13 @@ class SceneSide(Fitted):
         """As of the fitted model."""
         return self.fitted.error_prior(receiver)
 
-    def tracing_once(self) -> SceneSide:
+    def tracing_once(self) -> FittedInScene:
         """As of the fitted model."""
         shared = copy(self)
         shared.fitted = self.fitted.tracing_once()
         return shared
 
-    def in_scene(self, scene: str) -> SceneSide:
+    def in_scene(self, scene: str) -> FittedInScene:
         """The fitted model in an edited copy of the scene that it was fitted in."""
         return type(self)(self.fitted.in_scene(scene), replace(self.problem, scene=scene, material=None))
 
@@ -69,7 +69,7 @@ class SceneSide(Fitted):
         return self.fitted.arrays()
 
 
-def by_stage(problem: Problem, split: Split, side: SceneSide, used: Collection[str]) -> dict[str, PredictAll]:
+def by_stage(problem: Problem, split: Split, side: FittedInScene, used: Collection[str]) -> dict[str, PredictAll]:
     """Predictions of the stages up to each but the last, of the ``used`` ones of a fitted scene's side.
 
     The problem has the scene as it is stated; training rows of the split fit offsets of traced signal strengths.

@@ -30,7 +30,7 @@ from .engine import Engine, OptionReport
 from .kriging import StrengthKriging
 from .residual import StrengthResidual
 from .scene import MEAN, SceneStage, StageReport, in_scene, scene_reports
-from .side import SceneSide
+from .side import FittedInScene
 from .stage import Option, Stage, State
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
@@ -40,7 +40,7 @@ ExactMean = Callable[[Sequence[Receiver]], TracedPower]
 """Power at positions themselves for some receivers of a problem; fits share what was traced."""
 
 
-class FittedStrengths(SceneSide):
+class FittedStrengths(FittedInScene):
     """The scene's side for strengths: kriging about traced power."""
 
     fitted: Strengths
