@@ -285,7 +285,7 @@ class FitPlan:
         number: number of the training that this plan is for.
         loop: its settings: steps, share of them in which validation rows are held out, and steps between two scores.
         schedule: rows and learning rates of its steps.
-        in_groups: whether the state is chosen on rows held out in groups, far from the training rows too.
+        chooses: whether the state is chosen on rows far from the training rows, too, which are held out in groups.
         choosing: split of these rows, or, where Gaussians alone train, of validation rows as far from training rows as
             test rows (`hold_out_far`); ``split`` itself where there are none.
         unjudged: whether the training rows do not suffice for such groups.
@@ -329,9 +329,9 @@ class FitPlan:
         shown = not config.patience and 0 < config.holdout_steps_fraction < 1
         if self.graph.scene is None and record.has_positions and shown:
             self.choosing = self._with_far_rows()
-        self.in_groups = wanted and (held_out or self.choosing is not split or self.graph.corrects)
+        self.chooses = wanted and (held_out or self.choosing is not split or self.graph.corrects)
         # Without rows to choose by, Gaussians are not used at all (`Trainer`): paths alone are the safe answer.
-        self.unjudged = self.in_groups and self.choosing is split and not held_out
+        self.unjudged = self.chooses and self.choosing is split and not held_out
         self._take(0)
         # Sides are traced for all training rows at once, validation rows included, and addressed by these slots.
         self.known = [self.targets.at(port, rows) for port in range(self.targets.ports)]
@@ -360,7 +360,7 @@ class FitPlan:
     @property
     def chooses_beside_paths(self) -> bool:
         """Whether the state is chosen by groups of rows that are held out, beside the paths of a scene."""
-        return self.in_groups and self.graph.scene is not None
+        return self.chooses and self.graph.scene is not None
 
     def traced(self) -> list[TracedField | None]:
         """Traced side of the training rows at each port, None without a scene (InputError: positions in a solid)."""
@@ -414,7 +414,7 @@ class FitPlan:
             raise InputError(f"setting traced.alone: {text}, by whose rows Gaussians are chosen; choose less")
         if self.number == last:
             steps, held_out = max(config.steps - begin, 1), max(round(holdout * config.steps) - begin, 0)
-        elif self.in_groups:  # validation rows join a training that is chosen, for as large a share of its steps
+        elif self.chooses:  # validation rows join a training that is chosen, for as large a share of its steps
             held_out = max(end - begin, 1)
             steps = round(held_out / holdout)
         else:

@@ -182,11 +182,10 @@ class Trainer(TrainingLoop):
         return self.validation.facts(bool(self.state.chosen))
 
     def choose(self, score: float) -> bool:
-        """Early stopping (`TrainingLoop`), by the mean score where rows are held out in groups."""
-        if self.plan.in_groups and len(scores := self.validation.scores):
-            score = float(np.nanmean(scores))  # a mean has less variance than a median
-            if (score if self.higher_is_better else -score) > self.state.best_score:
-                self.state.best_scores = scores
+        """Early stopping (`TrainingLoop`)."""
+        score = self.validation.choosing_score(score)
+        if (score if self.higher_is_better else -score) > self.state.best_score:
+            self.state.best_scores = self.validation.scores
         if not super().choose(score):
             return False
         if self.state.reach_m == 0 and self.graph.scene is None:
@@ -247,7 +246,7 @@ def fit_curriculum(
     trainers = list[Trainer]()
     for number in range(len(plan.curriculum)):
         trainer = trainer_of(plan.part(number) if number else plan, trainers[-1] if trainers else None)
-        trainer.until_chosen = plan.in_groups and len(plan.curriculum) > 1
+        trainer.until_chosen = plan.chooses and len(plan.curriculum) > 1
         run(trainer)
         trainers.append(trainer)
     chosen = trainers[-1]

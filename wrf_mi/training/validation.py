@@ -73,6 +73,12 @@ class Validation:
         self.scores = np.concatenate([np.zeros(0), *each])
         return float(np.nanmedian(self.scores)) if len(self.scores) else float("nan")
 
+    def choosing_score(self, score: float) -> float:
+        """The score by which a state is chosen, given that of the last validation."""
+        if not self.plan.chooses or not len(self.scores):
+            return score
+        return float(np.nanmean(self.scores))  # rows far from training rows count, and a mean has less variance
+
     def _split(self, chosen: bool | int) -> Split:
         """Split whose validation rows are scored before or after a state is ``chosen``."""
         return self.plan.split if chosen else self.plan.choosing
@@ -125,7 +131,7 @@ class Validation:
         reach = reach.of_ports(plan.graph.carriers)
         positions_m = [plan.record.tx_pos_m[port_rows] for port_rows in rows]
         lengths = [reach.length_m]
-        if plan.in_groups and not state.chosen:
+        if plan.chooses and not state.chosen:
             lengths = reach.lengths(positions_m) if plan.trains == FIELD and state.step else [0.0]
         # The state keeps the reach with which it is scored, so that the best state has the best reach.
         state.reach_m, scores = choose_reach(
