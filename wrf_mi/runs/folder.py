@@ -43,7 +43,6 @@ from ..datasets.observations import count_not_finite
 from ..models import Model, known_model
 from ..models.few_rows import with_few_rows
 from ..models.model import Arrays
-from ..stages.mixture import WithIntervals
 from ..tasks import TASKS
 from ..training.fit_plan import check_rows
 from ..version import __version__
@@ -105,7 +104,11 @@ class RunConfig:
     def entry(self) -> Model:
         """Registry entry of the model; `InputError`: no model of that name."""
         entry = with_few_rows(known_model(self.model).serving(self.task, self.scene is not None), self.task)
-        return WithIntervals(entry) if self.intervals else entry
+        if not self.intervals:
+            return entry
+        from ..stages.mixture import WithIntervals  # stages bring corrections of scenes, which take long to import
+
+        return WithIntervals(entry)
 
 
 def package_versions() -> dict[str, str]:
