@@ -27,7 +27,7 @@ from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import Materials
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.stages import strengths as of_strengths
-from wrf_mi.stages.fitted import FittedHybrid
+from wrf_mi.stages.fitted import FittedMixture
 from wrf_mi.tracing import TraceOptions, power_map
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi.training.session import Interrupted, quiet
@@ -180,13 +180,13 @@ def test_progress_begins_before_anything_is_traced(anew: Run, traced: list, monk
 def test_duration_is_stated_before_candidates_are_predicted(anew: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """A clock that runs by a predicted position's share, and by a start of each prediction."""
     start_s, each_s, now = 5.0, 0.25, [0.0]
-    predict = FittedHybrid.predict
+    predict = FittedMixture.predict
 
-    def timed(fitted: FittedHybrid, inputs: Inputs, receiver: int) -> Prediction:
+    def timed(fitted: FittedMixture, inputs: Inputs, receiver: int) -> Prediction:
         now[0] += start_s + each_s * len(inputs.tx_pos_m)
         return predict(fitted, inputs, receiver)
 
-    monkeypatch.setattr(FittedHybrid, "predict", timed)
+    monkeypatch.setattr(FittedMixture, "predict", timed)
     monkeypatch.setattr(locate_calibration.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(locate_calibration, "TOGETHER", 32)
     reports: list[tuple[str, float, float]] = []

@@ -28,7 +28,7 @@ from wrf_mi.maps.dataset import write_map
 from wrf_mi.models import Inputs
 from wrf_mi.runs.api import train
 from wrf_mi.runs.run import Run
-from wrf_mi.stages.hybrid import FittedHybrid
+from wrf_mi.stages.fitted import FittedMixture
 from wrf_mi.training.by_distance import Mixture
 from wrf_mi.training.selection import RowDistance
 
@@ -227,7 +227,7 @@ def test_sides_of_a_hybrid_add_up_by_their_weights(room: tuple[Path, Record], tm
     law = wrf_mi.train(record, "mri", out=tmp_path / "law")
     mixture = Mixture(np.array([0.0, 1.0]), np.array([[1.0, 0.0], [0.2, 0.8]]))
     fitted = {"paths": traced.fitted, "kriging": law.fitted}
-    hybrid = FittedHybrid(traced.problem, np.arange(22), fitted, mixture, None, None, {"sizes": "predicted"})
+    hybrid = FittedMixture("hybrid", traced.problem, np.arange(22), fitted, mixture, None, None, (), {})
     positions = np.concatenate([record.tx_pos_m[:2], record.tx_pos_m[:2] + np.array([0.0, 0.0, 0.7])])
     parts = hybrid.decompose(Inputs(positions), 0)
     np.testing.assert_array_equal(parts.prediction.mean, hybrid.predict(Inputs(positions), 0).mean)

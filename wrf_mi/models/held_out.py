@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,35 @@ from ..core.types import IntArray
 from ..datasets.observations import fitted_receivers
 from ..scene.correction_data import read_correction_data
 from ..tasks import task_of
-from ..training.selection import HeldOut
+from ..training.selection import HeldOut, hold_out
 from .model import Arrays, Fitted, HeldOutPrediction, Model, Problem, Session, inputs_of
 from .receiver_places import placed_problem
 
 EVERY = "every/"  # prefix of the arrays of `HeldOut.every`
+
+
+class HoldOut(NamedTuple):
+    """Rows that are held out of the training rows of a split."""
+
+    split: Split  # the split
+    observation: NDArray[Any]  # observations of its record, by which the hold-out is known again
+    seed: int  # seed by which many observations are thinned
+    fold: Split  # the other training rows, and as test rows those held out
+    held_out: HeldOut
+
+
+def hold_out_once(problem: Problem, split: Split) -> HoldOut | None:
+    """`wrf_mi.training.selection.hold_out` of a split, computed once for all that choose by its rows; None: no rows."""
+    record, known = problem.record, cast(list[HoldOut], problem.hold_outs)
+    for each in known:
+        if each.split is split and each.observation is record.observation and each.seed == problem.seed:
+            return each
+    fold = hold_out(record, split)
+    held_out = None if fold is None else HeldOut.of(record, fold, problem.seed)
+    if fold is None or not held_out:
+        return None
+    known.append(HoldOut(split, record.observation, problem.seed, fold, held_out))
+    return known[-1]
 
 
 def labelled(session: Session, label: str) -> Session:

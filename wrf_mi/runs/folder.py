@@ -41,7 +41,6 @@ from ..datasets import load_split, save_split
 from ..datasets.folder_files import shown
 from ..datasets.observations import count_not_finite
 from ..models import Model, known_model
-from ..models.calibrated import WithIntervals
 from ..models.few_rows import with_few_rows
 from ..models.model import Arrays
 from ..tasks import TASKS
@@ -105,7 +104,11 @@ class RunConfig:
     def entry(self) -> Model:
         """Registry entry of the model; `InputError`: no model of that name."""
         entry = with_few_rows(known_model(self.model).serving(self.task, self.scene is not None), self.task)
-        return WithIntervals(entry) if self.intervals else entry
+        if not self.intervals:
+            return entry
+        from ..stages.mixture import WithIntervals  # stages bring corrections of scenes, which take long to import
+
+        return WithIntervals(entry)
 
 
 def package_versions() -> dict[str, str]:

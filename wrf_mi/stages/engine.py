@@ -21,11 +21,11 @@ import numpy as np
 from ..core import InputError, Split
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.types import FloatArray, IntArray
-from ..models.held_out import arrays_of_held_out, fold_of, stored_held_out
+from ..models.held_out import arrays_of_held_out, fold_of, hold_out_once, stored_held_out
 from ..models.model import HeldOutPrediction, Model, Problem, Session
 from ..tasks import task_of
 from ..training.by_distance import unit_means
-from ..training.selection import HeldOut, hold_out, improves, last_gain
+from ..training.selection import HeldOut, improves, last_gain
 from .stage import Option, Stage, State
 
 FOLDER, CHOSEN = "options", "chosen"  # folder of the predictions, and name of those of the chosen chain
@@ -81,12 +81,11 @@ class Engine:
 
     @cached_property
     def _fold(self) -> Fold | None:
-        record, fold = self._problem.record, hold_out(self._problem.record, self._split)
-        if fold is None:
+        rows = hold_out_once(self._problem, self._split)
+        if rows is None:
             return None
-        held_out = HeldOut.of(record, fold, self._problem.seed)
         # Places of receivers that nobody surveyed are estimated once, for all options.
-        return Fold(held_out, *fold_of(self._entry, self._problem, fold, self._session)) if len(held_out) else None
+        return Fold(rows.held_out, *fold_of(self._entry, self._problem, rows.fold, self._session))
 
     def fit(self) -> State:
         """The chosen options fitted to all rows."""

@@ -1,11 +1,11 @@
-"""A fitted hybrid: weighted predictions of its parts and kriging of what the scene's side leaves."""
+"""A fitted mixture of models: weighted predictions of its parts and kriging of what the scene's side leaves."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +15,13 @@ from ..core.angles import FloatArray
 from ..core.array_files import keyed, under
 from ..core.types import IntArray
 from ..models.error_prior import ErrorPrior
-from ..models.held_out import predicted_rows
+from ..models.held_out import HoldOut, predicted_rows
 from ..models.interpolation.kriging import Kriged, Kriging
-from ..models.model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays
+from ..models.model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, from_field_arrays
 from ..models.reception import Reception
 from ..tasks import task_of
 from ..training.by_distance import LEAST, Intervals, Mixture, expected_size
-from ..training.selection import HeldOut, RowDistance, rows_at_receiver
+from ..training.selection import RowDistance, rows_at_receiver
 from .side import SceneSide, by_stage
 
 LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
@@ -88,29 +88,56 @@ UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
 """Models of a downlink, the first of which is the mean that others have to improve on."""
 TRACED = (PATHS, "r2f2-scene")  # parts that are given the scene
 NEGLIGIBLE = 1e-3  # weight below which a part is not evaluated: its share of the prediction
+DEVIATIONS = "deviations"  # array of the names of the parts whose standard deviations count
 STATED, PREDICTED = "stated", "predicted"
-"""Sizes of expected errors: standard deviations that all parts state, or magnitudes (`expected_size`)."""
+"""Sizes of expected errors: standard deviations that parts state, or magnitudes (`expected_size`)."""
+
+
+def mixed(weights: FloatArray, predictions: Sequence[Prediction], states: NDArray[np.bool_]) -> Prediction:
+    """Weighted mean of predictions [q, ...], and `deviation_weights` of the deviations that some of them state.
+
+    Args:
+        weights: weights [q, k] of sum 1.
+        predictions: the k predictions.
+        states: which of them have standard deviations that count [k].
+    """
+    mean = np.einsum("qk,kq...->q...", weights, np.stack([each.mean for each in predictions]))
+    if not states.any():
+        return Prediction(mean)
+    stds = [each.stated_std for each, counts in zip(predictions, states, strict=True) if counts]
+    return Prediction(mean, np.einsum("qk,kq...->q...", deviation_weights(weights, states)[:, states], np.stack(stds)))
+
+
+def deviation_weights(weights: FloatArray, states: NDArray[np.bool_]) -> FloatArray:
+    """Weights [q, k] of standard deviations that some predictions state [k]: those of the predictions, of sum 1 again.
+
+    Where none of these has a weight, all that state deviations count alike.
+    """
+    of_stated = np.where(states, weights, 0.0)
+    total = of_stated.sum(axis=1, keepdims=True)
+    return np.where(total > 0, of_stated / np.where(total > 0, total, 1.0), states / max(states.sum(), 1))
 
 
 @dataclass(eq=False)
-class FittedHybrid(Fitted):
-    """A fitted hybrid."""
+class FittedMixture(Fitted):
+    """A weighted mean of fitted models with prediction intervals, or a single one with these."""
 
-    problem: Problem  # problem of the hybrid
+    name: str  # name of the model; a part of that name is the model itself, to which intervals alone are added
+    problem: Problem  # problem of the fit
     known: IntArray  # training rows that determine distances [n]
     parts: dict[str, Fitted]  # fitted parts with a weight, by name
     mixture: Mixture  # weights of these parts, and, if there are residuals, of the scene's side with them as the last
     residuals: Residuals | None  # what the scene's side leaves; None: it has no weight
     intervals: Intervals | None  # standard deviations; None: none are stated
+    deviations: tuple[str, ...]  # parts whose deviations are the sizes of expected errors; none: `expected_size`
     stated: dict[str, Any]  # further entries of ``metrics.json``
     reception: Reception | None = None  # probability of reception; None: not fitted
 
     def __post_init__(self) -> None:
         self._distance = RowDistance.of_rows(self.problem.record, self.known)
-
-    @property
-    def _states_sizes(self) -> bool:
-        return bool(self.stated["sizes"] == STATED)
+        model = self.parts.get(self.name)
+        if model is not None:
+            self.receivers, self.uses_heading, self.carriers_hz = model.receivers, model.uses_heading, model.carriers_hz
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Weighted mean of the parts' predictions, [m, ...], with its standard deviation."""
@@ -126,24 +153,26 @@ class FittedHybrid(Fitted):
         return self._mixed(
             record.tx_pos_m[rows],
             receiver,
-            lambda part, places: Decomposition(predicted_rows(part, record, rows[places], receiver)),
+            lambda part, places, _: Decomposition(predicted_rows(part, record, rows[places], receiver)),
         ).prediction
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
-        """The prediction, its traced and learned components, NaN where they have no weight, and the traced paths."""
+        """The prediction, its traced and learned components, NaN where they have no weight, and the traced paths.
+
+        Those of a single part are its own.
+        """
         return self._of_inputs(inputs, receiver, lambda part, *of_part: part.decompose(*of_part), std)
 
     def in_scene(self, scene: str) -> Fitted:
-        """The paths' part in an edited scene; residuals and weights stay."""
-        if PATHS not in self.parts:
-            return super().in_scene(scene)
-        return replace(self, parts=self.parts | {PATHS: self.parts[PATHS].in_scene(scene)})
+        """The part that predicts from the scene in an edited one; residuals and weights stay."""
+        name = PATHS if PATHS in self.parts else next(iter(self.parts))
+        return replace(self, parts=self.parts | {name: self.parts[name].in_scene(scene)})
 
-    def tracing_once(self) -> FittedHybrid:
-        """The hybrid of parts that trace once."""
+    def tracing_once(self) -> FittedMixture:
+        """The mixture of parts that trace once."""
         return replace(self, parts={name: part.tracing_once() for name, part in self.parts.items()})
 
-    def refit(self, record: Record, rows: IntArray) -> FittedHybrid | None:
+    def refit(self, record: Record, rows: IntArray) -> FittedMixture | None:
         """The parts given some rows, see `Fitted`, mixed at the distances to these; None if a part has to be fitted."""
         refits = {name: part.refit(record, rows) for name, part in self.parts.items()}
         parts = {name: part for name, part in refits.items() if part is not None}
@@ -159,47 +188,76 @@ class FittedHybrid(Fitted):
     def _of_inputs(
         self, inputs: Inputs, receiver: int, decompose: Callable[..., Decomposition], std: bool = True
     ) -> Decomposition:
-        """Mixed results of ``decompose(part, inputs, receiver, std)``; that of `Fitted` computes no sides."""
+        """Mixed results of ``decompose(part, inputs, receiver, std)``; that of `Fitted` computes no components."""
         needed = [name for name in self.parts if name.partition("-")[0] in UPLINK_PARTS]
         if needed and inputs.uplink is None:
-            raise InputError(f"hybrid: {needed[0]} has a weight and predicts from the uplink; give the uplink, too")
-        of_parts = std and self._states_sizes
+            raise InputError(
+                f"{self.name}: {needed[0]} has a weight and predicts from the uplink; give the uplink, too"
+            )
         return self._mixed(
-            inputs.tx_pos_m, receiver, lambda part, rows: decompose(part, inputs.rows(rows), receiver, of_parts), std
+            inputs.tx_pos_m,
+            receiver,
+            lambda part, rows, of_part: decompose(part, inputs.rows(rows), receiver, of_part),
+            std,
         )
 
     def _mixed(
         self,
         tx_pos_m: FloatArray,
         receiver: int,
-        predict: Callable[[Fitted, IntArray], Decomposition],
+        predict: Callable[[Fitted, IntArray, bool], Decomposition],
         std: bool = True,
     ) -> Decomposition:
-        """Weighted mean of the parts' ``predict(part, rows)`` and of the residuals, and both sides of it."""
+        """Weighted mean of the parts' ``predict(part, rows, std)``, with intervals and reception."""
         if not np.isfinite(tx_pos_m).all():
-            raise InputError("hybrid: predicts from positions; give finite x, y, z in metres for every row")
-        distance_m, observed = self._distance(tx_pos_m, receiver), self.problem.record.observation
+            raise InputError(f"{self.name}: predicts from positions; give finite x, y, z in metres for every row")
+        distance_m = self._distance(tx_pos_m, receiver)
+        if len(self.parts) == 1 and self.residuals is None:
+            ((name, part),) = self.parts.items()
+            result = predict(part, np.arange(len(tx_pos_m)), std and name in self.deviations)
+        else:
+            result = self._weighted(tx_pos_m, distance_m, receiver, predict, std)
+        prediction = Prediction(result.prediction.mean)
+        if std:
+            prediction = self.with_intervals(result.prediction, distance_m)
+            if self.reception is not None:
+                prediction = self.reception(prediction, tx_pos_m, receiver)
+        return replace(result, prediction=prediction)
+
+    def _weighted(
+        self,
+        tx_pos_m: FloatArray,
+        distance_m: FloatArray,
+        receiver: int,
+        predict: Callable[[Fitted, IntArray, bool], Decomposition],
+        std: bool,
+    ) -> Decomposition:
+        """Weighted mean of the parts and the residuals, of the deviations that parts state, and both sides of it."""
+        observed, count = self.problem.record.observation, len(tx_pos_m)
         shape, kind = observed.shape[2:], np.result_type(observed, np.float64)
-        weights = self._weights(distance_m)
-        residual_weight = weights[:, len(self.parts)] if self.residuals is not None else np.zeros(len(tx_pos_m))
-        sides, totals = np.zeros((2, len(tx_pos_m), *shape), kind), np.zeros((2, len(tx_pos_m)))
-        paths, (size, size_of_mean) = None, np.zeros((2, len(tx_pos_m), *shape))
-        for (name, part), weight in zip(self.parts.items(), weights.T, strict=False):
+        weights = self.weights(distance_m)
+        residual_weight = weights[:, len(self.parts)] if self.residuals is not None else np.zeros(count)
+        of_parts = weights[:, : len(self.parts)]
+        # A part may state the deviations of a mixture in which it has no weight.
+        of_std = deviation_weights(of_parts, self._states) * std
+        sides, totals = np.zeros((2, count, *shape), kind), np.zeros((2, count))
+        paths, (size, size_of_mean) = None, np.zeros((2, count, *shape))
+        for (name, part), weight, std_weight in zip(self.parts.items(), of_parts.T, of_std.T, strict=True):
             # Residuals are about the scene's side, which is therefore a part of what they predict.
             share = weight + residual_weight if name == PATHS else weight
-            rows = np.flatnonzero(share)
+            rows = np.flatnonzero(share + std_weight)
             if not len(rows):
                 continue
-            by_part = predict(part, rows)
+            by_part = predict(part, rows, bool(std_weight.any()))
             side = int(name in TRACED)
             sides[side, rows] += _spread(share[rows], shape) * by_part.prediction.mean
             totals[side, rows] += share[rows]
-            if by_part.prediction.std is not None:
-                size[rows] += _spread(share[rows], shape) * by_part.prediction.std
-            # NaN of a part that does not state it.
-            of_mean = by_part.prediction.std_mean
-            size_of_mean[rows] += _spread(share[rows], shape) * (np.nan if of_mean is None else of_mean)
-            paths = paths or (by_part.paths and by_part.paths.placed(rows, len(tx_pos_m)))
+            if std_weight.any():
+                size[rows] += _spread(std_weight[rows], shape) * by_part.prediction.stated_std
+                # NaN of a part that does not state it.
+                of_mean = by_part.prediction.std_mean
+                size_of_mean[rows] += _spread(std_weight[rows], shape) * (np.nan if of_mean is None else of_mean)
+            paths = paths or (by_part.paths and by_part.paths.placed(rows, count))
         mean = sides.sum(axis=0)
         rows = np.flatnonzero(residual_weight)
         if len(rows) and self.residuals is not None:
@@ -207,48 +265,42 @@ class FittedHybrid(Fitted):
             mean[rows] += _spread(residual_weight[rows], shape) * residual
         if task_of(self.problem.record).image:
             mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
-        prediction = self._with_intervals(mean, size, distance_m, size_of_mean) if std else Prediction(mean)
-        if std and self.reception is not None:
-            prediction = self.reception(prediction, tx_pos_m, receiver)
+        prediction = Prediction(mean)
+        if std and self.deviations:
+            prediction = Prediction(mean, size, std_mean=size_of_mean if np.isfinite(size_of_mean).all() else None)
         if not totals.any(axis=1).all():
             return Decomposition(prediction, paths=paths)
         with np.errstate(divide="ignore", invalid="ignore"):
             learned, traced = (values / _spread(total, shape) for values, total in zip(sides, totals, strict=True))
         return Decomposition(prediction, traced, learned, paths)
 
-    def _weights(self, distance_m: FloatArray) -> FloatArray:
+    @property
+    def _states(self) -> NDArray[np.bool_]:
+        return np.array([name in self.deviations for name in self.parts])
+
+    def weights(self, distance_m: FloatArray) -> FloatArray:
         """Weights of the parts and, as the last, of the residuals, [m, k]; 0 where a part is not worth its time."""
         weights = self.mixture(distance_m)
         weights = np.where(weights < NEGLIGIBLE, 0, weights)
         return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
-    def _with_intervals(
-        self, mean: NDArray[Any], size: FloatArray, distance_m: FloatArray, size_of_mean: FloatArray | None = None
-    ) -> Prediction:
-        """Means [m, ...] with calibrated standard deviations, from the mixed ones that the parts state, if they do.
-
-        Those of the mean are left out where a part does not state them.
-        """
+    def with_intervals(self, prediction: Prediction, distance_m: FloatArray) -> Prediction:
+        """Mixed predictions [m, ...] with calibrated standard deviations, from those that their parts state, if any."""
+        mean = prediction.mean
         if self.intervals is None:
             return Prediction(mean)
-        if self._states_sizes:
+        if self.deviations:
             factor = self.intervals(mean, np.ones(mean.shape), distance_m).stated_std
-            known = size_of_mean is not None and np.isfinite(size_of_mean).all()
-            of_mean = size_of_mean * factor if size_of_mean is not None and known else None
-            return Prediction(mean, np.maximum(size * factor, LEAST), std_mean=of_mean)
+            of_mean = None if prediction.std_mean is None else prediction.std_mean * factor
+            return Prediction(mean, np.maximum(prediction.stated_std * factor, LEAST), std_mean=of_mean)
         return self.intervals(mean, expected_size(task_of(self.problem.record), Prediction(mean)), distance_m)
 
-    def fit_reception(self, fold: Split, held_out: HeldOut, every: Mapping[str, Prediction]) -> None:
-        """Fit the probability of reception by predictions of `HeldOut.every` of the parts of a fold, by name."""
-        record, (receiver, row) = self.problem.record, held_out.every.T
-        distance_m = RowDistance.of_rows(record, fold.all_train).of_pairs(record, receiver, row)
-        weights, parts = self._weights(distance_m), [every[name] for name in self.parts]
-        mean = np.einsum("qk,kq->q", weights, [part.mean for part in parts])
-        size = np.zeros(len(mean))
-        if self._states_sizes:
-            size = np.einsum("qk,kq->q", weights, [part.stated_std for part in parts])
-        stated = self._with_intervals(mean, size, distance_m)
-        self.reception = Reception.fit(record, self.known, fold.all_train, held_out, stated)
+    def fit_reception(self, rows: HoldOut, every: Sequence[Prediction]) -> None:
+        """Fit the probability of reception by the parts' predictions of `HeldOut.every`, fitted without these rows."""
+        record, pairs = self.problem.record, rows.held_out.every.T
+        distance_m = RowDistance.of_rows(record, rows.fold.all_train).of_pairs(record, *pairs)
+        stated = self.with_intervals(mixed(self.weights(distance_m), every, self._states), distance_m)
+        self.reception = Reception.fit(record, self.known, rows.fold.all_train, rows.held_out, stated)
 
     def error_prior(self, receiver: int) -> ErrorPrior | None:
         """That of what the scene's side leaves, or else of the first part that states one."""
@@ -261,7 +313,7 @@ class FittedHybrid(Fitted):
     def arrays(self) -> Arrays:
         """Weights, residuals, intervals, training rows, and the arrays of the parts."""
         arrays: Arrays = {"known": self.known, "names": np.asarray(list(self.parts))}
-        arrays["facts"] = np.asarray(json.dumps(self.stated))
+        arrays |= {"facts": np.asarray(json.dumps(self.stated)), DEVIATIONS: np.asarray(self.deviations, str)}
         arrays |= field_arrays(self.mixture, "mixture/")
         if self.intervals is not None:
             arrays |= field_arrays(self.intervals, "intervals/")
@@ -273,13 +325,30 @@ class FittedHybrid(Fitted):
             arrays |= keyed(f"{name}/", fitted.arrays())
         return arrays
 
+    @classmethod
+    def from_arrays(cls, name: str, arrays: Arrays, problem: Problem, load: Callable[[str, Arrays], Fitted]) -> Self:
+        """The mixture that `arrays` described; ``load(part, arrays)`` loads a part."""
+        parts = {part: load(part, under(f"{part}/", arrays)) for part in map(str, arrays["names"])}
+        mixture, stated = from_field_arrays(Mixture, under("mixture/", arrays)), json.loads(str(arrays["facts"]))
+        stored, left = under("intervals/", arrays), under("residuals/", arrays)
+        residuals = Residuals.from_arrays(left, problem.record) if left else None
+        intervals = from_field_arrays(Intervals, stored) if stored else None
+        # Before deviations of some parts could count, those of all or of none did.
+        deviations = arrays.get(DEVIATIONS, arrays["names"] if stated["sizes"] == STATED else np.zeros(0, str))
+        reception = Reception.from_arrays(arrays, problem.record)
+        of_errors = residuals, intervals, tuple(map(str, deviations))
+        return cls(name, problem, arrays["known"], parts, mixture, *of_errors, stated, reception)
+
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions of the stages up to each but the last."""
-        side, used = self.parts.get(PATHS), [report["stage"] for report in self.stated["stages"] if report["kept"]]
+        side, used = (
+            self.parts.get(PATHS),
+            [report["stage"] for report in self.stated.get("stages", []) if report["kept"]],
+        )
         return by_stage(self.problem, split, side, used) if isinstance(side, SceneSide) and used else {}
 
     def facts(self) -> dict[str, Any]:
-        """Stages with their held-out scores, form and weights of the mixture, and held-out scores of its parts."""
+        """Entries of ``metrics.json``, and those of the reception."""
         return self.stated | ({} if self.reception is None else self.reception.facts(self.problem.record))
 
 

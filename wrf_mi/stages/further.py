@@ -19,7 +19,7 @@ from ..core.registry import Registry
 from ..models.error_prior import ErrorPrior
 from ..models.model import Arrays, Fitted, Model, PredictAll, Problem, Session
 from .engine import Engine
-from .fitted import FittedHybrid
+from .fitted import FittedMixture
 from .scene import StageReport, stated_reports
 from .side import at_all_receivers
 from .stage import Option, Stage, State
@@ -82,11 +82,11 @@ class Further(Fitted):
         return self.before.facts()
 
 
-def first_of(fitted: Fitted) -> FittedHybrid:
+def first_of(fitted: Fitted) -> FittedMixture:
     """The prediction that all further stages go on from."""
     while isinstance(fitted, Further):
         fitted = fitted.before
-    assert isinstance(fitted, FittedHybrid)
+    assert isinstance(fitted, FittedMixture)
     return fitted
 
 

@@ -18,11 +18,11 @@ from ..core.settings import with_settings
 from ..core.types import FloatArray, IntArray
 from ..models import model
 from ..models.gaussian.model import WRF_GS_PLUS, FittedField
+from ..models.held_out import hold_out_once
 from ..models.model import Arrays, Model, Problem, Session
 from ..tasks import task_of
 from ..training.config import TrainConfig, calibration_config, task_settings
 from ..training.loop import FitState
-from ..training.selection import hold_out
 from ..training.stage_selection import HeldOutReports
 from ..training.trainer import Trainer
 from .engine import LEAST_ROWS, Engine, Fold
@@ -120,8 +120,8 @@ class PathsStage(Stage):
         tried, and all further stages in the better one.
         """
         wanted = {*problem.settings.wanted}
-        fold = hold_out(problem.record, split)
-        judging = 0 if fold is None else np.count_nonzero(in_regions(split, fold.test))
+        rows = hold_out_once(problem, split)
+        judging = 0 if rows is None else np.count_nonzero(in_regions(split, rows.fold.test))
         if judging < LEAST_ROWS or too_few(problem.record, split):
             return [Option(TRAINED, self._unjudged)]
         options = [Option(AS_TRACED, self._as_traced)]

@@ -1,0 +1,142 @@
+"""Mixtures of parts that state deviations and parts that do not, single parts, one hold-out, and stored mixtures."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import wrf_mi
+from wrf_mi.core import InputError, Prediction, Record, Split
+from wrf_mi.core.array_files import stored_arrays, write_arrays
+from wrf_mi.datasets import make_splits
+from wrf_mi.models import MODELS, Problem, Session, held_out
+from wrf_mi.models.few_rows import with_few_rows
+from wrf_mi.models.model import Arrays, Decomposition, Fitted, Inputs, default_settings
+from wrf_mi.runs.folder import FITTED
+from wrf_mi.stages.fitted import DEVIATIONS, STATED, FittedMixture, deviation_weights
+from wrf_mi.stages.mixture import MixtureFit, Part
+from wrf_mi.training.by_distance import Intervals, Mixture, constant
+from wrf_mi.training.selection import RowDistance, hold_out
+
+FACTOR = 1.5  # of the made intervals
+
+
+class Level(Fitted):
+    """A strength everywhere, with or without a standard deviation, traced and learned in halves."""
+
+    def __init__(self, level_dbm: float, std_db: float | None = None) -> None:
+        self.level_dbm, self.std_db = level_dbm, std_db
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        mean = np.full(len(inputs), self.level_dbm)
+        if self.std_db is None:
+            return Prediction(mean)
+        return Prediction(mean, np.full(len(inputs), self.std_db), std_mean=np.full(len(inputs), self.std_db / 2))
+
+    def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
+        prediction = self.predict(inputs, receiver)
+        return Decomposition(prediction, prediction.mean - 3, prediction.mean - 3)
+
+    def arrays(self) -> Arrays:
+        return {}
+
+
+@pytest.fixture(scope="module")
+def flat(flat_folder: Path) -> tuple[Problem, Split]:
+    record = wrf_mi.load(flat_folder)
+    return Problem(record, None), make_splits(record, "official")[0]
+
+
+def mixture_of(
+    flat: tuple[Problem, Split], weights: Mixture, parts: dict[str, Fitted], *deviations: str
+) -> FittedMixture:
+    problem, split = flat
+    intervals = Intervals(np.ones(1), np.ones(1), np.zeros(1), np.full(1, FACTOR))
+    return FittedMixture("made", problem, split.all_train, parts, weights, None, intervals, deviations, {})
+
+
+def test_deviations_of_a_mixture_are_those_of_the_parts_that_state_them(flat: tuple[Problem, Split]) -> None:
+    """Near the rows of both parts, farther away of that without deviations alone."""
+    weights = Mixture(np.array([0.0, 0.1]), np.array([[0.5, 0.5], [0.0, 1.0]]))
+    mixture = mixture_of(flat, weights, {"stating": Level(-50, 4.0), "silent": Level(-60)}, "stating")
+    record = flat[0].record
+    at_m = np.concatenate([record.tx_pos_m[:1], record.tx_pos_m[:1] + np.array([0, 0, 5.0])])
+    prediction = mixture.predict(Inputs(at_m), 0)
+    np.testing.assert_allclose(prediction.mean, [-55, -60])
+    np.testing.assert_allclose(prediction.std, 4 * FACTOR)
+    np.testing.assert_allclose(prediction.std_mean, 2 * FACTOR)
+    np.testing.assert_allclose(mixture.predict_mean(Inputs(at_m), 0), prediction.mean)
+
+
+def test_deviation_weights_are_those_of_the_stating_predictions_and_equal_without_any() -> None:
+    weights = np.array([[0.2, 0.6, 0.2], [0.0, 1.0, 0.0]])
+    states = np.array([True, False, True])
+    np.testing.assert_allclose(deviation_weights(weights, states), [[0.5, 0, 0.5], [0.5, 0, 0.5]])
+    assert not deviation_weights(weights, ~states & states).any()
+
+
+def test_single_part_keeps_its_traced_and_learned_components(flat: tuple[Problem, Split]) -> None:
+    mixture = mixture_of(flat, constant(np.ones(1)), {"made": Level(-50, 4.0)}, "made")
+    parts = mixture.decompose(Inputs(flat[0].record.tx_pos_m[:2]), 0)
+    assert parts.traced is not None
+    assert parts.learned is not None
+    np.testing.assert_array_equal(parts.traced, -53)
+    np.testing.assert_allclose(parts.prediction.std, 4 * FACTOR)
+
+
+def fit_of(names: Sequence[str], flat: tuple[Problem, Split], folder: Path) -> MixtureFit:
+    problem, split = flat
+    entries = {name: with_few_rows(MODELS[name].serving("rssi", False), "rssi") for name in names}
+    parts = {
+        name: Part(entry, replace(problem, settings=default_settings(entry, (), {})), Session(folder / name, folder))
+        for name, entry in entries.items()
+    }
+    fit = MixtureFit("made", parts, problem, split, Session(folder, folder))
+    for name in names:
+        fit.predict_held_out(name)
+    return fit
+
+
+def test_rows_are_held_out_once_in_a_fit(
+    flat: tuple[Problem, Split], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the mixture, and for the choices of the kriging in it; the fit without these rows holds out others."""
+    splits = list[Split]()
+
+    def counted(record: Record, split: Split) -> Split | None:
+        splits.append(split)
+        return hold_out(record, split)
+
+    monkeypatch.setattr(held_out, "hold_out", counted)
+    fit = fit_of(["kriging"], (replace(flat[0], hold_outs=[]), flat[1]), tmp_path)
+    assert fit.part("kriging").options, "chosen by held-out rows"
+    assert sum(split is flat[1] for split in splits) == 1
+
+
+def test_runs_with_intervals_of_an_earlier_version_are_refused(flat_folder: Path, tmp_path: Path) -> None:
+    run = wrf_mi.train(flat_folder, "idw", out=tmp_path / "run", intervals=True)
+    arrays = stored_arrays(run.folder / FITTED)
+    write_arrays(run.folder / FITTED, {key: values for key, values in arrays.items() if key != DEVIATIONS})
+    with pytest.raises(InputError, match=r"intervals of an earlier version.*train the run anew"):
+        wrf_mi.open_run(run.folder).predict([[2.0, 1.0, 1.3]])
+
+
+def test_hybrids_stored_before_deviations_of_some_parts_counted_are_loaded(flat_folder: Path, tmp_path: Path) -> None:
+    run = wrf_mi.train(flat_folder, out=tmp_path / "run")
+    expected = run.predict([[2.0, 1.0, 1.3]]).std
+    assert run.metrics["sizes"] == STATED
+    arrays = stored_arrays(run.folder / FITTED)
+    write_arrays(run.folder / FITTED, {key: values for key, values in arrays.items() if key != DEVIATIONS})
+    np.testing.assert_array_equal(wrf_mi.open_run(run.folder).predict([[2.0, 1.0, 1.3]]).std, expected)
+
+
+def test_distances_of_a_refit_mixture_are_those_to_its_rows(flat: tuple[Problem, Split], tmp_path: Path) -> None:
+    fit = fit_of(["kriging"], flat, tmp_path)
+    mixture, record = fit.mixture(fit.weights(), None, {}), flat[0].record
+    rows = flat[1].all_train[::2]
+    refit = mixture.refit(record, rows)
+    assert refit is not None
+    at_m = record.tx_pos_m[flat[1].test]
+    np.testing.assert_array_equal(refit._distance(at_m, 0), RowDistance.of_rows(record, rows)(at_m, 0))
