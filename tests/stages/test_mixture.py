@@ -16,7 +16,7 @@ from wrf_mi.models.few_rows import with_few_rows
 from wrf_mi.models.model import Arrays, Decomposition, Fitted, Inputs, default_settings
 from wrf_mi.runs.folder import FITTED
 from wrf_mi.stages.fitted import DEVIATIONS, STATED, FittedMixture, deviation_weights
-from wrf_mi.stages.mixture import MixtureFit, Part
+from wrf_mi.stages.mixture import ChosenWeights, MixtureFit, Part
 from wrf_mi.training.by_distance import Intervals, Mixture, constant
 from wrf_mi.training.selection import RowDistance, hold_out
 
@@ -97,6 +97,27 @@ def fit_of(names: Sequence[str], flat: tuple[Problem, Split], folder: Path) -> M
     for name in names:
         fit.predict_held_out(name)
     return fit
+
+
+def test_fit_of_parts_with_and_without_deviations_states_those_of_the_former(
+    flat: tuple[Problem, Split], tmp_path: Path
+) -> None:
+    fit = fit_of(["kriging", "idw"], flat, tmp_path)
+    assert fit.rows is not None
+    count = len(fit.rows.held_out)
+    halves = ChosenWeights("mixed", constant(np.full(2, 0.5)), np.full((count, 2), 0.5))
+    mixture = fit.mixture(halves, None, {})
+    assert mixture.deviations == ("kriging",)
+    alone = fit.mixture(ChosenWeights("single", constant(np.eye(2)[1]), np.tile(np.eye(2)[1], (count, 1))), None, {})
+    assert list(alone.parts) == ["idw"]
+    assert alone.deviations == ()
+    inputs = flat[0].record.inputs(flat[1].test)
+    means = {name: fit.part(name).predict_mean(inputs, 0) for name in ("kriging", "idw")}
+    predicted = mixture.predict(inputs, 0)
+    np.testing.assert_allclose(predicted.mean, (means["kriging"] + means["idw"]) / 2)
+    assert predicted.std_mean is not None
+    assert np.ptp(predicted.stated_std / fit.part("kriging").predict(inputs, 0).stated_std) < 1e-6
+    assert np.ptp(alone.predict(inputs, 0).stated_std) < 1e-6
 
 
 def test_rows_are_held_out_once_in_a_fit(

@@ -172,8 +172,9 @@ class MixtureFit:
         ``weights`` [q, k] are those that each held-out row has not chosen: intervals are cross-fitted over the groups.
         """
         task, observed = task_of(self._problem.record), held_out.observed(self._problem.record)
-        stated = [name for name, each in self.predictions.items() if name in used and each.std is not None]
-        states = np.array([name in stated and len(stated) == len(self.predictions) for name in self.predictions])
+        states = np.array([name in used and each.std is not None for name, each in self.predictions.items()])
+        # Of channels mixed from traced paths and kriging, errors follow the magnitude, not kriging's deviations.
+        states &= not task.is_complex or states.all()
         predicted = mixed(weights, [*self.predictions.values()], states)
         mean, of_rows = predicted.mean, (held_out.distance_m, held_out.row, held_out.group)
         # Kriging of two or three rows may pass through all of them.
