@@ -196,13 +196,13 @@ def environment(place: Path, package: str, beside: Path | None = None) -> Path:
 def use_extra(extra: Extra, package: Path, beside: Path, folder: Path) -> None:
     """Check that the commands of an extra are refused without it, then use it where it is installed alone."""
     for line in extra.commands:
-        run(beside, "-m", "wrf_mi.cli", *shlex.split(line), folder=folder, refusal=f"'.[{extra.name}]'")
+        run(beside, "-m", "wrf_mi.apps.commands", *shlex.split(line), folder=folder, refusal=f"'.[{extra.name}]'")
     place = folder / f"extra-{extra.name}"
     place.mkdir()
     python = environment(place, f"wrf-mi[{extra.name}] @ {package.as_uri()}", beside)
     run(python, "-c", f"from pathlib import Path\n{extra.script}", folder=folder)
     for line in extra.commands:
-        run(python, "-m", "wrf_mi.cli", *shlex.split(line), folder=folder)
+        run(python, "-m", "wrf_mi.apps.commands", *shlex.split(line), folder=folder)
     for line in extra.programs:
         run(python, "-m", *shlex.split(line), folder=folder)
     shutil.rmtree(place)  # some take a gigabyte

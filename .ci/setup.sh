@@ -65,4 +65,4 @@ if ! "$venv/bin/python" -c 'import open3d' 2>/dev/null; then
         stop "Open3D cannot be loaded: sudo apt-get update && sudo apt-get install -y $open3d_needs"
 fi
 step "4 of 4, LLVM: seconds, a minute where it is installed"
-"$venv/bin/python" -m wrf_mi.cli doctor --install-llvm
+"$venv/bin/python" -m wrf_mi.apps.commands doctor --install-llvm

@@ -20,7 +20,7 @@ within() {  # within SECONDS COMMAND...: a rehearsal on a slower machine has all
 }
 status=0
 # Benchmarks first, as they are the figures that only such a machine gives; each part stops at its share of the time.
-within 300 "$python" -m wrf_mi.cli bench gpu --out "$out" --runs "$out/gpu-runs" 2>&1 | tee "$out/gpu.log" || status=1
+within 300 "$python" -m wrf_mi.apps.commands bench gpu --out "$out" --runs "$out/gpu-runs" 2>&1 | tee "$out/gpu.log" || status=1
 tests=(tests/gaussians tests/graph tests/tracing tests/training tests/models)
 if [[ "$device" == cuda ]]; then
     within 60 "$python" -m pytest -q -m gpu tests 2>&1 | tee "$out/gpu-tests.log" || status=1

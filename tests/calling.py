@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wrf_mi.cli.main import main
+from wrf_mi.apps.commands.main import main
 from wrf_mi.core.array_files import CHECKSUM
 from wrf_mi.runs.folder import FORMAT
 

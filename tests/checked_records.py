@@ -1,4 +1,4 @@
-"""Made-up records with what `wrf_mi.checking` looks for: lines of sight, distance laws, headings along a path."""
+"""Made-up records with what `wrf_mi.apps.checking` looks for: lines of sight, distance laws, headings along a path."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrf_mi.viewer.content import (
+from wrf_mi.apps.viewer.content import (
     GaussiansContent,
     MapContent,
     MaterialMesh,
@@ -13,7 +13,7 @@ from wrf_mi.viewer.content import (
     SceneContent,
     ViewContent,
 )
-from wrf_mi.viewer.layers import png
+from wrf_mi.apps.viewer.layers import png
 
 MARKUP = "<b>&amp;</script><img src=x onerror=alert(1)>"
 STORED, GAUSSIANS, HEIGHTS_M = 3, 5, (0.5, 1.5)
@@ -63,7 +63,7 @@ def made_view(observed: str = "image") -> ViewContent:
 
 
 def _observed(kind: str, rng: np.random.Generator) -> dict:
-    from wrf_mi.viewer.page import packed
+    from wrf_mi.apps.viewer.page import packed
 
     both = ("measured", "predicted")
     if kind == "image":

@@ -186,7 +186,7 @@ steps = stages_of_others:STAGE
 """
 CALLS = """
 import contextlib, io, json, sys
-from wrf_mi.cli.main import main
+from wrf_mi.apps.commands.main import main
 
 for words in json.loads(sys.argv[1]):
     out, err = io.StringIO(), io.StringIO()

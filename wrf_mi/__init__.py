@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 from .version import __version__
 
 if TYPE_CHECKING:
-    from .checking import check_data
+    from .apps.checking import check_data
+    from .apps.importing import import_measurements
     from .core import BackendError, InputError, Receiver, Record, Split
-    from .datasets import fetch, import_measurements, make_splits
+    from .datasets import fetch, make_splits
     from .models import Model
     from .runs.api import Run, open_run, resume, train
     from .runs.compare import compare
@@ -35,10 +36,10 @@ _HOME = {
     "Scene": "runs.scenes",
     "Split": "core",
     "TraceOptions": "tracing",
-    "check_data": "checking",
+    "check_data": "apps.checking",
     "compare": "runs.compare",
     "fetch": "datasets",
-    "import_measurements": "datasets",
+    "import_measurements": "apps.importing",
     "load": "synthetic:load_record",
     "make_splits": "datasets",
     "open_run": "runs.api",

@@ -234,7 +234,7 @@ def run_command(arguments: Sequence[str], folder: Path, where: str = "", resumes
     resumed = resumes and (folder / CONFIG).exists()
     call = ["train", "--resume", str(folder)] if resumed else [*arguments, "--out", str(folder)]
     start = time.perf_counter()
-    status, message = run_module("wrf_mi.cli", call)
+    status, message = run_module("wrf_mi.apps.commands", call)
     if status != 0:
         raise BenchFailed(f"{where}`wrf-mi {' '.join(call)}` ended with status {status} {message}".rstrip())
     return None if resumed else time.perf_counter() - start

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from wrf_mi.cli.output import show
+from wrf_mi.apps.commands.output import show
 from wrf_mi.core import InputError
 
 TABLES = "tables"  # name of the tables of all methods, which are neither a case nor a check

@@ -1,7 +1,7 @@
 """Scenes with one fault each, and whole ones: does ``wrf-mi check`` name the fault at its shape, and nothing else.
 
 Each damaged scene is a random room (`wrf_mi_scenes.random_rooms`) as a scene file with meshes, in which a fault of a
-kind of `wrf_mi.checking.scene_findings.KINDS` was made. Whole scenes are such rooms, those of Sionna RT, and solids.
+kind of `wrf_mi.apps.checking.scene_findings.KINDS` was made. Whole scenes are such rooms, those of Sionna RT, solids.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import trimesh
 from wrf_mi_scenes.mitsuba_xml import Parts, write_scene
 from wrf_mi_scenes.random_rooms import random_room
 
-from wrf_mi.checking import SceneReport, check_scene
+from wrf_mi.apps.checking import SceneReport, check_scene
 from wrf_mi.core import Receiver, Record
 
 COUNT = 510  # 15 of each kind

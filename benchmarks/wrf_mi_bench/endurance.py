@@ -96,7 +96,7 @@ def _tree(process: psutil.Process) -> Iterator[psutil.Process]:
 
 def demo(folder: Path) -> dict[str, Any]:
     """Largest resident memory of ``wrf-mi demo`` and its child processes together: ``rows`` and ``wrong``."""
-    call = [sys.executable, "-m", "wrf_mi.cli", "demo", "--out", str(folder / "demo")]
+    call = [sys.executable, "-m", "wrf_mi.apps.commands", "demo", "--out", str(folder / "demo")]
     started, most = subprocess.Popen(call, stdout=subprocess.DEVNULL), 0
     process = psutil.Process(started.pid)
     while started.poll() is None:
@@ -137,7 +137,7 @@ def _kill_worker(lost: list[int]) -> None:
 
 def main(folder: str, out: str) -> None:
     """Measure `lost_worker`, and write what is wrong; the plan of the tables is replaced in this process."""
-    from wrf_mi.cli.main import main as command
+    from wrf_mi.apps.commands.main import main as command
 
     place, lost, errors = Path(folder), list[int](), StringIO()
     prepare_data(place)

@@ -148,8 +148,8 @@ class Tables(Command):
             setattr(module, "plan", lambda quick=False: rows)  # noqa: B010
         setattr(table_pages, "PARTS", (rows[0].part,))  # noqa: B010
         if not children:
+            from wrf_mi.apps.commands.main import main
             from wrf_mi.backend import init
-            from wrf_mi.cli.main import main
 
             init("llvm", threads=1)
 

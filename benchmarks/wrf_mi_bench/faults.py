@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from wrf_mi.cli.main import main as command
+from wrf_mi.apps.commands.main import main as command
 from wrf_mi.core.files import write_atomically
 from wrf_mi.core.locks import locked_folder
 

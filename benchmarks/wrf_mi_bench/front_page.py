@@ -20,11 +20,11 @@ from wrf_mi_scenes.floor_plans import office
 from wrf_mi_scenes.mitsuba_xml import write_scene
 
 import wrf_mi
+from wrf_mi.apps.maps.picture import scene_cuts
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.receivers import receiver_index
 from wrf_mi.datasets.ble_folder import CARRIER_HZ
-from wrf_mi.maps.picture import scene_cuts
 from wrf_mi.receivers.channel import received_power
 from wrf_mi.receivers.reports import strength_db
 from wrf_mi.runs.folder import load_rows

@@ -119,7 +119,7 @@ def _fit(what: str, folder: Path) -> str:
 
 
 def _run(*arguments: str) -> None:
-    status, message = run_module("wrf_mi.cli", arguments)
+    status, message = run_module("wrf_mi.apps.commands", arguments)
     if status != 0:
         raise BenchFailed(f"bench gpu: `wrf-mi {' '.join(arguments)}` ended with status {status} {message}".rstrip())
 

@@ -202,7 +202,7 @@ def main(folder: str, names: str, first: str, count: str) -> None:
     warm()
     most = psutil.Process().memory_info().vms + MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    for user in ("wrf_mi.scene.scan.points", "wrf_mi.datasets.read_mat", "wrf_mi.viewer.map_layer"):
+    for user in ("wrf_mi.scene.scan.points", "wrf_mi.datasets.read_mat", "wrf_mi.apps.viewer.map_layer"):
         mock.patch.object(import_module(user), "run_module", forked_module).start()
     start = int(first)
     for name in names.split(","):

@@ -16,6 +16,14 @@ import trimesh
 import yaml
 from PIL import Image
 
+from wrf_mi.apps.exports import export
+from wrf_mi.apps.exports.fields import import_field
+from wrf_mi.apps.exports.format import ExportOptions
+from wrf_mi.apps.exports.paths_table import read_paths
+from wrf_mi.apps.maps.api import radio_map
+from wrf_mi.apps.maps.dataset import write_map
+from wrf_mi.apps.maps.locate_file import read_observations
+from wrf_mi.apps.viewer.map_layer import read_map
 from wrf_mi.core import Paths, Receiver, Record
 from wrf_mi.core.array_files import write_arrays
 from wrf_mi.core.files import write_atomically
@@ -26,13 +34,6 @@ from wrf_mi.datasets.argos import read_argos
 from wrf_mi.datasets.deepmimo import read_deepmimo
 from wrf_mi.datasets.nerf2_csi import write_nerf2_csi
 from wrf_mi.datasets.newrf import read_newrf, read_pickled_table
-from wrf_mi.exports import export
-from wrf_mi.exports.fields import import_field
-from wrf_mi.exports.format import ExportOptions
-from wrf_mi.exports.paths_table import read_paths
-from wrf_mi.maps.api import radio_map
-from wrf_mi.maps.dataset import write_map
-from wrf_mi.maps.locate_file import read_observations
 from wrf_mi.models.checks import check_parts
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.prediction_file import read_inputs
@@ -45,7 +46,6 @@ from wrf_mi.scene.plan.sources import read_plan
 from wrf_mi.scene.scan.points import read_points
 from wrf_mi.tracing import open_scene
 from wrf_mi.training.checkpoint import cut_log, read_checkpoint
-from wrf_mi.viewer.map_layer import read_map
 
 UP = np.array([0.0, 0, 0, 1])
 CARRIER_HZ = 2.4e9

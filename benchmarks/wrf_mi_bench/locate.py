@@ -1,8 +1,8 @@
 """Positions of the transmitter from signal strengths: likelihood over predictions beside k nearest neighbours.
 
 Every cell is a run of ``wrf-mi train`` on ``flat-ble``'s first run, whose second run is located. The form of the
-likelihood and k are chosen by training rows held out in space (`wrf_mi.maps.locate_calibration`). Consecutive rows of a
-run share their errors, so that intervals resample stretches of the run.
+likelihood and k are chosen by training rows held out in space (`wrf_mi.apps.maps.locate_calibration`). Consecutive rows
+of a run share their errors, so that intervals resample stretches of the run.
 """
 
 import shutil
@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from wrf_mi.apps.maps.locate import locate
+from wrf_mi.apps.maps.locate_file import test_observations
+from wrf_mi.apps.maps.locate_likelihood import COUNTS, METRICS, Neighbours
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.maps.locate import locate
-from wrf_mi.maps.locate_file import test_observations
-from wrf_mi.maps.locate_likelihood import COUNTS, METRICS, Neighbours
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.folder import METRICS as FINISHED
 from wrf_mi.runs.folder import load_rows

@@ -2,8 +2,8 @@
 
 From ten random training rows, rows are added ten at a time by each rule, a model is fitted to them, and its error on
 the official test rows is stored. Rules are random rows, those that fill space (each the farthest from all before),
-those of the greatest variance, and those of `wrf_mi.plan`: `wrf_mi.maps.plan.greedy` on the model's `error_prior`, for
-the error over the area in which rows could be chosen. Strengths are predicted by kriging about the local mean of the
+those of the greatest variance, and those of `wrf_mi.plan`: `wrf_mi.apps.maps.plan.greedy` on the model's
+`error_prior`, for the error over the area in which rows could be chosen. Strengths are predicted by kriging about the local mean of the
 power traced in a known scene, as by the hybrid's mean and residual, spectra by kriging of their pixels. A scene is
 traced once for all fits.
 """
@@ -20,12 +20,12 @@ from matplotlib.figure import Figure
 from scipy.spatial.distance import cdist
 
 import wrf_mi
+from wrf_mi.apps.maps.plan import greedy
 from wrf_mi.core import Record
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets import make_splits
-from wrf_mi.maps.plan import greedy
 from wrf_mi.models import Inputs
 from wrf_mi.models.error_prior import ErrorPrior
 from wrf_mi.models.interpolation.kriging import Kriging

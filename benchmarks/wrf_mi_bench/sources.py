@@ -27,10 +27,10 @@ SOURCE = "source"  # key of the digests in a stored result
 DIGITS = 12  # hexadecimal digits of a digest
 KEY_DIGITS = 16  # hexadecimal digits of a key: two of a million fits share a key with a probability of 3e-8
 COMMANDS = {
-    "demo": ("wrf_mi.cli.demo", MODELS.module("wrf-gs+")),
-    "train": ("wrf_mi.cli.train",),
+    "demo": ("wrf_mi.apps.commands.demo", MODELS.module("wrf-gs+")),
+    "train": ("wrf_mi.apps.commands.train",),
     NAMED: ("wrf_mi_bench.scene",),
-    CORRECTED: ("wrf_mi_bench.scene", "wrf_mi.cli.scenes"),
+    CORRECTED: ("wrf_mi_bench.scene", "wrf_mi.apps.commands.scenes"),
 }
 """Modules behind words of commands that benchmarks run in subprocesses."""
 RUNNER = f"{__package__}.bench"  # lists, runs and stores benchmarks; makes no figure

@@ -46,7 +46,7 @@ Measure = Callable[[Path], Figures]
 
 def command(*arguments: str | Path, beside: Sequence[Sequence[str | Path]] = ()) -> float:
     """Seconds of a command, with others that start at the same time; `BenchFailed` unless all end well."""
-    calls = [[sys.executable, "-m", "wrf_mi.cli", *map(str, each)] for each in (arguments, *beside)]
+    calls = [[sys.executable, "-m", "wrf_mi.apps.commands", *map(str, each)] for each in (arguments, *beside)]
     start = time.perf_counter()
     with tempfile.TemporaryFile("w+") as errors:
         started = [subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=errors) for call in calls]

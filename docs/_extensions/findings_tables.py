@@ -11,7 +11,7 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
-from wrf_mi.checking.scene_findings import KINDS
+from wrf_mi.apps.checking.scene_findings import KINDS
 from wrf_mi.runs.sweep import markdown_table
 
 MARK = re.compile(r"^<!-- kinds of findings: (\w+) -->$", re.MULTILINE)

@@ -309,7 +309,7 @@ def test_variable_of_an_unusable_library_is_named_with_its_path(wrong_library, k
     ],
 )
 def test_commands_end_with_one_line_on_a_wrong_variable(wrong_library, words, tmp_path):
-    code = f"import sys; from wrf_mi.cli.main import main; sys.exit(main({words.split()}))"
+    code = f"import sys; from wrf_mi.apps.commands.main import main; sys.exit(main({words.split()}))"
     ended = run_python(code, **{libraries.LLVM_VARIABLE: str(wrong_library["missing"]), "CUDA_VISIBLE_DEVICES": ""})
     assert (ended.returncode, len(ended.stderr.splitlines())) == (2, 1), ended.stderr
     assert ended.stderr.startswith(f"wrf-mi: {libraries.LLVM_VARIABLE} is set, but {wrong_library['missing']} is not a")

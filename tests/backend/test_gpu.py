@@ -25,7 +25,7 @@ def on_cpu(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Run the command in a process that sees no GPU."""
     with monkeypatch.context() as hidden:
         hidden.setenv("CUDA_VISIBLE_DEVICES", "")
-        assert run_module("wrf_mi.cli", arguments) == (0, "")
+        assert run_module("wrf_mi.apps.commands", arguments) == (0, "")
 
 
 def test_sorting_in_a_recording_is_replayed():
@@ -89,7 +89,7 @@ def test_models_of_a_scene_score_alike(model, options, tmp_path, monkeypatch):
         model,
         *options,
     ]
-    assert run_module("wrf_mi.cli", [*words, "--out", str(tmp_path / "gpu")]) == (0, "")
+    assert run_module("wrf_mi.apps.commands", [*words, "--out", str(tmp_path / "gpu")]) == (0, "")
     on_cpu([*words, "--out", str(tmp_path / "cpu")], monkeypatch)
     gpu, cpu = (json.loads((tmp_path / name / "metrics.json").read_text())["ssim"] for name in ("gpu", "cpu"))
     assert gpu["mean"] == pytest.approx(cpu["mean"], abs=SCORE)

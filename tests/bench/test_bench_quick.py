@@ -10,7 +10,7 @@ from wrf_mi_bench import quick as bench_quick
 from wrf_mi_bench.quick import FILE, PAIRS, Pair, measure_pairs, quick, ratio_table, read_stored, worse
 from wrf_mi_bench.traced import StockRenderer, difference, random_field, splatted
 
-from wrf_mi.cli.main import main as cli
+from wrf_mi.apps.commands.main import main as cli
 from wrf_mi.core import InputError
 
 SAME_SSIM, SAME_L2 = 0.99, 0.06

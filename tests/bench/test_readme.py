@@ -19,7 +19,7 @@ from wrf_mi_bench.front_page import OF_STAGES, OF_TABLES, QUESTIONS, SCENE, ques
 from wrf_mi_bench.stages import ALONE
 from wrf_mi_bench.table_plan import PARTS
 
-from wrf_mi.cli.main import build_parser
+from wrf_mi.apps.commands.main import build_parser
 from wrf_mi.core import Receiver, Record
 from wrf_mi.core.settings import describe, with_settings
 from wrf_mi.datasets import write_spectrum_folder

@@ -19,7 +19,7 @@ from wrf_mi_bench.sources import PACKAGES, SOURCE, code_digest, modules_of_comma
 from wrf_mi_bench.stale import UNKNOWN, stale
 from wrf_mi_bench.tables import FOLDER
 
-from wrf_mi.cli.main import main as cli
+from wrf_mi.apps.commands.main import main as cli
 from wrf_mi.core import InputError
 from wrf_mi.tasks import TASKS
 

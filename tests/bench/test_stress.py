@@ -15,7 +15,7 @@ from wrf_mi_bench.stress_losses import losses
 from wrf_mi_bench.stress_receivers import of_fields
 from wrf_mi_bench.stress_rows import held, worst_of
 
-from wrf_mi.cli.main import main as cli
+from wrf_mi.apps.commands.main import main as cli
 from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT, PlaneTables
 
 FEW = [pytest.param(part, few, id=part.__name__) for part, _, few in bench_stress.PARTS]

@@ -12,10 +12,17 @@ import trimesh
 from checked_records import channels, strengths
 from made_flat import write_flat
 
-from wrf_mi.checking import building as module
-from wrf_mi.checking import check_data
-from wrf_mi.checking.building import building_file, device_findings, in_solid, in_wall, inside_solids, read_building
-from wrf_mi.checking.scene_geometry import ShapePart
+from wrf_mi.apps.checking import building as module
+from wrf_mi.apps.checking import check_data
+from wrf_mi.apps.checking.building import (
+    building_file,
+    device_findings,
+    in_solid,
+    in_wall,
+    inside_solids,
+    read_building,
+)
+from wrf_mi.apps.checking.scene_geometry import ShapePart
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import load, write_ble_folder
 

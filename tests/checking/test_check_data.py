@@ -11,7 +11,7 @@ from made_flat import write_flat, write_plain_flat
 from spectrum_records import make_record
 
 import wrf_mi
-from wrf_mi.checking import SUSPICIONS, DataReport, check_data
+from wrf_mi.apps.checking import SUSPICIONS, DataReport, check_data
 from wrf_mi.core import DataFault, InputError, Receiver, Record
 from wrf_mi.datasets import write_spectrum_folder
 

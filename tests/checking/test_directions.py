@@ -9,9 +9,9 @@ from checked_records import WALL, channels, spectra, strengths, with_images, wit
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from wrf_mi.checking.directions import brightness, reversed_share, spectrum_axes
-from wrf_mi.checking.plans import distance_law, explained, levels_db, placements
-from wrf_mi.checking.units import distances_m
+from wrf_mi.apps.checking.directions import brightness, reversed_share, spectrum_axes
+from wrf_mi.apps.checking.plans import distance_law, explained, levels_db, placements
+from wrf_mi.apps.checking.units import distances_m
 from wrf_mi.core import Record
 
 POSE = (Rotation.from_quat(WALL) * Rotation.from_euler("zx", [20, 30], degrees=True)).as_quat()

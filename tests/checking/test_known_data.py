@@ -14,7 +14,7 @@ import pytest
 from changed_folders import DATA, needs
 from checked_records import with_images, with_orientations
 
-from wrf_mi.checking import check_data
+from wrf_mi.apps.checking import check_data
 from wrf_mi.core import Record
 from wrf_mi.datasets import load
 from wrf_mi.datasets.registry import KNOWN, locate

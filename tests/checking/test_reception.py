@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from made_building import TRAINED, building, silent_in
 from scipy.stats import truncnorm
 
-from wrf_mi.checking import check_data
-from wrf_mi.checking.rows import (
+from wrf_mi.apps.checking import check_data
+from wrf_mi.apps.checking.rows import (
     constant_observations,
     few_rows,
     named_rows,

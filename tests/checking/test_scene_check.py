@@ -13,12 +13,12 @@ from wrf_mi_bench.damaged_scenes import COUNT, DAMAGES, damaged_scene, is_named,
 from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi_scenes.random_rooms import random_room
 
-from wrf_mi.checking import check_scene
-from wrf_mi.checking.scene_findings import KINDS, LEVELS
-from wrf_mi.checking.scene_geometry import ShapePart, scene_parts
-from wrf_mi.checking.scene_xml_faults import SceneXml, read_xml
-from wrf_mi.checking.triangle_faults import FARTHEST_M
-from wrf_mi.cli.main import main as cli
+from wrf_mi.apps.checking import check_scene
+from wrf_mi.apps.checking.scene_findings import KINDS, LEVELS
+from wrf_mi.apps.checking.scene_geometry import ShapePart, scene_parts
+from wrf_mi.apps.checking.scene_xml_faults import SceneXml, read_xml
+from wrf_mi.apps.checking.triangle_faults import FARTHEST_M
+from wrf_mi.apps.commands.main import main as cli
 from wrf_mi.core import InputError
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing.sionna.scenes import load_scene

@@ -12,9 +12,9 @@ from wrf_mi_bench.damaged_scenes import DAMAGES, Damaged, damaged_scene
 from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi_scenes.random_rooms import random_room
 
-from wrf_mi.checking import Repair, check_scene, repair_scene
-from wrf_mi.checking.material_repair import ascii_name, meant
-from wrf_mi.checking.triangle_faults import wound_one_way
+from wrf_mi.apps.checking import Repair, check_scene, repair_scene
+from wrf_mi.apps.checking.material_repair import ascii_name, meant
+from wrf_mi.apps.checking.triangle_faults import wound_one_way
 from wrf_mi.core import InputError
 from wrf_mi.tracing.sionna.scenes import open_scene
 

@@ -8,8 +8,8 @@ import pytest
 from checked_records import channels, strengths
 from made_building import building
 
-from wrf_mi.checking import check_data
-from wrf_mi.checking.units import channel_phase, degrees, heading_unit, position_unit, strength_scale
+from wrf_mi.apps.checking import check_data
+from wrf_mi.apps.checking.units import channel_phase, degrees, heading_unit, position_unit, strength_scale
 from wrf_mi.core import Record
 
 

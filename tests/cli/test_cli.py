@@ -24,10 +24,10 @@ from commands import Command, arrays_in, rows_of
 from made_spectra import SIZE
 
 from wrf_mi import synthetic
+from wrf_mi.apps.commands import demo
+from wrf_mi.apps.commands.main import build_parser, main
+from wrf_mi.apps.commands.output import Watch
 from wrf_mi.backend.device import Recorded
-from wrf_mi.cli import demo
-from wrf_mi.cli.main import build_parser, main
-from wrf_mi.cli.output import Watch
 from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.runs import api as runs
@@ -71,7 +71,7 @@ def test_help_and_bad_arguments_import_no_tracer() -> None:
     """Help and parser errors appear before Dr.Jit, Mitsuba or Sionna RT is imported."""
     code = """
 import sys
-from wrf_mi.cli.main import main
+from wrf_mi.apps.commands.main import main
 for arguments in (["--help"], ["train", "--help"], ["export", "--help"], ["train", "--seed", "x"]):
     try:
         main(arguments)
@@ -230,7 +230,7 @@ def test_signal_to_end_writes_a_checkpoint_to_resume_from(ending: int, folder: P
     out = tmp_path / "run"
     words = training(folder, out, steps=200, log_every=1, validate_every=200)
     process = subprocess.Popen(
-        [sys.executable, "-m", "wrf_mi.cli", *map(str, words)],
+        [sys.executable, "-m", "wrf_mi.apps.commands", *map(str, words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -165,13 +165,13 @@ def test_system_errors_are_one_line_with_a_remedy(
     def fails(_: object) -> int:
         raise error
 
-    monkeypatch.setattr("wrf_mi.cli.data.list_command", fails)
+    monkeypatch.setattr("wrf_mi.apps.commands.data.list_command", fails)
     command.refused(["data", "list"], f"^wrf-mi: {re.escape(line)}")
 
 
 def test_closed_pipe_ends_the_command_silently() -> None:
     """The command writes to a pipe without reader, as with ``head``."""
-    code = "import sys; sys.stdin.read(1); from wrf_mi.cli.main import main; sys.exit(main(['data', 'list']))"
+    code = "import sys; sys.stdin.read(1); from wrf_mi.apps.commands.main import main; sys.exit(main(['data', 'list']))"
     with subprocess.Popen([sys.executable, "-c", code], stdin=-1, stdout=-1, stderr=-1) as process:
         assert process.stdin is not None
         assert process.stdout is not None

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from wrf_mi import backend
+from wrf_mi.apps.commands import doctor
+from wrf_mi.apps.commands.main import main
 from wrf_mi.backend import libraries, probe
-from wrf_mi.cli import doctor
-from wrf_mi.cli.main import main
 from wrf_mi.core import BackendError
 
 

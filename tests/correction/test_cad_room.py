@@ -184,7 +184,7 @@ def test_residuals_do_not_depend_on_surfaces_that_no_path_meets(tmp_path):
 
 def used(*arguments: str | Path) -> tuple[float, float]:
     """Processor time in s and peak memory in MiB of a command that succeeds."""
-    words = [sys.executable, "-m", "wrf_mi.cli.main", *map(str, arguments)]
+    words = [sys.executable, "-m", "wrf_mi.apps.commands.main", *map(str, arguments)]
     with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as child:
         _, status, usage = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)

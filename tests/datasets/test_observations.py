@@ -12,8 +12,8 @@ from calling import call, refused, stored
 from changed_folders import error_line, refusal
 from small_fits import official, settings
 
-from wrf_mi.checking.rows import few_rows
-from wrf_mi.cli.data import render, summary
+from wrf_mi.apps.checking.rows import few_rows
+from wrf_mi.apps.commands.data import render, summary
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.datasets import load
 from wrf_mi.datasets.observations import fitted_receivers, scorable, warn_of_left_out, warn_of_one_place

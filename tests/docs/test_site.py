@@ -12,7 +12,7 @@ from documents import CHECKOUT, DOCS, blocks
 
 import wrf_mi
 from wrf_mi import models
-from wrf_mi.checking.scene_findings import KINDS
+from wrf_mi.apps.checking.scene_findings import KINDS
 from wrf_mi.graph import receivers
 
 WORKFLOWS = sorted((CHECKOUT / ".github" / "workflows").glob("*.yml"))

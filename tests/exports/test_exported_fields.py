@@ -14,10 +14,10 @@ from changed_folders import error_line
 from programs import installed
 from small_fits import settings
 
+from wrf_mi.apps.exports import ExportOptions, export
+from wrf_mi.apps.exports.fields import RANGE_DB, import_field
 from wrf_mi.core import Record
 from wrf_mi.core.angles import rotation_matrix
-from wrf_mi.exports import ExportOptions, export
-from wrf_mi.exports.fields import RANGE_DB, import_field
 from wrf_mi.runs.api import train
 from wrf_mi.runs.run import open_run
 

@@ -10,10 +10,10 @@ from calling import call, refused
 from changed_folders import refusal
 from spectrum_records import assert_same, make_record
 
+from wrf_mi.apps.exports import export
 from wrf_mi.core import Antenna, Record
 from wrf_mi.datasets import load, write_record_file
 from wrf_mi.datasets.registry import data_home, stated_task
-from wrf_mi.exports import export
 
 
 def full_record() -> Record:

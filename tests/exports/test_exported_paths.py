@@ -12,10 +12,10 @@ from changed_folders import refusal
 from scipy.constants import speed_of_light
 from traced_rooms import FREQUENCY_HZ, PARTITION, SHOEBOX, image_lengths, write_xml
 
+from wrf_mi.apps.exports import ExportOptions, export
+from wrf_mi.apps.exports.paths_table import read_paths
 from wrf_mi.core import Paths
 from wrf_mi.datasets import load
-from wrf_mi.exports import ExportOptions, export
-from wrf_mi.exports.paths_table import read_paths
 from wrf_mi.runs.api import train
 from wrf_mi.tracing import TraceOptions, load_trace
 

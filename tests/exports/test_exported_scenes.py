@@ -12,7 +12,7 @@ from changed_folders import error_line
 from traced_rooms import SHOEBOX, write_xml
 
 from wrf_mi import backend
-from wrf_mi.exports import ExportOptions, export
+from wrf_mi.apps.exports import ExportOptions, export
 from wrf_mi.runs.api import train
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.make import make_scene

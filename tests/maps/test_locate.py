@@ -18,14 +18,14 @@ from scipy.stats import norm
 from scipy.stats import t as student_t
 from sklearn.neighbors import KNeighborsRegressor
 
+from wrf_mi.apps.maps import locate_calibration
+from wrf_mi.apps.maps.grid import Candidates, candidates_of, grid_over
+from wrf_mi.apps.maps.locate import locate
+from wrf_mi.apps.maps.locate_calibration import FILE, Located, choose, fit_silence, widest
+from wrf_mi.apps.maps.locate_file import read_observations
+from wrf_mi.apps.maps.locate_likelihood import Likelihood, Neighbours, Silence, densest, region_of
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import write_ble_folder
-from wrf_mi.maps import locate_calibration
-from wrf_mi.maps.grid import Candidates, candidates_of, grid_over
-from wrf_mi.maps.locate import locate
-from wrf_mi.maps.locate_calibration import FILE, Located, choose, fit_silence, widest
-from wrf_mi.maps.locate_file import read_observations
-from wrf_mi.maps.locate_likelihood import Likelihood, Neighbours, Silence, densest, region_of
 from wrf_mi.runs.api import train
 
 ROUNDING = 1e-9

@@ -13,12 +13,12 @@ from scipy.special import softmax
 from traced_rooms import LENGTH, SHOEBOX, WIDTH, receiver
 from wrf_mi_scenes.build_laboratory import sheet
 
+from wrf_mi.apps.maps import locate_calibration
+from wrf_mi.apps.maps.grid import candidates_of
+from wrf_mi.apps.maps.locate import locate
+from wrf_mi.apps.maps.locate_calibration import FILE, FOLDER, predict_candidates
 from wrf_mi.core import Prediction, Record
 from wrf_mi.datasets import write_ble_folder
-from wrf_mi.maps import locate_calibration
-from wrf_mi.maps.grid import candidates_of
-from wrf_mi.maps.locate import locate
-from wrf_mi.maps.locate_calibration import FILE, FOLDER, predict_candidates
 from wrf_mi.models import Inputs
 from wrf_mi.receivers.instruments import PowerInstrument
 from wrf_mi.runs.api import open_run, train

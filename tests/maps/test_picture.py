@@ -17,12 +17,12 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 
 import wrf_mi
+from wrf_mi.apps.maps import picture
+from wrf_mi.apps.maps.api import radio_map
+from wrf_mi.apps.maps.dataset import write_map
+from wrf_mi.apps.maps.picture import map_figure
 from wrf_mi.core import Record
 from wrf_mi.datasets import make_splits, write_ble_folder, write_nerf2_csi, write_spectrum_folder
-from wrf_mi.maps import picture
-from wrf_mi.maps.api import radio_map
-from wrf_mi.maps.dataset import write_map
-from wrf_mi.maps.picture import map_figure
 from wrf_mi.scene.make import make_scene
 
 BANDS_HZ = (9e8, 2.4e9)

@@ -15,11 +15,11 @@ from wrf_mi_bench.planning import OURS, RULES, SIZES, even_weights, farthest_poi
 
 import wrf_mi
 from wrf_mi import InputError, train
-from wrf_mi.cli.main import main
-from wrf_mi.maps.grid import STANDING_M
-from wrf_mi.maps.plan import error_priors, greedy, plan
-from wrf_mi.maps.plan_losses import SURFACE_DB
-from wrf_mi.maps.plan_picture import summary
+from wrf_mi.apps.commands.main import main
+from wrf_mi.apps.maps.grid import STANDING_M
+from wrf_mi.apps.maps.plan import error_priors, greedy, plan
+from wrf_mi.apps.maps.plan_losses import SURFACE_DB
+from wrf_mi.apps.maps.plan_picture import summary
 from wrf_mi.models.error_prior import ErrorPrior, with_columns
 from wrf_mi.models.interpolation.kriging import Kriging, UncertainKriged
 from wrf_mi.models.interpolation.kriging_equations import KrigingSystem, correlation

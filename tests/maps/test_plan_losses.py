@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.constants import epsilon_0
 
-from wrf_mi.maps.plan_losses import SURFACE_DB, Told, greedy_losses, loss_std_db, losses_of
+from wrf_mi.apps.maps.plan_losses import SURFACE_DB, Told, greedy_losses, loss_std_db, losses_of
 from wrf_mi.models.error_prior import ErrorPrior
 from wrf_mi.models.interpolation.kriging_equations import correlation
 

@@ -10,8 +10,8 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from wrf_mi.apps.maps.grid import grid_over, reachable, surface_of
 from wrf_mi.core import InputError
-from wrf_mi.maps.grid import grid_over, reachable, surface_of
 from wrf_mi.scene.coordinates import Y_UP
 from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing import open_scene

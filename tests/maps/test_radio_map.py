@@ -19,12 +19,12 @@ from scipy.stats import norm
 from traced_rooms import SHOEBOX, write_xml
 
 import wrf_mi
+from wrf_mi.apps.maps import api
+from wrf_mi.apps.maps.api import radio_map
+from wrf_mi.apps.maps.coverage import coverage_probability, reliability, reliability_figure, run_reliability
+from wrf_mi.apps.maps.dataset import write_map
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import write_ble_folder
-from wrf_mi.maps import api
-from wrf_mi.maps.api import radio_map
-from wrf_mi.maps.coverage import coverage_probability, reliability, reliability_figure, run_reliability
-from wrf_mi.maps.dataset import write_map
 from wrf_mi.models import Inputs
 from wrf_mi.runs.api import train
 from wrf_mi.runs.run import Run

@@ -43,7 +43,7 @@ def test_a_folder_with_the_name_of_the_package_does_not_hide_it(
     """As where the project is cloned."""
     (tmp_path / "wrf_mi").mkdir()
     monkeypatch.chdir(tmp_path)
-    assert run_module("wrf_mi.cli", ["--version"]) == (0, "")
+    assert run_module("wrf_mi.apps.commands", ["--version"]) == (0, "")
 
 
 def test_row_parts_respect_maximum_size_and_number_of_workers() -> None:
@@ -200,7 +200,7 @@ def test_child_ends_with_its_parent(tmp_path: Path, sleeper: dict[str, Any]) -> 
 
 
 def test_child_reports_status_and_last_line() -> None:
-    status, said = run_module("wrf_mi.cli", ["predict", "--no-such-option"], quiet=True)
+    status, said = run_module("wrf_mi.apps.commands", ["predict", "--no-such-option"], quiet=True)
     assert status == 2
     assert said.startswith("wrf-mi predict: ")
 

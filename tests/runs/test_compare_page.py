@@ -20,8 +20,8 @@ from pages import PHONE, open_page
 from playwright.sync_api import Browser
 from test_compare import captured, edit_metrics, make_run
 
-from wrf_mi.cli.main import build_parser
-from wrf_mi.cli.train import training_request
+from wrf_mi.apps.commands.main import build_parser
+from wrf_mi.apps.commands.train import training_request
 from wrf_mi.core import Record, Split
 from wrf_mi.models import Session
 from wrf_mi.runs import figures

@@ -14,7 +14,7 @@ import pytest
 from calling import call
 from traced_rooms import LENGTH, SHOEBOX, WIDTH, receiver, write_xml
 
-from wrf_mi.cli.output import Watch
+from wrf_mi.apps.commands.output import Watch
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import load, write_ble_folder
 from wrf_mi.receivers import rssi_dbm

@@ -12,8 +12,8 @@ import pytest
 from commands import rows_of
 
 from wrf_mi import InputError, Record, compare, load, make_splits, open_run, score_predictions, train
-from wrf_mi.cli.main import main
-from wrf_mi.cli.output import show_metrics
+from wrf_mi.apps.commands.main import main
+from wrf_mi.apps.commands.output import show_metrics
 from wrf_mi.core.files import write_csv
 from wrf_mi.runs.compare_tables import OTHER_ROWS, TIE, differences
 from wrf_mi.runs.results import read_runs

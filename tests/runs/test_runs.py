@@ -16,8 +16,8 @@ from calling import contents, copied, stored
 from made_spectra import SIZE
 from small_fits import official, settings, stop_after
 
+from wrf_mi.apps.commands.main import main
 from wrf_mi.backend import set_threads
-from wrf_mi.cli.main import main
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.datasets import load, load_split, make_splits, save_split, write_spectrum_folder
 from wrf_mi.runs.api import Interrupted, Run, evaluate_run, open_run, resume, train

@@ -20,8 +20,8 @@ import pytest
 from calling import SET
 from commands import Command, rows_of
 
-from wrf_mi.cli.main import build_parser, main
-from wrf_mi.cli.train import TRACING, training_names, training_request
+from wrf_mi.apps.commands.main import build_parser, main
+from wrf_mi.apps.commands.train import TRACING, training_names, training_request
 from wrf_mi.core import InputError
 from wrf_mi.core.digest import content_digest
 from wrf_mi.runs import sweep as module

@@ -11,15 +11,15 @@ import yaml
 from calling import call, refused
 from made_rooms import closed_box, sampled, write_las
 
+from wrf_mi.apps.maps.grid import surface_of
+from wrf_mi.apps.viewer.layers import read_scene
 from wrf_mi.core import InputError
-from wrf_mi.maps.grid import surface_of
 from wrf_mi.scene.coordinates import Y_UP, looks_y_up, require_fine, require_near, require_precise
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.mesh.files import mesh_parts
 from wrf_mi.scene.mesh.surfaces import sampled as points_on
 from wrf_mi.scene.scan.points import read_points
 from wrf_mi.tracing import open_scene
-from wrf_mi.viewer.layers import read_scene
 
 ROOM = (6.0, 5.0, 2.5)
 GRID = np.array([701_362.56, 4_485_513.72, 1650.1])

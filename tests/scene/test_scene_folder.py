@@ -16,7 +16,7 @@ from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from wrf_mi import backend
-from wrf_mi.checking import check_scene
+from wrf_mi.apps.checking import check_scene
 from wrf_mi.core import InputError
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.paths import Paths

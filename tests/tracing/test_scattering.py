@@ -11,10 +11,10 @@ from wrf_mi_bench.sionna_reference import sionna_paths
 from wrf_mi_bench.wave_formulas import lambertian_power
 from wrf_mi_scenes.build_laboratory import sheet
 
-from wrf_mi.checking import check_scene
-from wrf_mi.checking.scene_repair import repair_scene
+from wrf_mi.apps.checking import check_scene
+from wrf_mi.apps.checking.scene_repair import repair_scene
+from wrf_mi.apps.exports import ExportOptions, export
 from wrf_mi.core import Antenna, InputError
-from wrf_mi.exports import ExportOptions, export
 from wrf_mi.scene.edit import edit_scene
 from wrf_mi.scene.materials import read_materials
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths

@@ -13,7 +13,7 @@ from traced_rooms import FREQUENCY_HZ, SHOEBOX, receiver, write_xml
 from wrf_mi_scenes.build_laboratory import box, sheet
 from wrf_mi_scenes.mitsuba_xml import ABSORBER
 
-from wrf_mi.cli.main import main
+from wrf_mi.apps.commands.main import main
 from wrf_mi.core import InputError
 from wrf_mi.correction import default_options
 from wrf_mi.correction.page import write_page

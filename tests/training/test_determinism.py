@@ -10,9 +10,9 @@ from small_fits import QUICK, official, settings, stop_after
 from step_job import step_in_process
 
 from wrf_mi import backend
+from wrf_mi.apps.commands import train as cli_train
+from wrf_mi.apps.commands.main import main
 from wrf_mi.backend.probe import try_llvm
-from wrf_mi.cli import train as cli_train
-from wrf_mi.cli.main import main
 from wrf_mi.core import BackendError
 from wrf_mi.core.array_files import stored_arrays
 from wrf_mi.parallel import run_module
@@ -46,7 +46,7 @@ def test_deterministic_fits_of_two_processes_have_equal_bits(folder, tmp_path):
     """Another process trains without a stop, this one stops and resumes from the files."""
     words, complete, resumed = [word for s in FIT for word in ("--set", s)], tmp_path / "complete", tmp_path / "resumed"
     asked = ["train", str(folder), "--model", "wrf-gs+", "--deterministic", *words, "--out", str(complete)]
-    assert run_module("wrf_mi.cli", asked)[0] == 0
+    assert run_module("wrf_mi.apps.commands", asked)[0] == 0
     with pytest.raises(Interrupted):
         train(folder, "wrf-gs+", out=resumed, settings=[*FIT, "deterministic=true"], stop=stop_after(17))
     backend.set_threads(2)

@@ -12,8 +12,8 @@ from pages import LAPTOP, PHONE, OpenPage, open_page
 from PIL import Image
 from playwright.sync_api import Browser
 
-from wrf_mi.viewer.content import ViewContent
-from wrf_mi.viewer.page import page
+from wrf_mi.apps.viewer.content import ViewContent
+from wrf_mi.apps.viewer.page import page
 
 POSITIONS_ALONE = replace(made_view("curve"), scene=None, gaussians=None, paths=None, maps=[])
 ELLIPSOID = 42

@@ -16,12 +16,12 @@ from hypothesis.extra.numpy import arrays
 from made_views import MARKUP, made_view
 from PIL import Image
 
+from wrf_mi.apps.viewer import page as page_module
+from wrf_mi.apps.viewer import view as view_module
+from wrf_mi.apps.viewer.layers import png
+from wrf_mi.apps.viewer.page import LARGEST, MISSING, SMALLEST_RANGE, packed, page, plotly_js
+from wrf_mi.apps.viewer.view import View
 from wrf_mi.core import InputError
-from wrf_mi.viewer import page as page_module
-from wrf_mi.viewer import view as view_module
-from wrf_mi.viewer.layers import png
-from wrf_mi.viewer.page import LARGEST, MISSING, SMALLEST_RANGE, packed, page, plotly_js
-from wrf_mi.viewer.view import View
 
 ROUNDED = 0.51 / LARGEST
 """Largest error of a packed number as a share of the range: half a step, and rounding."""

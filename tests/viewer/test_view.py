@@ -13,16 +13,16 @@ from calling import SMALL, call, refused
 from made_channels import channels
 
 import wrf_mi
+from wrf_mi.apps.viewer.content import ViewOptions
+from wrf_mi.apps.viewer.layers import path_layer, power_db, representative, scene_content, surfaces_in
+from wrf_mi.apps.viewer.map_layer import read_map, thinned
+from wrf_mi.apps.viewer.view import view
 from wrf_mi.core import InputError
 from wrf_mi.models.ray_tracing import TracingSettings
 from wrf_mi.runs.results import read_run
 from wrf_mi.runs.run import open_run
 from wrf_mi.tracing import load_trace, open_scene
 from wrf_mi.tracing.search.surfaces import scene_surfaces
-from wrf_mi.viewer.content import ViewOptions
-from wrf_mi.viewer.layers import path_layer, power_db, representative, scene_content, surfaces_in
-from wrf_mi.viewer.map_layer import read_map, thinned
-from wrf_mi.viewer.view import view
 
 FLOAT32 = 1e-5
 """Relative rounding of float32."""

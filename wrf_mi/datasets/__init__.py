@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from .registry import DataSet, DataSetStatus, data_home, datasets, load, user_cache
     from .spectrum_folder import read_spectrum_folder, write_spectrum_folder
     from .splits import SPLIT_NAMES, load_split, make_splits, save_split
-    from .tables import ImportOptions, ImportReport, import_measurements
 
 # Imported when first used: a command needs the readers of one layout.
 __getattr__, __dir__, _ = lazy_loader.attach(
@@ -35,7 +34,6 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "registry": ["DataSet", "DataSetStatus", "data_home", "datasets", "load", "user_cache"],
         "spectrum_folder": ["read_spectrum_folder", "write_spectrum_folder"],
         "splits": ["SPLIT_NAMES", "load_split", "make_splits", "save_split"],
-        "tables": ["ImportOptions", "ImportReport", "import_measurements"],
     },
 )
 
@@ -43,12 +41,9 @@ __all__ = [
     "SPLIT_NAMES",
     "DataSet",
     "DataSetStatus",
-    "ImportOptions",
-    "ImportReport",
     "data_home",
     "datasets",
     "fetch",
-    "import_measurements",
     "load",
     "load_split",
     "make_splits",

@@ -2,7 +2,7 @@
 
 Errors at positions are jointly normal, and rows that were measured lower their variance by an amount that depends on
 where these rows are and not on what was read there (Rasmussen and Williams, "Gaussian Processes for Machine Learning"
-(2006), equation 2.24). So the worth of a measurement can be computed before it is made (`wrf_mi.maps.plan`).
+(2006), equation 2.24). So the worth of a measurement can be computed before it is made (`wrf_mi.apps.maps.plan`).
 """
 
 from __future__ import annotations

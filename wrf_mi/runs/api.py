@@ -17,7 +17,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..backend import init
-from ..checking import warn_of_suspicions
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
@@ -33,6 +32,7 @@ from ..scene.correction_data import read_correction_data
 from ..synthetic import load_record
 from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
 from ..training.session import Interrupted, OnProgress, quiet
+from .applications import APPLICATIONS
 from .evaluate import FittedPart, score_other, score_part, score_run
 from .folder import (
     FITTED,
@@ -149,7 +149,7 @@ def train(
     )
     data = data if isinstance(data, str | Path | Record) else load_record(data)
     problem, config, splits = plan_run(data, request, progress, on_progress)
-    warn_of_suspicions(problem.record)
+    APPLICATIONS["warn"](problem.record)
     warn_of_left_out(problem.record, config.left_out, least_rows(problem.record, request))
     warn_of_one_place(problem.record, splits)
     _warn_of_known_rows(problem, splits)

@@ -29,6 +29,7 @@ from ..models.model import UNUSED_HEADING, UNUSED_UPLINK
 from ..models.receiver_places import stored_problem
 from ..parallel import PartsProgress, Scheduler, row_parts
 from ..training.predictor import Predictor
+from .applications import APPLICATIONS
 from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
 from .prediction_file import check_prediction_file, spooled, write_prediction_file
 from .results import RECEPTION, STD_MEAN
@@ -182,29 +183,28 @@ class Run:
         return list(self.metrics.get("stages", []))
 
     def map(self, **options: Any) -> Any:
-        """Map of power, coverage and best receiver, ``xarray.Dataset``; options of `wrf_mi.maps.api.radio_map`."""
-        return resolve("wrf_mi.maps.api:radio_map")(self, **options)
+        """Map of power, coverage and best receiver, ``xarray.Dataset``; options of `wrf_mi.apps.maps.api.radio_map`."""
+        return APPLICATIONS["map"](self, **options)
 
     def locate(self, observed_dbm: ArrayLike, **options: Any) -> Any:
-        """Positions of transmitters from signal strengths; options of `wrf_mi.maps.locate.locate`."""
-        return resolve("wrf_mi.maps.locate:locate")(self, observed_dbm, **options)
+        """Positions of transmitters from signal strengths; options of `wrf_mi.apps.maps.locate.locate`."""
+        return APPLICATIONS["locate"](self, observed_dbm, **options)
 
     def plan(self, count: int = 10, **options: Any) -> Any:
-        """Positions to measure next; options of `wrf_mi.maps.plan.plan`."""
-        return resolve("wrf_mi.maps.plan:plan")(self, count, **options)
+        """Positions to measure next; options of `wrf_mi.apps.maps.plan.plan`."""
+        return APPLICATIONS["plan"](self, count, **options)
 
     def view(self, *more: Any, **options: Any) -> Any:
-        """Interactive 3D view of the run and of ``more``, such as maps; options of `wrf_mi.viewer.view.view`."""
-        return resolve("wrf_mi.viewer.view:view")(self, *more, **options)
+        """Interactive 3D view of the run and of ``more``, such as maps; options of `wrf_mi.apps.viewer.view.view`."""
+        return APPLICATIONS["view"](self, *more, **options)
 
     def plot(self) -> Any:
         """Matplotlib figure of test rows: truth, prediction and interpolation side by side."""
         return resolve("wrf_mi.runs.compare:sample_figure")([self.folder])
 
     def export(self, format: str, out: str | Path, **options: Any) -> dict[str, Any]:
-        """Write a file for other programs; formats and options of `wrf_mi.exports.export`."""
-        stated = resolve("wrf_mi.exports:ExportOptions")(**options)
-        return dict(resolve("wrf_mi.exports:export")(self.folder, format, out, stated))
+        """Write a file for other programs; formats and options of `wrf_mi.apps.exports.export`."""
+        return dict(APPLICATIONS["export"](self.folder, format, out, **options))
 
     def predict_inputs(self, inputs: Inputs, receiver: int) -> Prediction:
         """Predict the observations of the receiver of an index; errors as those of `predict`."""

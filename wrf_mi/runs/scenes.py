@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..backend import init
-from ..checking import warn_of_suspicions
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
 from ..core.registry import resolve
@@ -21,6 +20,7 @@ from ..datasets.splits import single_split
 from ..scene.correction_data import FILE
 from ..synthetic import load_record
 from ..training.session import OnProgress, quiet
+from .applications import APPLICATIONS
 
 # What makes, corrects or edits a scene is imported where it is used: it takes a quarter of the start of a training.
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class Scene:
                 texts = setting_texts(settings) if isinstance(settings, Mapping) else settings
                 options = with_settings(default_options(record, n_train), texts)
             rows = split if isinstance(split, Split) else single_split(record, split, seed, n_train)
-            warn_of_suspicions(record)
+            APPLICATIONS["warn"](record)
             write_page(correct_scene(self.folder, record, rows, options, material, on_progress), place, replace)
 
         return self._made(out, corrected, replace)
@@ -139,8 +139,8 @@ class Scene:
         return run
 
     def view(self, *more: Any, **options: Any) -> Any:
-        """Interactive 3D view of the scene and of ``more``, such as runs; options of `wrf_mi.viewer.view.view`."""
-        return resolve("wrf_mi.viewer.view:view")(self.folder, *more, **options)
+        """Interactive 3D view of the scene and of ``more``, such as runs; options of `wrf_mi.apps.viewer.view.view`."""
+        return APPLICATIONS["view"](self.folder, *more, **options)
 
     @classmethod
     def _made(cls, out: str | Path | None, make: Callable[[Path], Any], replace: bool = False) -> Scene:

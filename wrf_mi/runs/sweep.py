@@ -33,6 +33,7 @@ from ..models import MODELS
 from ..parallel import Scheduler, run_module
 from ..synthetic import load_record
 from ..tasks import TASKS
+from .applications import APPLICATIONS, COMMAND
 from .evaluate import stored_metrics
 from .folder import CONFIG, METRICS, RunRequest, is_finished, package_versions
 from .plan import plan_run
@@ -276,7 +277,7 @@ def _run(run: SweepRun) -> dict[str, Any]:
     if folder.exists() and not resumable:
         shutil.rmtree(folder)  # stopped before its configuration was there: nothing to go on from
     arguments = ("train", "--resume", str(folder)) if resumable else (*run.arguments, "--out", str(folder))
-    status, message = run_module("wrf_mi.cli", arguments)
+    status, message = run_module(APPLICATIONS.module(COMMAND).rpartition(".")[0], arguments)
     done = status == 0 and (folder / METRICS).exists()
     return _row(run, "done" if done else message.removeprefix("wrf-mi: ") or f"ended with status {status}")
 

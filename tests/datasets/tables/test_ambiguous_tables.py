@@ -9,7 +9,7 @@ import pytest
 from changed_folders import error_line
 
 from wrf_mi import import_measurements
-from wrf_mi.checking import check_data
+from wrf_mi.apps.checking import check_data
 from wrf_mi.core import Record
 from wrf_mi.datasets import read_ble_folder
 

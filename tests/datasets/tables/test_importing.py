@@ -10,7 +10,7 @@ from changed_folders import error_line, refusal
 from matplotlib.figure import Figure
 
 from wrf_mi import import_measurements
-from wrf_mi.checking import check_data
+from wrf_mi.apps.checking import check_data
 from wrf_mi.core import Record
 from wrf_mi.datasets import read_ble_folder
 from wrf_mi.datasets.ble_folder import TAG_HEIGHT_M

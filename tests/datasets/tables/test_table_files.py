@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from changed_folders import error_line, refusal
 
-from wrf_mi.datasets.tables import files
-from wrf_mi.datasets.tables.files import joined, read_table
+from wrf_mi.apps.importing import files
+from wrf_mi.apps.importing.files import joined, read_table
 
 pandas = pytest.importorskip("pandas")
 

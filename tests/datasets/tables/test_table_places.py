@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from changed_folders import refusal
 
-from wrf_mi.datasets.tables.places import find_frame, headings_rad, place_numbers, unit_scale
+from wrf_mi.apps.importing.places import find_frame, headings_rad, place_numbers, unit_scale
 
 pyproj = pytest.importorskip("pyproj")
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wrf_mi.datasets.tables.readings import (
+from wrf_mi.apps.importing.readings import (
     Readings,
     mean_strengths,
     merged,

@@ -13,7 +13,7 @@ from calling import call, refused
 from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct, WktCoordinateSystemVlr
 from made_rooms import by_kind, closed_box, sampled, write_las
 
-from wrf_mi.checking import check_scene
+from wrf_mi.apps.checking import check_scene
 from wrf_mi.core import InputError
 from wrf_mi.scene import coordinates
 from wrf_mi.scene.coordinates import Y_UP, check_extent, extra_package

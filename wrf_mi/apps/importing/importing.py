@@ -1,0 +1,396 @@
+"""Import of tables of signal strengths into a folder that all commands read."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from ...core import DataFault, InputError, Receiver, Record
+from ...core.angles import FloatArray
+from ...core.files import listed, one_line
+from ...core.types import IntArray
+from ...datasets.ble_folder import CARRIER_HZ, write_ble_folder
+from ...datasets.unknown import SENT, name_words
+from .columns import HERTZ, described, find_columns, parsed_columns, unit_of
+from .files import Table, joined, read_table
+from .options import ImportOptions, option_name
+from .picture import plan_picture
+from .places import (
+    POSITION_DIGITS,
+    LocalFrame,
+    find_frame,
+    finite_columns,
+    floor_numbers,
+    headings_rad,
+    place_numbers,
+    plane_columns,
+    unit_scale,
+    with_cells,
+    with_positions,
+)
+from .readings import (
+    Means,
+    Readings,
+    chosen,
+    file_offsets,
+    further_columns,
+    mean_strengths,
+    merged,
+    read_readings,
+    virtual_networks,
+    without_not_heard,
+)
+from .receivers_table import read_receivers
+from .slots import without_slots
+
+FACTS, PICTURE = "import.yml", "plan.png"  # files beside the tables: what the import assumed, and a plan of the rows
+MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
+MOST_CELLS = 50_000_000  # largest number of receivers times places: 2 GB while means are computed
+TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
+RADIOS = frozenset({"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "umts", "tdscdma", "lte", "nr", "5g"})
+"""Values of a column of kinds of radio, in small letters."""
+SENT_IN_NAME = re.compile(r"(?<![\d.])(-?\d+(?:\.\d+)?)[ _]?dbm", re.IGNORECASE)
+STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What `import_measurements` wrote.
+
+    Attributes:
+        folder: the data set.
+        record: its content.
+        columns: lines of a table: column, meaning, unit and number of values.
+        notes: what was found and assumed.
+    """
+
+    folder: Path
+    record: Record
+    columns: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def import_measurements(
+    files: str | Path | Sequence[str | Path], out: str | Path, replace: bool = False, **options: Any
+) -> ImportReport:
+    r"""Make a data set of signal strengths from tables as people have them.
+
+    A table has a column for each receiver, or a row for each reading with an id and a strength. Readings of a receiver
+    at one place are averaged. The folder also holds ``import.yml`` with all that was assumed, and ``plan.png``.
+
+    Args:
+        files: tables in CSV, Parquet or Excel; their rows train, unless there is a column ``split``.
+        out: folder to write.
+        replace: whether an existing folder is replaced.
+        options: attributes of `ImportOptions`.
+
+    Raises:
+        InputError: an unknown option, a table or a field that cannot be understood, or a folder that exists.
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> rows = ["x,y,bssid,rssi", "0,0,hall,-50", "0,0,hall,-52", "2,0,hall,-60", "2,0,attic,-71"]
+    >>> _ = (folder / "scans.csv").write_text("\n".join(rows))
+    >>> report = import_measurements(folder / "scans.csv", folder / "office")
+    >>> [receiver.name for receiver in report.record.receivers]
+    ['hall', 'attic']
+    >>> report.record.observation
+    array([[-51., -60.],
+           [ nan, -71.]], dtype=float32)
+    """
+    if unknown := set(options) - {attribute.name for attribute in dataclasses.fields(ImportOptions)}:
+        raise InputError(f"import_measurements: no option {min(unknown)}; see ImportOptions")
+    if Path(out).exists() and not replace:
+        raise InputError(f"{out}: exists; remove it, choose another folder, or give --replace")
+    chosen_options = ImportOptions(**options)
+    files = [files] if isinstance(files, str | Path) else list(files)
+    return _Import(files, Path(out), chosen_options).run(replace)
+
+
+class _Import:
+    """One import: its table, columns and notes, which each step extends."""
+
+    def __init__(self, files: Sequence[str | Path], out: Path, options: ImportOptions) -> None:
+        self.out, self.options, self.notes = out, options, list[str]()
+        stated = options.columns
+        self.stated = parsed_columns(stated) if isinstance(stated, str) else dict(stated)
+        self.table, self.is_test = self._read(files)
+        if "cell" in self.stated:
+            self.table = with_cells(self.table, self.stated["cell"])
+        self.notes += self.table.notes
+        self.columns = find_columns(self.table, self.stated, options.receivers)
+        self.units, self.carrier_of = dict[str, str](), dict[str, float]()
+        self.facts: dict[str, Any] = {"files": [path.name for path, _ in self.table.files]}
+
+    def run(self, replace: bool) -> ImportReport:
+        """Read, average and write."""
+        self._check_idle()
+        self._check_strengths()
+        frame, xyz_m = self._positions()
+        readings, notes, not_heard = without_not_heard(read_readings(self.table, self.columns), self.options.not_heard)
+        self.notes += notes
+        if not len(readings.dbm):
+            raise DataFault(self.table.files[0][0], "no reading was heard; correct --columns or --not-heard")
+        self._check_sent(readings)
+        conditions = self._conditions(readings)
+        keys = {"z": xyz_m[:, 2], **conditions, "part": self.is_test}
+        place = place_numbers(keys, xyz_m[:, :2], self.options.place_m)
+        count = np.bincount(place)
+        self.notes += file_offsets(readings, place, self._file, [path.name for path, _ in self.table.files])
+        first = np.unique(place, return_index=True)[1]
+        readings, means = self._means(readings, place, len(count))
+        position_m = np.column_stack([np.bincount(place, axis) / count for axis in xyz_m.T]).round(POSITION_DIGITS)
+        receivers, notes = self._receivers(readings, frame)
+        self.notes += notes
+        record = self._record(means, position_m, receivers)
+        record = self._with_conditions(record, {name: values[first] for name, values in conditions.items()})
+        record = self._with_split(record, self.is_test[first])
+        further, notes = further_columns(self.table, self.columns, readings, place)
+        fixed = one_line(self.columns.of.get("id", "the columns of strengths"))
+        text = f"the fixed ends, named by {fixed}, are the receivers, and the moving end is the transmitter"
+        self.notes += [*notes, f"{text}: by reciprocity it does not matter who sends"]
+        lines = described(self.table, self.columns, self.units)
+        self.facts |= {"columns": lines, "frame": frame.facts(), "not_heard_dbm": not_heard, "notes": self.notes}
+        extra: dict[str, str | bytes] = {
+            FACTS: yaml.safe_dump(self.facts, sort_keys=False, allow_unicode=True, width=120),
+            PICTURE: plan_picture(record),
+        }
+        write_ble_folder(self.out, record, replace, extra, further)
+        return ImportReport(self.out, record, tuple(lines), tuple(self.notes))
+
+    def _read(self, files: Sequence[str | Path]) -> tuple[Table, NDArray[np.bool_]]:
+        """All rows with their positions, and which of them test."""
+        options = self.options
+        paths = [*files, *options.test]
+        tables, positions = ([read_table(path, options.sheet) for path in part] for part in (paths, options.positions))
+        if len(positions) not in (0, 1, len(paths)):
+            text = f"{len(positions)} files of positions for {len(paths)} tables"
+            raise InputError(f"--positions: {text}; give one for each table, those of --test last, or one for all")
+        if positions:
+            positions *= len(paths) // len(positions)
+            pairs = [with_positions(*pair, self.stated) for pair in zip(tables, positions, strict=True)]
+            tables = [table for table, _ in pairs]
+            self.notes.append(f"positions of {options.positions[0]} are matched {pairs[0][1]}")
+        tables = [without_slots(table) for table in tables]
+        self._file = np.repeat(np.arange(len(paths)), list(map(len, tables)))
+        table = joined(tables)
+        for name, text in options.where.items():
+            chosen_rows = table.where(name, text)
+            left_out = len(table) - np.count_nonzero(chosen_rows)
+            self.notes.append(f"{left_out} rows are left out: their {one_line(name)} is not {one_line(text)}")
+            table = dataclasses.replace(table, frame=table.frame[chosen_rows])
+            self._file = self._file[chosen_rows]
+        return table, self._file >= len(files)
+
+    def _check_idle(self) -> None:
+        """Refuse options of quantities that the tables state, or do not have."""
+        of, without_z = self.columns.of, "z" not in self.columns.of
+        needed = {
+            "height_m": (without_z, "the table has a column z"),
+            "storey_m": (without_z and "floor" in of, "it belongs to a column floor without z"),
+            "heading": ("heading" in of, "the table has no column of headings"),
+            "anchor_height_m": (self.options.anchors is not None, "it belongs to --anchors"),
+        }
+        for name, (counts, reason) in needed.items():
+            if not counts and getattr(self.options, name) != getattr(ImportOptions, name):
+                raise DataFault(self.table.files[0][0], f"{option_name(name)}: {reason}; omit it")
+
+    def _positions(self) -> tuple[LocalFrame, FloatArray]:
+        """The local frame and the positions [rows, 3] in it."""
+        options, table, of = self.options, self.table, self.columns.of
+        first, second, geographic = plane_columns(of, table)
+        xy = finite_columns(table, [first, second])
+        unit = options.units or self.columns.unit("lon" if geographic else "x")
+        scale_m = options.pitch_m or unit_scale(unit, "--units")
+        frame, notes = find_frame(xy, geographic, unit, scale_m, options.crs)
+        self.notes += notes
+        if not options.pitch_m and (xy == np.round(xy)).all() and np.ptp(xy, axis=0).max() < MOST_STEPS:
+            self.notes.append("x and y are whole numbers: if they are indices of a grid, state its pitch by --pitch")
+        shown = f"steps of {options.pitch_m:g} m" if options.pitch_m else frame.crs or unit or "m"
+        self.units |= dict.fromkeys(("x", "y", "lat", "lon"), shown)
+        return frame, np.column_stack([frame.local_m(xy), self._heights_m()])
+
+    def _heights_m(self) -> FloatArray:
+        """Heights of the rows, from z, the floor, or an assumption."""
+        options, table, of = self.options, self.table, self.columns.of
+        if "z" in of:
+            self.units["z"] = self.columns.unit("z") or options.units.replace("deg", "m") or "m"
+            return finite_columns(table, [of["z"]])[:, 0] * unit_scale(self.units["z"], "--units")
+        height_m = self._stated_heights_m()[self._file]
+        if "floor" in of:
+            floors = floor_numbers(table, of["floor"])
+            names = dict(zip(table.frame[of["floor"]].astype(str), floors * options.storey_m, strict=True))
+            shown = listed(
+                [f"{one_line(name)} at {z:g} m" for name, z in sorted(names.items(), key=lambda item: item[1])]
+            )
+            self.notes.append(f"floors by names and storeys of {options.storey_m:g} m (--storey): {shown}")
+            return height_m + options.storey_m * floors
+        heights_m = np.unique(height_m)
+        text = "all rows are" if len(heights_m) == 1 else "rows are"
+        self.notes.append(f"no column z: {text} {listed([f'{z:g}' for z in heights_m])} m above the floor (--height)")
+        return height_m
+
+    def _stated_heights_m(self) -> FloatArray:
+        """Height above the floor of the rows of each table."""
+        count, stated = int(self._file.max()) + 1, np.atleast_1d(np.asarray(self.options.height_m, float))
+        if len(stated) not in (1, count):
+            raise InputError(f"--height: {len(stated)} heights for {count} tables; give one for each, or one for all")
+        return np.broadcast_to(stated, count)
+
+    def _check_strengths(self) -> None:
+        """Refuse strengths in per cent, whose scale is that of each program."""
+        of = self.columns.of
+        names = [of["rssi"]] if "rssi" in of and not self.columns.strengths else list(self.columns.strengths)
+        for name in names:
+            if unit_of(name) == "%" or name_words(name) & {"quality", "percent"}:
+                text = f"{one_line(name)} is in per cent; give dBm (in Windows dBm = quality / 2 - 100)"
+                raise DataFault(self.table.files[0][0], f"{text}, or name another column by --columns rssi=...")
+
+    def _check_sent(self, readings: Readings) -> None:
+        """Refuse strengths of one receiver at several powers that were sent, or several kinds of radio."""
+        frame = self.table.frame
+        for name in frame.columns:
+            words, stated = name_words(name), frame[name].notna().to_numpy()[readings.row]
+            values = frame[name].iloc[readings.row[stated]].astype(str).str.strip()
+            if words & SENT and self.table.is_numeric(name):
+                several = values.groupby(readings.receiver[stated]).nunique().max() > 1
+            else:
+                several = values.nunique() > 1 and set(values.str.lower()) <= RADIOS
+            if several:
+                counts = listed([f"{one_line(text)} ({rows})" for text, rows in values.value_counts().items()])
+                text = f"{one_line(name)} is {counts}: these are not pooled"
+                remedy = f"choose one by --where {shlex.quote(f'{name}={values.value_counts().index[0]}')}"
+                raise DataFault(self.table.files[0][0], f"{text}; {remedy}")
+        powers = {match[1] for path, _ in self.table.files if (match := SENT_IN_NAME.search(path.stem))}
+        if len(powers) > 1:
+            text = f"files at {', '.join(sorted(powers, key=float))} dBm sent, by their names, are not pooled"
+            raise InputError(f"{self.table.files[0][0].parent}: {text}; import each into a folder of its own")
+
+    def _conditions(self, readings: Readings) -> dict[str, Any]:
+        """Heading, carrier and run of each row where stated; rows that differ in them are not averaged."""
+        of, table, conditions = self.columns.of, self.table, {}
+        if "split" in of:
+            self.is_test = self.is_test | _test_rows(table, of["split"])
+        for meaning in sorted({"heading", "run"} & set(of)):
+            if empty := int(table.frame[of[meaning]].isna().sum()):
+                self.notes.append(f"{of[meaning]} is empty in {empty} rows: kept, and not used as {meaning}")
+                self.columns.kept.append(of.pop(meaning))
+        if "heading" in of:
+            headings = finite_columns(table, [of["heading"]])[:, 0]
+            conditions["heading"], self.units["heading"] = headings_rad(headings, of["heading"], self.options.heading)
+        if "run" in of:
+            conditions["run"] = table.frame[of["run"]].astype(str).str.strip().to_numpy(str)
+        if "frequency" in of and not self.options.frequency_hz:
+            self.units["frequency"] = "-> Hz"
+            conditions |= self._carriers(_hertz(table, of["frequency"]), readings)
+        return conditions
+
+    def _carriers(self, carriers_hz: FloatArray, readings: Readings) -> dict[str, Any]:
+        """Carriers of rows, none where each receiver has its own, as in a scan of Wi-Fi networks."""
+        pairs = np.unique(np.column_stack([readings.receiver, carriers_hz[readings.row]]), axis=0)
+        if len(np.unique(pairs[:, 1])) > 1 and len(pairs) == len(np.unique(pairs[:, 0])):
+            self.carrier_of = {readings.ids[int(number)]: float(carrier) for number, carrier in pairs}
+            return {}
+        return {"frequency_hz": carriers_hz}
+
+    def _means(self, readings: Readings, place: IntArray, places: int) -> tuple[Readings, Means]:
+        """Readings of the receivers that remain, and their means at each place."""
+        options = self.options
+        if places * len(readings.ids) > MOST_CELLS:
+            text = f"{places} places of {len(readings.ids)} receivers do not fit into memory ({MOST_CELLS} values do)"
+            raise InputError(f"{self.out}: {text}; average by --place, or leave receivers out by --receivers")
+        means = mean_strengths(readings, place, places, options.average)
+        groups = virtual_networks(readings.ids, means.dbm)
+        if groups:
+            names = listed(readings.ids[number] for number in groups[0])
+            text = f"{sum(map(len, groups))} addresses are networks of {len(groups)} radios (the first: {names})"
+            self.notes.append(text + (": merged" if options.merge_radios else "; --merge-radios makes them one"))
+            if options.merge_radios:
+                readings = merged(readings, groups)
+                means = mean_strengths(readings, place, places, options.average)
+        trains = ~self.is_test[np.unique(place, return_index=True)[1]]
+        heard = (means.count[:, trains] > 0).sum(axis=1)
+        remaining = np.flatnonzero(heard >= max(1, options.min_heard))
+        if len(out := np.setdiff1d(np.arange(len(heard)), remaining)):
+            names = listed([readings.ids[number] for number in out])
+            text = f"{len(out)} of {len(heard)} receivers were heard in fewer than {max(1, options.min_heard)} training"
+            self.notes.append(f"{text} rows and are left out (--min-rows): {names}")
+        if not len(remaining):
+            text = f"no receiver was heard in {options.min_heard} training rows; lower --min-rows"
+            raise InputError(f"{self.out}: {text}")
+        readings = chosen(readings, remaining)
+        return readings, Means(means.dbm[remaining], means.count[remaining], means.std[remaining])
+
+    def _receivers(self, readings: Readings, frame: LocalFrame) -> tuple[tuple[Receiver, ...], list[str]]:
+        """Receivers with the carriers of their readings, if these state any."""
+        options = self.options
+        table = None if options.anchors is None else read_table(options.anchors, options.sheet)
+        receivers, notes = read_receivers(table, readings.ids, frame, options.units, options.anchor_height_m)
+        pairs = list(zip(readings.ids, receivers, strict=True))
+        carriers = [self.carrier_of.get(name, receiver.frequency_hz) for name, receiver in pairs]
+        if None in carriers or options.frequency_hz:  # one carrier for all
+            carriers = [None] * len(carriers)
+        stated = zip(receivers, carriers, strict=True)
+        return tuple(dataclasses.replace(receiver, frequency_hz=hz) for receiver, hz in stated), notes
+
+    def _record(self, means: Means, position_m: FloatArray, receivers: tuple[Receiver, ...]) -> Record:
+        averaged = bool((means.count > 1).any())
+        if averaged:
+            most, what = int(means.count.max()), {"db": "dB", "mw": "mW"}[self.options.average]
+            text = f"{means.count.sum()} readings at {len(position_m)} places are averaged in {what}, up to {most} each"
+            self.notes.append(f"{text}; count_ and std_ are their number and the noise of the mean")
+        carrier_hz = self.options.frequency_hz or CARRIER_HZ
+        stated = "frequency" in self.columns.of or receivers[0].frequency_hz
+        if not self.options.frequency_hz and not stated:
+            self.notes.append(f"no carrier is stated: {carrier_hz:.4g} Hz (--frequency)")
+        return Record(
+            name=self.out.name,
+            task="rssi",
+            tx_pos_m=position_m,
+            receivers=receivers,
+            observation=means.dbm.round(STRENGTH_DIGITS).astype(np.float32),
+            frequencies_hz=np.array([carrier_hz]),
+            n_readings=means.count if averaged else None,
+            std=means.std.round(STRENGTH_DIGITS) if averaged else None,
+        )
+
+    def _with_conditions(self, record: Record, conditions: Mapping[str, NDArray[Any]]) -> Record:
+        record = dataclasses.replace(record, tx_heading_rad=conditions.get("heading"), runs=conditions.get("run"))
+        of_receivers = record.receiver_carriers_hz
+        return record.at_carriers(conditions.get("frequency_hz")).at_receiver_carriers(of_receivers)
+
+    def _with_split(self, record: Record, is_test: NDArray[np.bool_]) -> Record:
+        if not is_test.any() or is_test.all():
+            self.notes.append("no test rows are stated: train scores folds in space, then fits all rows (--split none)")
+            return record
+        official = np.flatnonzero(~is_test), np.flatnonzero(is_test)
+        self.notes.append(f"split: {len(official[0])} training and {len(official[1])} test rows, as stated")
+        return dataclasses.replace(record, official=official)
+
+
+def _test_rows(table: Table, column: str) -> NDArray[np.bool_]:
+    words = table.frame[column].astype(str).str.strip().str.lower().to_numpy(str)
+    known = np.isin(words, (*TRAIN_WORDS, *TEST_WORDS))
+    if len(wrong := np.flatnonzero(~known)):
+        text = f"{one_line(column)} is {one_line(words[wrong[0]])!r}; give train or test, or --columns split=-"
+        raise table.fault(text, int(wrong[0]))
+    return np.isin(words, TEST_WORDS)
+
+
+def _hertz(table: Table, column: str) -> FloatArray:
+    """Carriers in Hz, from the unit of their column or else by their size."""
+    values = finite_columns(table, [column])[:, 0]
+    if (wrong := values <= 0).any():
+        row = int(np.argmax(wrong))
+        raise table.fault(f"{one_line(column)} is {values[row]:g}; give the carrier, or --columns frequency=-", row)
+    largest = values.max()
+    return values * HERTZ.get(unit_of(column), 1e9 if largest < 1e3 else 1e6 if largest < 1e6 else 1.0)

@@ -1,0 +1,317 @@
+"""Choice of the likelihood's form and of k nearest neighbours by training rows that are held out in space.
+
+The run's model is fitted again to the rest of each fold (`folds_of`), predicts at all candidate positions, and locates
+the fold's held-out rows. The form with the greatest mean logarithm of the posterior density at the true positions is
+chosen: a proper score (Gneiting and Raftery, "Strictly proper scoring rules, prediction, and estimation" (2007), JASA
+102), which regions that are too narrow or too wide lower.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import softmax
+from scipy.stats import t as student_t
+from sklearn.linear_model import LogisticRegression
+from threadpoolctl import threadpool_limits
+
+from ...core import InputError, Record, Split
+from ...core.angles import FloatArray
+from ...core.array_files import stored_arrays, write_arrays
+from ...core.files import readable, write_atomically
+from ...core.types import IntArray
+from ...datasets.observations import fitted_receivers
+from ...models import Fitted, Session
+from ...models.held_out import fit_fold
+from ...models.model import Inputs, slices
+from ...runs.folder import load_rows
+from ...runs.run import Run
+from ...training.selection import hold_out
+from .grid import HEADINGS, Candidates
+from .locate_likelihood import Likelihood, Neighbours, Silence, choose_neighbours, region_of
+
+logger = logging.getLogger(__name__)
+
+DEGREES, SCALES, OFFSETS_DB = (4.0, 8.0, None), (0.35, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0), (0.0, 3.0, 6.0)
+"""Forms of the likelihood to choose from."""
+WIDE = 0.95  # probability of the quantile by which the widths of distributions are compared
+MOST_ROWS = 300  # most held-out rows that are located
+LEVEL = 0.9  # probability of a region by default, and of those whose held-out coverage is stated
+TOGETHER = 512  # candidates that are predicted together
+TIMED = 64  # most candidates whose predictions are timed at once, before all are predicted
+FOLDS = 3  # hold-outs with other seeds: one alone has few positions, near each other
+FOLDER, FILE = "locate", "locate.json"  # folder of finished folds in the run folder, and file of the choice
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Likelihood and nearest neighbours of a run, with what held-out rows say of them."""
+
+    likelihood: Likelihood  # form of the likelihood
+    neighbours: Neighbours | None = None  # nearest neighbours; None: the run has no training rows to compare with
+    rows: int = 0  # number of located held-out rows; 0: the form is the default one, as nothing could be held out
+    error_m: float = np.nan  # their mean distance from the estimate, metres
+    inside: float = np.nan  # share of them inside the regions of probability `LEVEL`
+    neighbours_error_m: float = np.nan  # mean held-out distance of nearest neighbours, metres
+    # mean log posterior density at the true positions of each form that was tried, per square metre
+    scores: dict[str, float] | None = None
+
+
+def predict_candidates(
+    fitted: Fitted, receivers: IntArray, headings: int, candidates: Candidates, report: Callable[[float], None]
+) -> NDArray[np.float32]:
+    """Means in dBm and standard deviations in dB [2, headings, n_rx, p] of a fitted model at the candidates.
+
+    Receivers are those of the given numbers [n_rx]; headings are equally spaced where the model uses them.
+    `InputError` where it states no standard deviation.
+    """
+    positions = candidates.positions_m
+    predicted = np.empty((2, headings, len(receivers), len(positions)), np.float32)
+    report(0.0)
+    # Positions in the outer loop: a chunk's paths to all receivers are traced together and bound the memory.
+    for part in slices(len(positions), TOGETHER):
+        for number in range(headings):
+            turned = np.full(part.stop - part.start, 2 * np.pi * number / headings) if headings > 1 else None
+            for place, receiver in enumerate(receivers):
+                prediction = fitted.predict(Inputs(positions[part], turned), int(receiver))
+                if prediction.std is None:
+                    raise InputError("its model states no standard deviation; train it with --intervals")
+                predicted[:, number, place, part] = prediction.mean, prediction.std
+        report(part.stop / len(positions))
+    return predicted
+
+
+def seconds_to_predict(fitted: Fitted, receivers: IntArray, headings: int, candidates: Candidates) -> float:
+    """Estimated duration of `predict_candidates` in seconds, from predictions at a few of the candidates."""
+    count = len(candidates.positions_m)
+    many = min(max(count // 4, 1), TIMED, TOGETHER)
+    few = max(many // 8, 1)
+    timed_m = candidates.positions_m[np.linspace(0, count - 1, 2 * many + few).astype(int)]
+
+    def seconds(places_m: FloatArray) -> float:
+        begun, turned = time.perf_counter(), np.zeros(len(places_m)) if headings > 1 else None
+        for receiver in receivers:
+            fitted.predict(Inputs(places_m, turned), int(receiver))
+        return time.perf_counter() - begun
+
+    seconds(timed_m[:many])  # the first prediction opens the scene and compiles kernels, which later ones do not
+    # A call takes a time of its own and one for each position: two calls of different sizes determine both.
+    short, long = seconds(timed_m[many:-many]), seconds(timed_m[-many:])
+    each = max(long - short, 0.0) / max(many - few, 1)
+    return headings * (len(slices(count, TOGETHER)) * max(short - few * each, 0.0) + count * each)
+
+
+def headings_of(run: Run) -> int:
+    """Number of headings at which a run's model is evaluated; 1 where it does not use the heading."""
+    return HEADINGS if run.takes_heading and run.problem.record.tx_heading_rad is not None else 1
+
+
+@dataclass(frozen=True)
+class Located:
+    """Held-out rows of a fold: predictions at the receivers of the given numbers, which have enough training rows in
+    the fold (`predict_candidates`); rows of the record [m], and the candidate nearest to each [m].
+    """
+
+    predicted: NDArray[np.float32]
+    receivers: IntArray
+    rows: IntArray
+    truth: IntArray
+
+
+def calibration_of(run: Run, fitted: Fitted, candidates: Candidates, session: Session) -> Calibration:
+    """The stored choice of a run for these candidates, else a new one, which is stored in the run folder.
+
+    ``fitted`` is the run's model, which shares what it has traced at the candidates (`Fitted.tracing_once`). Finished
+    folds are kept until all are, so that a stopped choice (`Interrupted`) goes on. `InputError` of a fold that the
+    model cannot be fitted to.
+    """
+    grid, file = candidates.grid, run.folder / FILE
+    key = {"candidates": int(candidates.inside.sum()), "low_m": [float(grid.x_m[0]), float(grid.y_m[0])]}
+    key |= {"high_m": [float(grid.x_m[-1]), float(grid.y_m[-1])], "height_m": grid.height_m}
+    if file.exists():
+        with readable(file, f"{file}: missing", "remove it"):
+            stored = json.loads(file.read_text(encoding="utf-8"))
+            if stored.pop("key") == key:
+                form, near = stored.pop("likelihood"), Neighbours(**stored.pop("neighbours"))
+                silence = None if form["silence"] is None else Silence(**form["silence"])
+                return Calibration(Likelihood(**form | {"silence": silence}), near, **stored)
+    record, split = run.problem.record, load_rows(run.folder, run.problem.record)
+    folds = folds_of(record, split)
+    if not folds:
+        return Calibration(Likelihood())
+    parts, most = [], max(1, MOST_ROWS // len(folds))
+    for number, fold in enumerate(folds):
+
+        def report(share: float, number: int = number) -> None:
+            session.report(f"calibrating by {len(folds)} folds", (number + share) / len(folds))
+
+        report(0.0)
+        folder = run.folder / FOLDER / f"fold{number}"
+        receivers, predicted = _predicted_fold(run, fitted, fold, folder, candidates, session, report)
+        test = fold.test[np.isfinite(record.observation[receivers][:, fold.test]).any(axis=0)]
+        test = np.sort(np.random.default_rng([run.problem.seed, 11]).permutation(test)[:most])
+        parts.append(Located(predicted, receivers, test, candidates.nearest(record.tx_pos_m[test])))
+    neighbours, error_m = choose_neighbours(record, folds)
+    chosen = choose(record, parts, candidates, lambda share: session.report("choosing the likelihood", share))
+    chosen = replace(chosen, neighbours=neighbours, neighbours_error_m=error_m)
+    write_atomically(file, json.dumps({"key": key, **asdict(chosen)}, indent=1) + "\n")
+    shutil.rmtree(run.folder / FOLDER, ignore_errors=True)
+    return chosen
+
+
+def _predicted_fold(
+    run: Run,
+    fitted: Fitted,
+    fold: Split,
+    folder: Path,
+    candidates: Candidates,
+    session: Session,
+    report: Callable[[float], None],
+) -> tuple[IntArray, NDArray[np.float32]]:
+    """Receivers of a fold and predictions at the candidates by a model fitted to it; a finished fit is read.
+
+    A model whose parameters are not the fit is given the fold's rows: fitting a hybrid to each fold takes minutes.
+    """
+    record = run.problem.record
+    if (refit := fitted.refit(record, fold.all_train)) is not None:
+        numbers, _ = fitted_receivers(record, [fold])
+        return numbers, predict_candidates(refit, numbers, headings_of(run), candidates, report)
+    file = folder.with_suffix(".npz")
+    arrays = stored_arrays(file) if file.exists() else {}
+    if "predicted" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
+        folder.mkdir(parents=True, exist_ok=True)  # with the files of a stopped fit, if any
+        # One line for all folds: a fit may have twenty stages.
+        inner = replace(session, folder=folder, run=folder, on_progress=lambda *_: report(0.0))
+        with threadpool_limits(1, "blas"):
+            of_fold, numbers = fit_fold(run.model, run.problem, fold, inner)
+            places = np.arange(len(numbers))
+            predicted = predict_candidates(of_fold.tracing_once(), places, headings_of(run), candidates, report)
+        arrays = {"predicted": predicted, "positions_m": candidates.positions_m, "receivers": numbers}
+        write_arrays(file, arrays)
+        shutil.rmtree(folder)
+    return arrays["receivers"], arrays["predicted"]
+
+
+def folds_of(record: Record, split: Split) -> list[Split]:
+    """Hold-outs of other seeds (`hold_out`), whose likelihoods are compared; none where no rows can be held out."""
+    folds = [hold_out(record, replace(split, seed=split.seed + number)) for number in range(FOLDS)]
+    return [fold for fold in folds if fold is not None]
+
+
+def choose(
+    record: Record, parts: Sequence[Located], candidates: Candidates, report: Callable[[float], None]
+) -> Calibration:
+    """The likelihood with the best score on held-out rows.
+
+    Degrees of freedom and scale are chosen together (`widest`), then the common offset. That and a probability of
+    receiving nothing (`Silence`), each fold scored by the other folds', are kept where they raise the score by more
+    than the standard error.
+    """
+    forms = [Likelihood(degrees, scale) for degrees in DEGREES for scale in SCALES]
+    steps = len(forms) + len(OFFSETS_DB) + 1
+    scores: dict[str, float] = {}
+
+    def score(likelihoods: Sequence[Likelihood]) -> FloatArray:
+        of_parts = [_scores(record, part, form, candidates) for part, form in zip(parts, likelihoods, strict=True)]
+        report((len(scores) + 1) / steps)
+        return np.concatenate(of_parts)
+
+    def scored(tried: Sequence[Likelihood]) -> list[FloatArray]:
+        of_forms = []
+        for form in tried:
+            of_forms.append(score([form] * len(parts)))
+            scores[_words(form)] = float(of_forms[-1].mean())
+        return of_forms
+
+    best = widest(forms, scored(forms))
+    shared = [replace(best, offset_db=offset) for offset in OFFSETS_DB]
+    plain, *others = scored(shared)
+    gains = [0.0, *(_clear_gain(other - plain) for other in others)]
+    best = shared[int(np.argmax(gains))]
+    silences = _silences_of_others(record, parts)
+    if (silence := fit_silence(record, parts)) is not None:
+        # Each fold is scored by the probability of the other folds, so that it cannot describe itself.
+        gain = score([replace(best, silence=others) for others in silences]) - score([best] * len(parts))
+        scores["with receivers that received nothing"] = scores[_words(best)] + float(gain.mean())
+        if _clear_gain(gain) > 0:
+            best = replace(best, silence=silence)
+    errors_m, inside = _located(record, parts, candidates, best)
+    report(1.0)
+    return Calibration(best, None, len(errors_m), float(np.mean(errors_m)), float(np.mean(inside)), scores=scores)
+
+
+def _silences_of_others(record: Record, parts: Sequence[Located]) -> list[Silence | None]:
+    """Probability of receiving nothing for each fold, fitted to the others; to the only one where there are none."""
+    return [fit_silence(record, [other for other in parts if other is not part] or parts) for part in parts]
+
+
+def _located(
+    record: Record, parts: Sequence[Located], candidates: Candidates, form: Likelihood
+) -> tuple[list[float], list[bool]]:
+    """Horizontal errors of held-out rows in metres, and whether the region holds their position."""
+    errors_m, inside = [], []
+    for part in parts:
+        for row, truth, place in zip(part.rows, part.truth, record.tx_pos_m[part.rows], strict=True):
+            probability = softmax(form.log(_strengths(record, part, row), *part.predicted))
+            estimate, _, region = region_of(probability, candidates.distance_m, LEVEL)
+            errors_m.append(float(np.linalg.norm((candidates.positions_m[estimate] - place)[:2])))
+            inside.append(bool(region[truth]))
+    return errors_m, inside
+
+
+def widest(forms: Sequence[Likelihood], scores: Sequence[FloatArray]) -> Likelihood:
+    """The form with the widest residuals among those whose scores [m] are within a standard error of the best.
+
+    Held-out rows share the conditions of the training rows, and few of them tell forms apart by chance; the rows to be
+    located have errors of another day (Breiman et al., "Classification and regression trees" (1984), section 3.4.3: the
+    rule of one standard error).
+    """
+    best = scores[int(np.argmax([of_form.mean() for of_form in scores]))]
+    able = [form for form, of_form in zip(forms, scores, strict=True) if _clear_gain(best - of_form) <= 0]
+    # Student's t of infinitely many degrees of freedom is normal.
+    return max(able, key=lambda form: form.scale * student_t(form.degrees or np.inf).ppf(WIDE))
+
+
+def _clear_gain(difference: FloatArray) -> float:
+    """Mean of differences [m] where it exceeds its standard error, else 0."""
+    mean = float(difference.mean())
+    return mean if mean > difference.std() / np.sqrt(len(difference)) else 0.0
+
+
+def _strengths(record: Record, part: Located, row: int) -> FloatArray:
+    return np.asarray(record.observation[part.receivers, row], float)
+
+
+def _words(form: Likelihood) -> str:
+    shape = "normal" if form.degrees is None else f"Student-t of {form.degrees:g} degrees"
+    offset = f", common offset of {form.offset_db:g} dB" if form.offset_db else ""
+    return f"{shape}, {form.scale:g} standard deviations{offset}"
+
+
+def _scores(record: Record, part: Located, form: Likelihood, candidates: Candidates) -> FloatArray:
+    """Log posterior density [m] at the true positions of held-out rows, per square metre."""
+    densities = []
+    for row, truth in zip(part.rows, part.truth, strict=True):
+        log = form.log(_strengths(record, part, row), *part.predicted)
+        densities.append(log[truth] - np.logaddexp.reduce(log))
+    return np.asarray(densities) - np.log(candidates.cell_m2 or 1.0)
+
+
+def fit_silence(record: Record, parts: Sequence[Located]) -> Silence | None:
+    """Probability of receiving nothing from held-out rows; None where it does not fall with the predicted strength."""
+    mean = np.concatenate([part.predicted[0][:, :, part.truth].mean(axis=0).ravel() for part in parts])
+    received = np.concatenate([np.isfinite(record.observation[p.receivers][:, p.rows]).ravel() for p in parts])
+    if received.all() or not received.any():
+        return None
+    middle, spread = float(mean.mean()), float(mean.std()) or 1.0
+    fit = LogisticRegression().fit((mean[:, None] - middle) / spread, received)
+    slope, intercept = float(fit.coef_[0, 0]), float(fit.intercept_[0])
+    return Silence(middle - intercept / slope * spread, slope / spread) if slope > 0 else None

@@ -1,0 +1,275 @@
+"""Observations from a CSV file, positions to one, and their picture."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch
+
+from ...core import DataFault, InputError, Receiver
+from ...core.angles import FloatArray
+from ...core.files import listed, one_line, text_lines, write_csv
+from ...core.types import IntArray
+from ...core.yaml_files import read_yaml
+from ...datasets.folder_files import CsvTable, read_csv
+from ...runs.folder import load_rows
+from ...runs.run import Run
+from ...tasks.scores import summary
+from ..importing.importing import FACTS
+from ..importing.observed import ObservedTable, read_observed
+from ..importing.readings import id_key
+from .locate import LocatedPositions
+from .picture import scene_cuts
+
+logger = logging.getLogger(__name__)
+
+DBM, RSSI, ANCHOR = "_dbm", "rssi_", "anchor"
+"""Columns are ``<receiver>_dbm``, or ``rssi_<receiver>``, where the name of ``anchor<number>`` is its number."""
+SILENT = "no receiver of the run received anything, so there is no position; remove the row"
+SHOWN, COLUMNS = 6, 3  # number of rows that are drawn, and panels side by side
+MARGIN_M = 0.5  # margin of a panel around the candidates
+REGION, ESTIMATE, NEIGHBOURS, TRUTH = "tab:orange", "tab:red", "tab:purple", "black"
+
+
+def read_observations(
+    path: str | Path, receivers: Sequence[Receiver], left_out: Collection[str] = (), data: str | Path | None = None
+) -> tuple[FloatArray, FloatArray | None]:
+    """Read the signal strengths [n_rx, m] of each receiver, and true positions [m, 2] or None, from a table.
+
+    A column ``<receiver>_dbm``, as ``wrf-mi predict`` writes it, or ``rssi_<receiver>``, as data sets have it, is
+    needed for each receiver; a field is empty where nothing was received (NaN). Columns ``x`` and ``y``, if any, are
+    true positions in metres. Other columns are ignored, also those of receivers that the run left out of its data. A
+    table without such columns, or from which the run's data were imported, is read as `wrf_mi.import_measurements`
+    reads it (`read_observed`).
+
+    Args:
+        path: the table.
+        receivers: receivers of the run.
+        left_out: names of receivers that the run left out of its data.
+        data: folder of the run's data, whose ``import.yml``, if any, states the frame of positions.
+
+    Raises:
+        InputError: missing or unreadable, receivers without a column or with several, columns of unknown receivers, a
+            field that is no number, or a row without any strength.
+    """
+    path, names = Path(path), [receiver.name for receiver in receivers]
+    facts_file = None if data is None else Path(data) / FACTS
+    facts = {} if facts_file is None or not facts_file.is_file() else read_yaml(facts_file)
+    # A table that was imported may have columns named as in data sets, and positions in another frame.
+    was_imported = path.name in facts.get("files", ()) and path.resolve().parent != Path(data or "").resolve()
+    if was_imported or not _has_layout(path, names):
+        return _imported(read_observed(path, facts), names, left_out)
+    table = read_csv(path, skip_blank=True)
+    columns = _columns(table, names, left_out, imported=bool(facts))
+    values = np.stack([table.numbers(column, may_be_empty=True) for column in columns])
+    if len(silent := _silent(values)):
+        raise DataFault(table.path, SILENT, row=int(silent[0]) + 1)
+    stated = [axis for axis in "xy" if axis in table.header]
+    if len(stated) == 1:
+        raise DataFault(table.path, f"column {stated[0]} alone is no position; give x and y, or neither", line=1)
+    return values, np.stack([table.numbers(axis) for axis in "xy"], axis=1) if stated else None
+
+
+def _has_layout(path: Path, names: Sequence[str]) -> bool:
+    """Whether a file is CSV with a column of a receiver that is named as in data sets and predictions."""
+    try:
+        header = [name.strip() for name in next(iter(text_lines(path)), "").split(",")]
+    except InputError:  # no text in UTF-8
+        return False
+    return not {column for name in names for column in _able(name)}.isdisjoint(header)
+
+
+def _imported(
+    observed: ObservedTable, names: Sequence[str], left_out: Collection[str]
+) -> tuple[FloatArray, FloatArray | None]:
+    """Strengths [n_rx, m] of the receivers of a run from a table, and true positions [m, 2] or None."""
+    numbers = {key: number for number, name in enumerate(names) for key in _keys(name)}
+    number_of = [numbers.get(id_key(name), -1) for name in observed.ids]
+    file, heard = observed.table.files[0][0], np.array(number_of) >= 0
+    lacking = [name for number, name in enumerate(names) if number not in number_of]
+    if not heard.any() or (lacking and not observed.is_long):
+        text = f"no strengths of {_receivers(lacking)} among {one_line(listed(observed.ids))}"
+        raise DataFault(file, f"{text}; name each as in the data of the run")
+    known = {key for name in left_out for key in _keys(name)} | numbers.keys()
+    if unknown := [name for name in observed.ids if id_key(name) not in known]:
+        logger.warning("%s: %d receivers unknown to the run are not used: %s", file, len(unknown), listed(unknown))
+    values = np.full((len(names), len(observed.first_row)), np.nan)
+    values[np.array(number_of)[heard]] = observed.dbm[heard]
+    if len(silent := _silent(values)):
+        raise observed.table.fault(SILENT, int(observed.first_row[silent[0]]))
+    return values, observed.xy_m
+
+
+def _silent(values: FloatArray) -> IntArray:
+    """Columns of strengths [n_rx, m] without any."""
+    return np.flatnonzero(~np.isfinite(values).any(axis=0))
+
+
+def _keys(name: str) -> set[str]:
+    """Ids of a table, as `id_key` compares them, that are a receiver's."""
+    return {id_key(name), id_key(name.removeprefix(ANCHOR))}
+
+
+def _receivers(names: Sequence[str]) -> str:
+    return f"receiver{'s' if len(names) > 1 else ''} {one_line(listed(names))}"
+
+
+def _columns(table: CsvTable, names: Sequence[str], left_out: Collection[str], imported: bool) -> list[str]:
+    """Columns of the receivers; `DataFault` with all receivers that lack one or have two, and all unknown columns.
+
+    Unknown columns of data that were imported are of receivers that the import left out, and ignored.
+    """
+    stated = {name: [column for column in _able(name) if column in table.header] for name in names}
+    faults: dict[str, str] = {}  # what is wrong by its remedy
+    if lacking := [name for name in names if not stated[name]]:
+        able = " or ".join(map(one_line, _able(lacking[0])))
+        remedy = f"name one {able}" + ", and so on" * (len(lacking) > 1)
+        faults[f"{remedy}, and leave it empty where nothing was received"] = f"no column of {_receivers(lacking)}"
+    if doubled := [f"{columns[0]} and {columns[1]}" for columns in stated.values() if len(columns) > 1]:
+        faults["remove one of them"] = f"{one_line(listed(doubled))} are of one receiver"
+    known = {column for name in (*names, *left_out) for column in _able(name)}
+    strengths = [column for column in table.header if column.endswith(DBM) or column.startswith(RSSI)]
+    if (unknown := [column for column in strengths if column not in known]) and not imported:
+        verb = "columns {} name" if len(unknown) > 1 else "column {} names"
+        text = f"{verb.format(one_line(listed(unknown)))} no receiver of the run ({one_line(listed(names))})"
+        faults[f"rename or remove {'them' if len(unknown) > 1 else 'it'}"] = text
+    if faults:
+        raise DataFault(table.path, f"{', and '.join(faults.values())}; {', and '.join(faults)}", line=1)
+    return [columns[0] for columns in stated.values()]
+
+
+def _able(name: str) -> list[str]:
+    """Names that the column of a receiver may have."""
+    number = name.removeprefix(ANCHOR)
+    return [f"{name}{DBM}", f"{RSSI}{name}", *([f"{RSSI}{number}"] if number.isdecimal() else [])]
+
+
+def test_observations(run: Run) -> tuple[FloatArray, FloatArray]:
+    """Signal strengths of the test rows of a run that were received, and true positions, as `read_observations`."""
+    record = run.problem.record
+    rows = load_rows(run.folder, record).test
+    if not len(rows):
+        text = "its split holds no rows out, which could be located; give a file of strengths"
+        raise InputError(f"{run.folder}: {text} (positions of receivers are estimated by train)")
+    rows = rows[np.isfinite(record.observation[:, rows]).any(axis=0)]
+    return np.asarray(record.observation[:, rows], float), np.asarray(record.tx_pos_m[rows, :2], float)
+
+
+def write_positions_file(out: Path, located: LocatedPositions, true_m: FloatArray | None = None) -> Path:
+    """Write positions as a CSV file, a row for each observation in their order.
+
+    Columns: ``x``, ``y``, ``z``, estimate in metres; ``radius_m`` and ``area_m2``, circle around it and region that
+    hold the probability ``level``; ``knn_x``, ``knn_y``, nearest neighbours; and where true positions are known
+    ``true_x``, ``true_y``, ``error_m`` and ``inside``, 1 where the region holds the true position.
+    """
+    columns: dict[str, Any] = dict(zip("xyz", located.tx_pos_m.T, strict=True))
+    columns |= {"radius_m": located.radius_m, "area_m2": located.area_m2, "level": np.full(len(located), located.level)}
+    if located.neighbours_m is not None:
+        columns |= {"knn_x": located.neighbours_m[:, 0], "knn_y": located.neighbours_m[:, 1]}
+    if true_m is not None:
+        columns |= {"true_x": true_m[:, 0], "true_y": true_m[:, 1], "error_m": located.error_m(true_m)}
+        columns["inside"] = located.covers(true_m).astype(int)
+    rounded = [values if values.dtype.kind in "iu" else values.astype(float).round(4) for values in columns.values()]
+    return write_csv(out, columns, zip(*rounded, strict=True))
+
+
+def posterior_arrays(located: LocatedPositions) -> dict[str, Any]:
+    """Probabilities over the grid: ``x_m`` [nx], ``y_m`` [ny], ``height_m``, ``probability`` [m, ny, nx]."""
+    grid = located.candidates.grid
+    spread = np.zeros((len(located), len(grid.x_m) * len(grid.y_m)), np.float32)
+    spread[:, located.candidates.inside] = located.probability
+    shape = (len(located), len(grid.y_m), len(grid.x_m))
+    return {"x_m": grid.x_m, "y_m": grid.y_m, "height_m": grid.height_m, "probability": spread.reshape(shape)}
+
+
+def figures_of(located: LocatedPositions, true_m: FloatArray | None = None) -> dict[str, Any]:
+    """Figures of positions: likelihood, held-out rows, regions, and errors where true positions are known."""
+    chosen = located.calibration
+    figures: dict[str, Any] = {"n": len(located), "level": located.level, "likelihood": asdict(chosen.likelihood)}
+    figures |= {"area_m2": summary(located.area_m2), "radius_m": summary(located.radius_m)}
+    figures |= {"at_border": int(located.at_border.sum()), "training_rows_outside": located.rows_outside}
+    if chosen.neighbours is not None:
+        figures["neighbours"] = asdict(chosen.neighbours)
+        names = ("rows", "error_m", "inside", "neighbours_error_m")
+        figures["held_out"] = {name: getattr(chosen, name) for name in names}
+    if true_m is not None:
+        figures |= {"error_m": summary(located.error_m(true_m)), "inside": float(located.covers(true_m).mean())}
+        figures["outside"] = int(located.candidates.outside(true_m).sum())
+        if (near := located.neighbours_error_m(true_m)) is not None:
+            figures["neighbours_error_m"] = summary(near)
+    return figures
+
+
+def draw_positions(run: Run, located: LocatedPositions, true_m: FloatArray | None = None) -> Figure:
+    """Rows at equal spacing: probability, region, estimate, nearest neighbours and, if known, true positions [m, 2]."""
+    rows = np.unique(np.linspace(0, len(located) - 1, min(SHOWN, len(located))).round().astype(int))
+    columns = min(COLUMNS, len(rows))
+    lines = -(-len(rows) // columns)
+    arrays, walls = posterior_arrays(located), scene_cuts(run, located.candidates.grid.height_m)
+    size = np.array([np.ptp(arrays["x_m"]), np.ptp(arrays["y_m"])]) + 1.0
+    height = 3.6 * float(np.clip(size[1] / size[0], 0.4, 2.0)) + 0.6
+    figure = Figure(figsize=(3.6 * columns + 0.3, height * lines + 0.5), layout="constrained", facecolor="white")
+    panels = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axes, row in zip(panels, rows, strict=False):
+        _draw_row(axes, arrays, located, int(row), true_m)
+        for lines_m in walls:
+            axes.add_collection(LineCollection(list(lines_m), colors="0.35", linewidths=1.2))
+        place = np.stack([receiver.position_m[:2] for receiver in run.receivers])
+        axes.plot(*place.T, "^", color="tab:blue", markersize=6, markeredgecolor="white")
+        for grid_m, set_limits in ((arrays["x_m"], axes.set_xlim), (arrays["y_m"], axes.set_ylim)):
+            set_limits(grid_m[0] - MARGIN_M, grid_m[-1] + MARGIN_M)
+        axes.set_aspect("equal")
+        axes.tick_params(labelsize=7)
+    for axes in panels[len(rows) :]:
+        axes.set_visible(False)
+    figure.supxlabel("x (m)", fontsize=8)
+    figure.supylabel("y (m)", fontsize=8)
+    dot: dict[str, Any] = {"linestyle": "none"}
+    handles: list[Any] = [
+        Patch(color="tab:green", alpha=0.6, label="probability"),
+        Line2D([], [], color=REGION, label=f"{located.level:.0%} region"),
+        Line2D([], [], marker="o", color=ESTIMATE, label="estimate", **dot),
+        Line2D([], [], color=ESTIMATE, linestyle=":", label=f"circle of {located.level:.0%}"),
+    ]
+    if located.calibration.neighbours is not None:
+        name = f"{located.calibration.neighbours.count} nearest neighbours"
+        handles.append(Line2D([], [], marker="s", color=NEIGHBOURS, label=name, **dot))
+    if true_m is not None:
+        handles.append(Line2D([], [], marker="+", color=TRUTH, markeredgewidth=2, label="true position", **dot))
+    handles.append(Line2D([], [], marker="^", color="tab:blue", label="receiver", **dot))
+    figure.legend(handles=handles, loc="outside upper center", ncols=4, fontsize=8)
+    return figure
+
+
+def _draw_row(
+    axes: Axes, arrays: dict[str, Any], located: LocatedPositions, row: int, true_m: FloatArray | None
+) -> None:
+    grid = located.candidates.grid
+    drawn = arrays["probability"][row]
+    axes.pcolormesh(grid.x_m, grid.y_m, np.where(drawn > 0, drawn, np.nan), shading="nearest", cmap="Greens")
+    inside = np.zeros(drawn.size)
+    inside[located.candidates.inside] = located.region[row]
+    if min(drawn.shape) > 1:
+        # A border of zeros closes outlines at the edge of the grid.
+        x, y = (np.concatenate([[2 * a[0] - a[1]], a, [2 * a[-1] - a[-2]]]) for a in (grid.x_m, grid.y_m))
+        bordered = np.pad(inside.reshape(drawn.shape), 1)
+        axes.contour(x, y, bordered, levels=[0.5], colors=REGION, linewidths=1.4)
+    x_m, y_m = located.tx_pos_m[row, :2]
+    axes.add_patch(Circle((x_m, y_m), located.radius_m[row], fill=False, color=ESTIMATE, linewidth=0.8, linestyle=":"))
+    axes.plot(x_m, y_m, "o", color=ESTIMATE, markersize=6)
+    if located.neighbours_m is not None:
+        axes.plot(*located.neighbours_m[row, :2], "s", color=NEIGHBOURS, markersize=5)
+    title = f"row {row + 1}: {located.area_m2[row]:.1f} m²"
+    if true_m is not None:
+        axes.plot(*true_m[row], "+", color=TRUTH, markersize=11, markeredgewidth=2)
+        title += f", error {located.error_m(true_m)[row]:.2f} m"
+    axes.set_title(title, fontsize=9)

@@ -1,0 +1,324 @@
+"""Picture of a radio map: power, standard deviation and coverage over plan or mesh, with the measured points."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from numpy.typing import NDArray
+
+from ...core import Prediction
+from ...core.angles import FloatArray
+from ...core.carriers import FREQUENCY
+from ...models.receiver_places import stored_places
+from ...runs.figures import without_formulas
+from ...runs.folder import load_rows
+from ...runs.results import RECEPTION
+from ...runs.run import Run
+from ...runs.scene_view import surfaces_of
+from ...scene.mesh.surfaces import cut_lines
+from ...scene.preview import AZIMUTH_DEG, ELEVATION_DEG, MOST_FACES
+from ...tasks import task_of
+from .dataset import COVERAGE, POWER, STD, STD_OF_MEAN
+
+if TYPE_CHECKING:
+    import xarray
+
+PANEL_IN, BAR_IN, COLUMNS = 3.2, 0.5, 3  # width of a panel and of its colour scale; number of panels in a line
+MOST_PANELS = 12  # largest number of receivers that are drawn, the first ones
+MOST_POINTS = 250  # largest number of training rows of a panel, and of other measured rows
+TAIL = 1.0  # percentage of values beyond either end of the colour scale
+MEASURED_TAIL = 10.0  # likewise for measured levels, among which are single deep fades
+STRONGEST = "strongest receiver"
+TRAINED = {"marker": "o", "s": 13, "edgecolors": "white", "linewidths": 0.4}
+OTHER = {"marker": "s", "s": 11, "edgecolors": "black", "linewidths": 0.4}
+EDGE = 0.02  # margin around all that is drawn, a share of its size
+NEARBY = 0.25  # distance from the rest of a map up to which estimated receivers are drawn, a share of its size
+ESTIMATED: dict[str, Any] = {"marker": "X", "s": 26, "facecolors": "none"}  # receiver at an estimated place
+RED = "#c1121f"  # of receivers
+MOST_DEVIATIONS = 3  # number of receivers up to which the standard deviation of each is drawn
+CERTAIN = 0.9  # least coverage of a panel in one colour, whose title states the values
+LETTERS_PER_INCH, LINE_IN = 14, 0.16  # of the text above the panels, and height of its lines in inches
+SAME_CARRIER = 1e-9  # relative difference of frequencies that are the same
+
+
+class _Measured(NamedTuple):
+    """Measured rows of a panel: positions [n, 3] in metres, levels [n], and whether each trained the model."""
+
+    points_m: FloatArray
+    level: FloatArray
+    trained: NDArray[np.bool_]
+
+
+class _Panel(NamedTuple):
+    """Values [y, x] or [point] with their colours and unit, and the sides on which values may lie beyond these.
+
+    ``number`` is the receiver's, None: all; ``measured`` are its rows.
+    """
+
+    title: str
+    values: FloatArray
+    colours: ScalarMappable
+    unit: str
+    beyond: Literal["neither", "both"]
+    number: int | None
+    measured: _Measured | None
+
+
+def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
+    """Expected power, its standard deviation and the coverage, of the strongest receiver; then power at each receiver,
+    and of at most `MOST_DEVIATIONS` receivers the standard deviation at each.
+
+    Walls are the cut of the run's scene at the map's height; measured rows of the run's data at this receiver and at
+    the map's carrier have their measured level as colour, circles those that trained the model, squares all others.
+    """
+    flat = "point" not in dataset.sizes
+    measured = [_measured(dataset, run, k) for k in range(dataset.sizes["receiver"])]
+    panels, estimated = _panels(dataset, measured), stored_places(run.folder)
+    lines = -(-len(panels) // COLUMNS)
+    columns = min(COLUMNS, len(panels))
+    width = (PANEL_IN + BAR_IN) * columns
+    walls = scene_cuts(run, float(dataset["height"])) if flat else []
+    area_m = _area(dataset, measured, estimated, walls)
+    at_m, around_m = _receivers(dataset)[:, : area_m.shape[1]], NEARBY * np.ptp(area_m, axis=0).max()
+    is_drawn = ((at_m >= area_m[0] - around_m) & (at_m <= area_m[1] + around_m)).all(axis=1)
+    area_m = _with_margin(np.concatenate([area_m, at_m[is_drawn]]))
+    heading = _heading(dataset, measured, estimated, is_drawn, int(width * LETTERS_PER_INCH))
+    height = (PANEL_IN * _aspect(dataset) + 0.5) * lines + 0.3 + LINE_IN * heading.count("\n")
+    figure = Figure(figsize=(width, height), layout="constrained")
+    kind: dict[str, Any] = {} if flat else {"projection": "3d", "computed_zorder": False}
+    grid = figure.subplots(lines, columns, squeeze=False, subplot_kw=kind)
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        if panel is None:
+            axes.set_axis_off()
+            continue
+        if flat:
+            _draw_plan(axes, dataset, panel.values, panel.colours, walls)
+            axes.set_xlabel("x (m)", fontsize=7)
+            axes.set_ylabel("y (m)", fontsize=7)
+        else:
+            _draw_mesh(axes, dataset, panel.values, panel.colours)
+        _draw_points(axes, dataset, panel, estimated, is_drawn)
+        if flat:  # of which ellipses may reach beyond
+            axes.set(xlim=area_m[:, 0], ylim=area_m[:, 1])
+        axes.set_title(textwrap.fill(panel.title, int(PANEL_IN * LETTERS_PER_INCH)), fontsize=8)
+        axes.tick_params(labelsize=6)
+        bar = figure.colorbar(panel.colours, ax=axes, shrink=0.8, pad=0.02 if flat else 0.12, extend=panel.beyond)
+        bar.ax.tick_params(labelsize=6)
+        top = f" (largest: {np.nanmax(panel.values):.0f})" if panel.beyond == "both" else ""
+        bar.set_label(f"{panel.unit}{top}", fontsize=7)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_axis_off()
+    figure.suptitle(heading, fontsize=8)
+    return without_formulas(figure)
+
+
+def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Panel | None]:
+    """Panels of the strongest receiver, then of each of the first ones, in lines; None leaves a place free."""
+    power = dataset[POWER].values
+    low, high = _range(power, np.concatenate([rows.level for rows in measured]))
+    colours = ScalarMappable(Normalize(low, max(high, low + 1e-3)), "viridis")
+    unit = dataset[POWER].attrs["units"]
+    names = [str(name) for name in dataset["receiver"].values]
+    several = len(names) > 1
+    number = None if several else 0
+    who = STRONGEST if several else names[0]
+    # Positions without a value, inside solids, have none at any receiver.
+    best = np.where(np.isfinite(power), power, -np.inf).argmax(axis=0)[None]
+
+    def of_best(name: str) -> FloatArray:
+        return np.take_along_axis(dataset[name].values, best, axis=0)[0]
+
+    rows = None if several else measured[0]
+    panels: list[_Panel | None] = []
+    panels.append(_Panel(f"{who}: expected power", of_best(POWER), colours, unit, "both", number, rows))
+    # The map is of the mean power: its deviation where the model states it, else that of a reading.
+    deviation, of = (STD_OF_MEAN, "the mean") if STD_OF_MEAN in dataset else (STD, "a reading")
+    title, each = "{}: standard deviation of " + of, deviation in dataset and 1 < len(names) <= MOST_DEVIATIONS
+    if deviation in dataset:
+        drawn = dataset[deviation].values if each else of_best(deviation)
+        shades = ScalarMappable(Normalize(0, max(float(np.nanmax(drawn)), 1e-3)), "magma")
+        panels.append(_Panel(title.format(who), of_best(deviation), shades, "dB", "neither", number, None))
+    if COVERAGE in dataset:
+        probable = ScalarMappable(Normalize(0, 1), "cividis")
+        values = of_best(COVERAGE)
+        panels.append(_Panel(_covered(dataset, who, values), values, probable, "probability", "neither", number, None))
+    numbers = range(len(names) if several else 0)[:MOST_PANELS]
+    powers = [_Panel(f"{names[k]}: expected power", power[k], colours, unit, "both", k, measured[k]) for k in numbers]
+    if not each:
+        return panels + powers
+    std = dataset[deviation].values
+    spreads = [_Panel(title.format(names[k]), std[k], shades, "dB", "neither", k, None) for k in numbers]
+    return [panel for line in (panels, powers, spreads) for panel in (*line, *[None] * (COLUMNS - len(line)))]
+
+
+def _covered(dataset: xarray.Dataset, who: str, values: FloatArray) -> str:
+    """Title of the coverage: what the probability is of, and its values where all of them have one colour."""
+    threshold = next(dataset.attrs[key] for key in ("threshold_dbm", "threshold_db") if key in dataset.attrs)
+    received = "reception and " if RECEPTION in dataset else ""
+    title = f"{who}: probability of {received}more than {threshold:g} {dataset[POWER].attrs['units']}"
+    low, high = np.nanmin(values), np.nanmax(values)
+    if low < CERTAIN:
+        return title
+    return f"{title}: {low:.2f} to {high:.2f} here" + (", as readings are lost at any power" if received else "")
+
+
+def _receivers(dataset: xarray.Dataset) -> FloatArray:
+    """Positions of receivers [n, 3], metres; NaN where unknown."""
+    return np.stack([dataset[f"receiver_{axis}"].values for axis in "xyz"], axis=-1)
+
+
+def _area(
+    dataset: xarray.Dataset, measured: Sequence[_Measured], estimated: Mapping[str, Any], walls: Sequence[FloatArray]
+) -> FloatArray:
+    """Least and largest coordinates [2, 2], of a mesh [2, 3], of all that is drawn but receivers at estimated places.
+
+    Those far outside, whose places are often uncertain, would shrink the map.
+    """
+    axes, names = "xy" if "point" not in dataset.sizes else "xyz", map(str, dataset["receiver"].values)
+    stated = _receivers(dataset)[[name not in estimated for name in names]]
+    points = [rows.points_m for rows in measured] + [stated]
+    shown = [np.concatenate([dataset[axis].values, *(part[:, k] for part in points)]) for k, axis in enumerate(axes)]
+    ends = np.array([[np.nanmin(values), np.nanmax(values)] for values in shown]).T
+    for lines in walls:
+        ends = np.stack([np.minimum(ends[0], lines.min(axis=(0, 1))), np.maximum(ends[1], lines.max(axis=(0, 1)))])
+    return ends
+
+
+def _with_margin(points_m: FloatArray) -> FloatArray:
+    """Least and largest coordinates [2, k] of points [n, k], with a margin for marks at the edge."""
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    margin_m = EDGE * (high - low).max()
+    return np.stack([low - margin_m, high + margin_m])
+
+
+def _heading(
+    dataset: xarray.Dataset,
+    measured: Sequence[_Measured],
+    estimated: Mapping[str, Any],
+    is_drawn: NDArray[np.bool_],
+    width: int,
+) -> str:
+    """Title, heights of the transmitter, carrier and marks, in lines of at most ``width`` letters."""
+    heights = np.concatenate([rows.points_m[:, 2] for rows in measured])
+    words = [] if "point" in dataset.sizes else [f"transmitter at z = {float(dataset['height']):.2f} m"]
+    if FREQUENCY in dataset.attrs:
+        words.append(f"{dataset.attrs[FREQUENCY] / 1e6:.6g} MHz")
+    if not len(heights):
+        words.append("no measured row at this carrier" if FREQUENCY in dataset.attrs else "no measured row")
+    elif f"{heights.min():.2f}" == f"{heights.max():.2f}":
+        words.append(f"measured at z = {heights.min():.2f} m")
+    else:
+        words.append(f"measured at z = {heights.min():.2f} to {heights.max():.2f} m")
+    trained = np.concatenate([rows.trained for rows in measured])
+    names = map(str, dataset["receiver"].values)
+    receivers = {name in estimated for name, drawn in zip(names, is_drawn, strict=True) if drawn}
+    outside = np.count_nonzero(np.isfinite(_receivers(dataset)).all(axis=1) & ~is_drawn)
+    marks = {
+        "circles: training rows": trained.any(),
+        "squares: other measured rows": not trained.all(),
+        "crosses: receivers": False in receivers,
+        "open crosses: receivers at estimated places, with one standard deviation": True in receivers,
+        f"{outside} estimated outside of the map, not drawn": outside,
+    }
+    parts = [dataset.attrs["title"], ", ".join(words), ", ".join(mark for mark, drawn in marks.items() if drawn)]
+    if not dataset.attrs["level_is_absolute"]:
+        parts.append("levels relative to full scale are no signal strengths")
+    return "\n".join(textwrap.fill(part, width) for part in parts)
+
+
+def _range(power: FloatArray, measured: FloatArray) -> tuple[float, float]:
+    """Ends of the colour scale: nearly all of the map, and all but the fades of the measured levels."""
+    ends = [np.percentile(power[np.isfinite(power)], [TAIL, 100 - TAIL])]
+    if len(measured):
+        ends.append(np.percentile(measured, [MEASURED_TAIL, 100 - MEASURED_TAIL]))
+    return float(np.min(ends)), float(np.max(ends))
+
+
+def _aspect(dataset: xarray.Dataset) -> float:
+    x_m, y_m = (np.ptp(dataset[axis].values) + 0.1 for axis in "xy")
+    return 0.9 if "point" in dataset.sizes else float(np.clip(y_m / x_m, 0.3, 1.6))
+
+
+def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:
+    """Lines [n, 2, 2] in which a height cuts surfaces of a run's scene, metres, of those that it cuts."""
+    scene = run.problem.opened_scene
+    cuts = [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
+    return [lines for lines in cuts if len(lines)]  # a floor has none
+
+
+def _draw_plan(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Any) -> None:
+    shades: Any = {"cmap": colours.cmap, "norm": colours.norm}
+    axes.pcolormesh(dataset["x"].values, dataset["y"].values, values, shading="nearest", rasterized=True, **shades)
+    for lines in walls:
+        axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2, capstyle="round"))
+    axes.set_aspect("equal")
+    axes.margins(0)
+
+
+def _draw_mesh(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable) -> None:
+    triangles = dataset["triangle"].values
+    area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+    largest = np.argsort(-area, kind="stable")[:MOST_FACES]
+    rgba = colours.to_rgba(np.ma.masked_invalid(values[largest]))
+    faces = Poly3DCollection(triangles[largest], facecolors=rgba, edgecolors="none", antialiaseds=False, zorder=1)
+    axes.add_collection3d(faces)
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    size = np.maximum(high - low, 0.05 * float((high - low).max()))
+    for axis, start, extent in zip("xyz", low, size, strict=True):
+        axes.set(**{f"{axis}lim": (start, start + extent)})
+        # Labels of a short axis would lie upon each other.
+        getattr(axes, f"{axis}axis").set_major_locator(MaxNLocator(max(1, round(6 * extent / size.max()))))
+        getattr(axes, f"set_{axis}label")(f"{axis} (m)", fontsize=7)
+    axes.set_box_aspect(size, zoom=0.85)
+    axes.set_proj_type("ortho")
+    axes.view_init(ELEVATION_DEG, AZIMUTH_DEG)
+
+
+def _measured(dataset: xarray.Dataset, run: Run, number: int) -> _Measured:
+    """Rows with a level at a receiver of a map, at its carrier, thinned."""
+    record, split = run.problem.record, load_rows(run.folder, run.problem.record)
+    task, index = task_of(record), int(np.atleast_1d(dataset.attrs["receiver_numbers"])[number])
+    added = float(dataset.attrs["transmit_power_dbm"]) if task.level_kind == "gain" else 0.0
+    level = task.level(Prediction(record.observation[index])).mean + added
+    known = np.isfinite(level) & np.isfinite(record.tx_pos_m).all(axis=1)
+    if record.carriers_hz is not None and FREQUENCY in dataset.attrs:
+        known &= np.isclose(record.carriers_hz, dataset.attrs[FREQUENCY], rtol=SAME_CARRIER, atol=0)
+    used = split.left[split.left[:, 0] == index, 1] if index in split.held_receivers else split.all_train
+    trained = np.isin(np.arange(len(known)), used)
+    kinds = (np.flatnonzero(known & part) for part in (trained, ~trained))
+    rows = np.concatenate([part[:: max(1, -(-len(part) // MOST_POINTS))] for part in kinds])
+    return _Measured(record.tx_pos_m[rows], level[rows], trained[rows])
+
+
+def _draw_points(
+    axes: Any, dataset: xarray.Dataset, panel: _Panel, estimated: Mapping[str, Any], is_drawn: NDArray[np.bool_]
+) -> None:
+    """Measured levels of a receiver, and the receivers as crosses, open with an ellipse where estimated."""
+    dims, at = 3 if "point" in dataset.sizes else 2, _receivers(dataset)
+    for k in np.flatnonzero(is_drawn) if panel.number is None else [panel.number] * bool(is_drawn[panel.number]):
+        place = estimated.get(str(dataset["receiver"].values[k]))
+        mark = {"marker": "x", "color": RED, "s": 22} if place is None else ESTIMATED | {"edgecolors": RED}
+        axes.scatter(*at[k, :dims, None], **mark, linewidths=1.4, zorder=5)
+        if place is not None and dims == 2:
+            spread = 2 * np.array(place["std_m"])[:2]
+            axes.add_patch(Ellipse((at[k, 0], at[k, 1]), *spread, fill=False, edgecolor=RED, linewidth=1, zorder=5))
+            paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
+            text = {"textcoords": "offset points", "fontsize": 6, "color": RED, "bbox": paper, "zorder": 5}
+            axes.annotate("estimated", at[k, :2], (7, 4), **text)
+    if panel.measured is None:
+        return
+    shades = {"cmap": panel.colours.cmap, "norm": panel.colours.norm}
+    # Training rows, often the fewer, lie above the others.
+    for rows, mark in ((~panel.measured.trained, OTHER), (panel.measured.trained, TRAINED)):
+        at_m = panel.measured.points_m[rows]
+        axes.scatter(*at_m.T[:dims], c=panel.measured.level[rows], **shades, **mark, zorder=4)
