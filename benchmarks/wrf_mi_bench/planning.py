@@ -3,8 +3,8 @@
 From ten random training rows, rows are added ten at a time by each rule, a model is fitted to them, and its error on
 the official test rows is stored. Rules are random rows, those that fill space (each the farthest from all before),
 those of the greatest variance, and those of `wrf_mi.plan`: `wrf_mi.apps.maps.plan.greedy` on the model's
-`error_prior`, for the error over the area in which rows could be chosen. Strengths are predicted by kriging about the local mean of the
-power traced in a known scene, as by the hybrid's mean and residual, spectra by kriging of their pixels. A scene is
+`error_prior`, for the error over the area in which rows could be chosen. Strengths are predicted by kriging about the
+local mean of the power traced in a known scene, as by the hybrid's mean and residual, spectra by kriging of their pixels. A scene is
 traced once for all fits.
 """
 

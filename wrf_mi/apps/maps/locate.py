@@ -1,7 +1,7 @@
 """Position of a transmitter from what the receivers of a run received.
 
 The posterior over candidate positions inside the area is the likelihood of the observation under the run's predictions
-(`wrf_mi.apps.maps.locate_likelihood`), whose form held-out training rows choose (`wrf_mi.apps.maps.locate_calibration`).
+(`wrf_mi.apps.maps.locate_likelihood`), whose form held-out rows choose (`wrf_mi.apps.maps.locate_calibration`).
 """
 
 from __future__ import annotations

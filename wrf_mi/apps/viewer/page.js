@@ -1,5 +1,5 @@
 "use strict";
-// The page of a view. Data are in the element "content" (wrf_mi/viewer/page.py); every layer makes its traces anew from
+// The page of a view. Data are in the element "content" (wrf_mi/apps/viewer/page.py); every layer makes its traces anew from
 // the state, and plotly draws those of the layers that are switched on.
 (() => {
   const data = JSON.parse(document.getElementById("content").textContent);
