@@ -34,7 +34,7 @@ from wrf_mi.datasets.argos import read_argos
 from wrf_mi.datasets.deepmimo import read_deepmimo
 from wrf_mi.datasets.nerf2_csi import write_nerf2_csi
 from wrf_mi.datasets.newrf import read_newrf, read_pickled_table
-from wrf_mi.models.checks import check_parts
+from wrf_mi.estimators.checks import check_parts
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.prediction_file import read_inputs
 from wrf_mi.runs.results import read_run

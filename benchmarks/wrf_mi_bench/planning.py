@@ -4,8 +4,8 @@ From ten random training rows, rows are added ten at a time by each rule, a mode
 the official test rows is stored. Rules are random rows, those that fill space (each the farthest from all before),
 those of the greatest variance, and those of `wrf_mi.plan`: `wrf_mi.apps.maps.plan.greedy` on the model's
 `error_prior`, for the error over the area in which rows could be chosen. Strengths are predicted by kriging about the
-local mean of the power traced in a known scene, as by the hybrid's mean and residual, spectra by kriging of their pixels. A scene is
-traced once for all fits.
+local mean of the power traced in a known scene, as by the hybrid's mean and residual, spectra by kriging of their
+pixels. A scene is traced once for all fits.
 """
 
 import tempfile
@@ -26,10 +26,10 @@ from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets import make_splits
+from wrf_mi.estimators.error_prior import ErrorPrior
+from wrf_mi.estimators.interpolation.kriging import Kriging
+from wrf_mi.estimators.interpolation.strengths import fit_strengths
 from wrf_mi.models import Inputs
-from wrf_mi.models.error_prior import ErrorPrior
-from wrf_mi.models.interpolation.kriging import Kriging
-from wrf_mi.models.interpolation.strengths import fit_strengths
 from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.scene.make import make_scene
 from wrf_mi.stages.strengths import SMOOTH_M, SPACING_M, TRACE

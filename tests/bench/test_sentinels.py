@@ -189,7 +189,7 @@ def test_source_of_a_result_has_what_its_module_imports_and_the_models_that_it_n
     rows = [
         needed_files(*modules_of_command(f"wrf-mi train rfid-lab --model {name}".split())) for name in ("idw", "fire")
     ]
-    assert ["wrf_mi/models/uplink/fire.py" in files for files in rows] == [False, True]
+    assert ["wrf_mi/estimators/uplink/fire.py" in files for files in rows] == [False, True]
 
 
 def test_results_of_changed_source_are_listed(tmp_path, capsys):

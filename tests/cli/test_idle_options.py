@@ -10,7 +10,7 @@ import pytest
 from commands import Command, positions_file
 
 from wrf_mi.core import InputError
-from wrf_mi.models.ray_tracing import TracingSettings
+from wrf_mi.estimators.ray_tracing import TracingSettings
 from wrf_mi.runs.api import plan_run, train
 from wrf_mi.runs.folder import RunRequest
 from wrf_mi.tracing import TraceOptions

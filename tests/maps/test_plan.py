@@ -20,9 +20,9 @@ from wrf_mi.apps.maps.grid import STANDING_M
 from wrf_mi.apps.maps.plan import error_priors, greedy, plan
 from wrf_mi.apps.maps.plan_losses import SURFACE_DB
 from wrf_mi.apps.maps.plan_picture import summary
-from wrf_mi.models.error_prior import ErrorPrior, with_columns
-from wrf_mi.models.interpolation.kriging import Kriging, UncertainKriged
-from wrf_mi.models.interpolation.kriging_equations import KrigingSystem, correlation
+from wrf_mi.estimators.error_prior import ErrorPrior, with_columns
+from wrf_mi.estimators.interpolation.kriging import Kriging, UncertainKriged
+from wrf_mi.estimators.interpolation.kriging_equations import KrigingSystem, correlation
 
 EXACT = 1e-9  # of variances in double precision
 

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.constants import epsilon_0
 
 from wrf_mi.apps.maps.plan_losses import SURFACE_DB, Told, greedy_losses, loss_std_db, losses_of
-from wrf_mi.models.error_prior import ErrorPrior
-from wrf_mi.models.interpolation.kriging_equations import correlation
+from wrf_mi.estimators.error_prior import ErrorPrior
+from wrf_mi.estimators.interpolation.kriging_equations import correlation
 
 EXACT = 1e-6  # relative, of variances: the process has a jitter of 1e-9 of its own
 STD_DB = np.array([2.0, 3.0, 1.0])

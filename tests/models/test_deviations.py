@@ -11,7 +11,7 @@ import pytest
 from wrf_mi.core import Prediction, Receiver, Record
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.types import Inputs
-from wrf_mi.models.interpolation.strengths import Strengths, fit_strengths
+from wrf_mi.estimators.interpolation.strengths import Strengths, fit_strengths
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.other_models import score_predictions
 from wrf_mi.runs.results import read_run

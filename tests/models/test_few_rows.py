@@ -13,7 +13,7 @@ from made_building import FITS, PLACES_M, TRAINED, building
 from wrf_mi.core import InputError, Record
 from wrf_mi.core.types import Inputs
 from wrf_mi.datasets import write_ble_folder
-from wrf_mi.models.few_rows import SharedLaw
+from wrf_mi.estimators.few_rows import SharedLaw
 from wrf_mi.runs.api import open_run, train
 
 NAMES = list(PLACES_M)

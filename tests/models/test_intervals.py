@@ -13,9 +13,9 @@ from scipy.stats import norm
 import wrf_mi
 from wrf_mi.core import InputError, Record, Split
 from wrf_mi.datasets import load, make_splits
+from wrf_mi.estimators.held_out import held_out_predictions
+from wrf_mi.estimators.model import default_settings
 from wrf_mi.models import MODELS, Problem, Session
-from wrf_mi.models.held_out import held_out_predictions
-from wrf_mi.models.model import default_settings
 from wrf_mi.scene.correction_data import FILE, CorrectionData
 from wrf_mi.tasks.scores import crps, inside_interval
 from wrf_mi.training.by_distance import fit_intervals

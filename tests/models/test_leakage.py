@@ -12,8 +12,8 @@ from made_channels import channels
 from wrf_mi.backend import init
 from wrf_mi.core import Record, Split
 from wrf_mi.datasets import load
+from wrf_mi.estimators.model import Arrays, default_settings
 from wrf_mi.models import MODELS, Problem, Session
-from wrf_mi.models.model import Arrays, default_settings
 
 STEPS = ("steps=3", "log_every=100", "validate_every=3")
 SMALL = ("initial.gaussians=8", "network.width=8", "density.every=0", *STEPS)

@@ -12,7 +12,7 @@ import wrf_mi
 from wrf_mi.apps.maps.api import radio_map
 from wrf_mi.apps.maps.coverage import run_reliability
 from wrf_mi.core import Prediction, Record
-from wrf_mi.models.reception import Sensitivity
+from wrf_mi.estimators.reception import Sensitivity
 from wrf_mi.tasks.scores import probability_scores
 from wrf_mi.training.selection import HeldOut, hold_out
 

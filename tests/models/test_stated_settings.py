@@ -19,10 +19,10 @@ from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core import settings as core_settings
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.settings import setting_texts
+from wrf_mi.estimators.interpolation.strength_terms import PARTS_OF_NOISE as NOISE
+from wrf_mi.estimators.interpolation.strength_terms import Hyperparameters
+from wrf_mi.estimators.model import inputs_of
 from wrf_mi.models import MODELS, Session
-from wrf_mi.models.interpolation.strength_terms import PARTS_OF_NOISE as NOISE
-from wrf_mi.models.interpolation.strength_terms import Hyperparameters
-from wrf_mi.models.model import inputs_of
 from wrf_mi.runs.api import open_run, plan_run, train
 from wrf_mi.runs.folder import RunRequest
 from wrf_mi.stages.hybrid import parts_of

@@ -18,9 +18,9 @@ from test_compare import captured
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.array_files import CHECKSUM
 from wrf_mi.datasets import make_splits, write_ble_folder
+from wrf_mi.estimators.held_out import held_out_predictions
+from wrf_mi.estimators.model import Problem, Session, default_settings
 from wrf_mi.models import MODELS
-from wrf_mi.models.held_out import held_out_predictions
-from wrf_mi.models.model import Problem, Session, default_settings
 from wrf_mi.runs.api import evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run

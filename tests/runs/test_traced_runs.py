@@ -19,7 +19,7 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import load
-from wrf_mi.models.ray_tracing import TracingSettings
+from wrf_mi.estimators.ray_tracing import TracingSettings
 from wrf_mi.runs.api import evaluate_run, predict_to_file, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run

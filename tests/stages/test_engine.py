@@ -10,8 +10,8 @@ import pytest
 
 from wrf_mi.core import InputError, Prediction, Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
-from wrf_mi.models.interpolation.idw import MODEL as IDW
-from wrf_mi.models.model import Arrays, Fitted, Inputs, Problem, Session
+from wrf_mi.estimators.interpolation.idw import MODEL as IDW
+from wrf_mi.estimators.model import Arrays, Fitted, Inputs, Problem, Session
 from wrf_mi.stages.engine import CONFIDENCE, LEAST_ROWS, Engine
 from wrf_mi.stages.residual import FEW_ROWS
 from wrf_mi.stages.stage import Option, Stage, State

@@ -10,11 +10,11 @@ from threadpoolctl import threadpool_limits
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
+from wrf_mi.estimators.interpolation.strength_settings import BY_SEARCH, DEFAULT, LIKELIHOOD, NONE, TREES
+from wrf_mi.estimators.interpolation.strength_trees import LEAST_STOPS
+from wrf_mi.estimators.interpolation.strengths import Strengths, fit_strengths
+from wrf_mi.estimators.model import Inputs, default_settings, inputs_of
 from wrf_mi.models import MODELS, Problem, Session
-from wrf_mi.models.interpolation.strength_settings import BY_SEARCH, DEFAULT, LIKELIHOOD, NONE, TREES
-from wrf_mi.models.interpolation.strength_trees import LEAST_STOPS
-from wrf_mi.models.interpolation.strengths import Strengths, fit_strengths
-from wrf_mi.models.model import Inputs, default_settings, inputs_of
 from wrf_mi.runs.api import plan_run
 from wrf_mi.runs.folder import RunRequest
 from wrf_mi.tasks.scores import REAL_90

@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 from wrf_mi.core import InputError, Prediction
 from wrf_mi.core.angles import pixel_directions, solid_angles
 from wrf_mi.datasets import load, make_splits
-from wrf_mi.models.interpolation.idw import InverseDistance
+from wrf_mi.estimators.interpolation.idw import InverseDistance
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim, ssim_mixtures, summary
 

@@ -11,9 +11,9 @@ from wrf_mi_bench.sionna_reference import sionna_paths
 
 from wrf_mi.core import InputError
 from wrf_mi.datasets import read_ble_folder
-from wrf_mi.models.checks import check_parts
-from wrf_mi.models.model import Problem
-from wrf_mi.models.ray_tracing import MODEL, TracingSettings
+from wrf_mi.estimators.checks import check_parts
+from wrf_mi.estimators.model import Problem
+from wrf_mi.estimators.ray_tracing import MODEL, TracingSettings
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import RayTracer, TraceOptions, load_trace, open_scene, recompute, save_trace, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared

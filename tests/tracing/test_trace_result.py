@@ -12,9 +12,9 @@ from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi.core import Antenna, InputError, load_paths, save_paths
 from wrf_mi.core.settings import settings_from, with_settings
 from wrf_mi.correction.options import CorrectionOptions
+from wrf_mi.estimators.ray_tracing import TracingSettings
+from wrf_mi.estimators.uplink.r2f2 import PathSettings
 from wrf_mi.graph.settings import TracedConfig
-from wrf_mi.models.ray_tracing import TracingSettings
-from wrf_mi.models.uplink.r2f2 import PathSettings
 from wrf_mi.tracing import TraceOptions, load_trace, open_scene, recompute, save_trace, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.search.chains import SPECULAR, TRANSMISSION

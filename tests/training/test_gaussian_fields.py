@@ -11,14 +11,14 @@ from wrf_mi.backend.device import to_float, to_tensor
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.settings import with_settings
+from wrf_mi.estimators.model import inputs_of
+from wrf_mi.estimators.networks import nerf2
+from wrf_mi.estimators.networks.nerf2 import Nerf2Settings, Networks
 from wrf_mi.gaussians import FIELDS
 from wrf_mi.gaussians.parameters import by_component
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.models import Problem
-from wrf_mi.models.model import inputs_of
-from wrf_mi.models.networks import nerf2
-from wrf_mi.models.networks.nerf2 import Nerf2Settings, Networks
 from wrf_mi.runs.api import train
 from wrf_mi.tasks import TASKS
 from wrf_mi.training.checkpoint import read_checkpoint, write_checkpoint

@@ -7,7 +7,7 @@ from small_fits import official, settings
 
 from wrf_mi.core import InputError, Split
 from wrf_mi.core.settings import with_settings
-from wrf_mi.models.interpolation.idw import InverseDistance
+from wrf_mi.estimators.interpolation.idw import InverseDistance
 from wrf_mi.tasks.scores import ssim
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.loop import FitState

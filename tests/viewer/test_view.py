@@ -18,7 +18,7 @@ from wrf_mi.apps.viewer.layers import path_layer, power_db, representative, scen
 from wrf_mi.apps.viewer.map_layer import read_map, thinned
 from wrf_mi.apps.viewer.view import view
 from wrf_mi.core import InputError
-from wrf_mi.models.ray_tracing import TracingSettings
+from wrf_mi.estimators.ray_tracing import TracingSettings
 from wrf_mi.runs.results import read_run
 from wrf_mi.runs.run import open_run
 from wrf_mi.tracing import load_trace, open_scene

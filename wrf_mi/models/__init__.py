@@ -3,35 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
-import lazy_loader
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from ..core import InputError
 from ..core.registry import Registry
 
 if TYPE_CHECKING:
-    from .model import Fitted, Inputs, Model, Problem, Session
+    from ..estimators.model import Fitted, Inputs, Model, Problem, Session
 
 ENTRY_POINTS = "wrf_mi.models"  # Group of the entry points by which other packages add models
 
 _OWN: Mapping[str, Model | str] = {
-    "wrf-gs": "wrf_mi.models.gaussian.model:WRF_GS",
-    "wrf-gs+": "wrf_mi.models.gaussian.model:WRF_GS_PLUS",
-    "factorised": "wrf_mi.models.gaussian.model:FACTORISED",
-    "ray-tracing": "wrf_mi.models.ray_tracing:MODEL",
+    "wrf-gs": "wrf_mi.estimators.gaussian.model:WRF_GS",
+    "wrf-gs+": "wrf_mi.estimators.gaussian.model:WRF_GS_PLUS",
+    "factorised": "wrf_mi.estimators.gaussian.model:FACTORISED",
+    "ray-tracing": "wrf_mi.estimators.ray_tracing:MODEL",
     "hybrid": "wrf_mi.stages.hybrid:MODEL",
-    "idw": "wrf_mi.models.interpolation.idw:MODEL",
+    "idw": "wrf_mi.estimators.interpolation.idw:MODEL",
     "kriging": "wrf_mi.stages.kriging:MODEL",
-    "trees": "wrf_mi.models.interpolation.trees:MODEL",
-    "mri": "wrf_mi.models.interpolation.mri:MODEL",
-    "vae": "wrf_mi.models.networks.vae:MODEL",
-    "dcgan": "wrf_mi.models.networks.dcgan:MODEL",
-    "nerf2": "wrf_mi.models.networks.nerf2:MODEL",
-    "linear": "wrf_mi.models.uplink.linear:MODEL",
-    "fire": "wrf_mi.models.uplink.fire:MODEL",
-    "r2f2": "wrf_mi.models.uplink.r2f2:MODEL",
-    "optml": "wrf_mi.models.uplink.optml:MODEL",
+    "trees": "wrf_mi.estimators.interpolation.trees:MODEL",
+    "mri": "wrf_mi.estimators.interpolation.mri:MODEL",
+    "vae": "wrf_mi.estimators.networks.vae:MODEL",
+    "dcgan": "wrf_mi.estimators.networks.dcgan:MODEL",
+    "nerf2": "wrf_mi.estimators.networks.nerf2:MODEL",
+    "linear": "wrf_mi.estimators.uplink.linear:MODEL",
+    "fire": "wrf_mi.estimators.uplink.fire:MODEL",
+    "r2f2": "wrf_mi.estimators.uplink.r2f2:MODEL",
+    "optml": "wrf_mi.estimators.uplink.optml:MODEL",
 }
 
 
@@ -60,9 +59,11 @@ def known_model(name: str) -> Model:
     return MODELS[name]
 
 
-__getattr__, __dir__, _ = lazy_loader.attach(
-    __name__, submod_attrs={"model": ["Fitted", "Inputs", "Model", "Problem", "Session"]}
-)
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module("wrf_mi.estimators.model"), name)  # imported when first used, as the models are
+
 
 __all__ = [
     "ENTRY_POINTS",

@@ -25,8 +25,8 @@ from ..datasets.observations import (
     warn_of_left_out,
     warn_of_one_place,
 )
+from ..estimators.receiver_places import placed_problem, write_places
 from ..models import Problem, Session
-from ..models.receiver_places import placed_problem, write_places
 from ..parallel import Scheduler
 from ..scene.correction_data import read_correction_data
 from ..synthetic import load_record

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from ..core import InputError, Prediction
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically, write_csv, write_figure
-from ..models.ray_tracing import PATHS
+from ..estimators.ray_tracing import PATHS
 from ..tasks import TASKS
 from ..training.session import OnProgress, quiet
 from . import figures

@@ -21,7 +21,7 @@ from ..core import AntennaOptions
 from ..core.settings import flat
 from ..core.yaml_files import read_yaml
 from ..datasets.registry import KNOWN
-from ..models.model import default_settings
+from ..estimators.model import default_settings
 from ..tasks import TASKS
 from .compare_tables import (
     BETTER,

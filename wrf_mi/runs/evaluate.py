@@ -20,12 +20,12 @@ from ..core.memory import peak_memory_mb
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.observations import FEW_ROWS, rows_received, scorable
+from ..estimators.few_rows import with_few_rows
+from ..estimators.interpolation.idw import MODEL as IDW
+from ..estimators.interpolation.mri import MODEL as MRI
+from ..estimators.model import PredictAll, default_settings, inputs_of
+from ..estimators.receiver_places import stored_places
 from ..models import Fitted, Inputs, Problem, Session
-from ..models.few_rows import with_few_rows
-from ..models.interpolation.idw import MODEL as IDW
-from ..models.interpolation.mri import MODEL as MRI
-from ..models.model import PredictAll, default_settings, inputs_of
-from ..models.receiver_places import stored_places
 from ..tasks import CARRIER, LAW, TASKS, UPLINK
 from ..tasks.scores import crps, inside_interval, summary
 from .folder import METRICS, PREDICTIONS, RunConfig

@@ -22,10 +22,10 @@ from ..datasets.observations import (
     place_of,
 )
 from ..datasets.splits import NONE, default_split, splits_below
+from ..estimators.checks import check_held_receivers, check_record, check_stated
+from ..estimators.model import default_settings
+from ..estimators.receiver_places import check_placeable, placed_problem, tell_places
 from ..models import MODELS, Model, Problem, known_model
-from ..models.checks import check_held_receivers, check_record, check_stated
-from ..models.model import default_settings
-from ..models.receiver_places import check_placeable, placed_problem, tell_places
 from ..synthetic import load_record
 from ..tasks import TASKS, task_of
 from ..training.fit_plan import check_rows

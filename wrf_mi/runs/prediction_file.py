@@ -22,7 +22,7 @@ from ..core.carriers import FREQUENCY
 from ..core.files import one_line, write_csv
 from ..core.types import FloatArray
 from ..datasets.folder_files import read_csv, read_motion
-from ..models.model import Inputs
+from ..estimators.model import Inputs
 from ..tasks import TASKS
 from .evaluate import stored_metrics, without_single_axis, write_predictions
 from .folder import METRICS

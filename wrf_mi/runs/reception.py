@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import Prediction, Record, Split
-from ..models.reception import ReceivedShares
+from ..estimators.reception import ReceivedShares
 from ..tasks.scores import calibration_bins, probability_scores
 from .results import RECEPTION
 

@@ -22,11 +22,11 @@ from ..core.receivers import receiver_index
 from ..core.registry import resolve
 from ..datasets import load_split
 from ..datasets.labelled import LabelledPrediction, ordered
+from ..estimators.checks import check_inputs
+from ..estimators.gaussian.model import FittedField
+from ..estimators.model import UNUSED_HEADING, UNUSED_UPLINK
+from ..estimators.receiver_places import stored_problem
 from ..models import Fitted, Inputs, Model, Problem
-from ..models.checks import check_inputs
-from ..models.gaussian.model import FittedField
-from ..models.model import UNUSED_HEADING, UNUSED_UPLINK
-from ..models.receiver_places import stored_problem
 from ..parallel import PartsProgress, Scheduler, row_parts
 from ..training.predictor import Predictor
 from .applications import APPLICATIONS

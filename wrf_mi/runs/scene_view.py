@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..core.angles import FloatArray
+from ..estimators.ray_tracing import PATHS
 from ..gaussians.parameters import Gaussians
-from ..models.ray_tracing import PATHS
 from ..scene.mesh.surfaces import KINDS, Kind, Surface
 from ..scene.preview import GaussianCloud, draw_scene
 from ..tracing import load_trace

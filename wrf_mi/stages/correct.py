@@ -24,7 +24,7 @@ from ..correction.misfit import Misfit
 from ..correction.options import FRAME, PHASES, PLANES, CorrectionOptions, OnStage
 from ..correction.state import SceneEdit, ScenePosterior
 from ..correction.uncertain_phases import UncertainPhases
-from ..models.model import Arrays, Fitted, Problem, Session
+from ..estimators.model import Arrays, Fitted, Problem, Session
 from ..tracing.paths.instrument_parameters import gain_name
 from ..training.selection import last_gain
 from .engine import CONFIDENCE, Engine

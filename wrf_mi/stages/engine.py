@@ -21,8 +21,8 @@ import numpy as np
 from ..core import InputError, Split
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.types import FloatArray, IntArray
-from ..models.held_out import arrays_of_held_out, fold_of, hold_out_once, stored_held_out
-from ..models.model import HeldOutPrediction, Model, Problem, Session
+from ..estimators.held_out import arrays_of_held_out, fold_of, hold_out_once, stored_held_out
+from ..estimators.model import HeldOutPrediction, Model, Problem, Session
 from ..tasks import task_of
 from ..training.by_distance import unit_means
 from ..training.selection import HeldOut, improves, last_gain

@@ -14,11 +14,20 @@ from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.array_files import keyed, under
 from ..core.types import IntArray
-from ..models.error_prior import ErrorPrior
-from ..models.held_out import HoldOut, predicted_rows
-from ..models.interpolation.kriging import Kriged, Kriging
-from ..models.model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem, field_arrays, from_field_arrays
-from ..models.reception import Reception
+from ..estimators.error_prior import ErrorPrior
+from ..estimators.held_out import HoldOut, predicted_rows
+from ..estimators.interpolation.kriging import Kriged, Kriging
+from ..estimators.model import (
+    Arrays,
+    Decomposition,
+    Fitted,
+    Inputs,
+    PredictAll,
+    Problem,
+    field_arrays,
+    from_field_arrays,
+)
+from ..estimators.reception import Reception
 from ..tasks import task_of
 from ..training.by_distance import LEAST, Intervals, Mixture, expected_size
 from ..training.selection import RowDistance, rows_at_receiver

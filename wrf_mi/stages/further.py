@@ -16,8 +16,8 @@ import numpy as np
 from ..core import Split
 from ..core.array_files import keyed, under
 from ..core.registry import Registry
-from ..models.error_prior import ErrorPrior
-from ..models.model import Arrays, Fitted, Model, PredictAll, Problem, Session
+from ..estimators.error_prior import ErrorPrior
+from ..estimators.model import Arrays, Fitted, Model, PredictAll, Problem, Session
 from .engine import Engine
 from .fitted import FittedMixture
 from .scene import StageReport, stated_reports

@@ -22,10 +22,19 @@ from pydantic import Field
 
 from ..core import InputError, Record, Split
 from ..core.settings import CheckedSettings
+from ..estimators.checks import check_held_receivers, check_record
+from ..estimators.few_rows import with_few_rows
+from ..estimators.model import (
+    Arrays,
+    Fitted,
+    HeldOutPrediction,
+    Model,
+    Problem,
+    Session,
+    default_settings,
+    known_positions,
+)
 from ..models import MODELS
-from ..models.checks import check_held_receivers, check_record
-from ..models.few_rows import with_few_rows
-from ..models.model import Arrays, Fitted, HeldOutPrediction, Model, Problem, Session, default_settings, known_positions
 from ..tasks import task_of
 from ..training.by_distance import GAPS
 from ..training.selection import away_as

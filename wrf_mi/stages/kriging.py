@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..core import InputError, Split
-from ..models.interpolation.diffuse import ChannelKriging
-from ..models.interpolation.kriging import GENERIC_ONLY, GenericKriging, KrigingSettings, asks_generic
-from ..models.interpolation.spectra import SpectrumKriging, SpectrumKrigingSettings
-from ..models.interpolation.strength_settings import POOLED_ONLY, StrengthSettings, unused_of_pooled
-from ..models.interpolation.strengths import EXACT, Strengths
-from ..models.model import Arrays, Fitted, Model, Problem, Session, known_positions
+from ..estimators.interpolation.diffuse import ChannelKriging
+from ..estimators.interpolation.kriging import GENERIC_ONLY, GenericKriging, KrigingSettings, asks_generic
+from ..estimators.interpolation.spectra import SpectrumKriging, SpectrumKrigingSettings
+from ..estimators.interpolation.strength_settings import POOLED_ONLY, StrengthSettings, unused_of_pooled
+from ..estimators.interpolation.strengths import EXACT, Strengths
+from ..estimators.model import Arrays, Fitted, Model, Problem, Session, known_positions
 from .engine import Engine
 from .residual import StrengthResidual
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from ..core import InputError, Prediction, Split
 from ..core.types import FloatArray
-from ..models.held_out import fit_model, held_out_predictions, hold_out_once, labelled
-from ..models.model import Arrays, Fitted, HeldOutPrediction, Model, Problem, Session, known_positions
+from ..estimators.held_out import fit_model, held_out_predictions, hold_out_once, labelled
+from ..estimators.model import Arrays, Fitted, HeldOutPrediction, Model, Problem, Session, known_positions
 from ..tasks import task_of
 from ..training import by_distance
 from ..training.by_distance import SINGLE, Intervals, Mixture

@@ -16,10 +16,10 @@ from ..backend.device import release_memory
 from ..core import InputError, Prediction, Split
 from ..core.settings import with_settings
 from ..core.types import FloatArray, IntArray
-from ..models import model
-from ..models.gaussian.model import WRF_GS_PLUS, FittedField
-from ..models.held_out import hold_out_once
-from ..models.model import Arrays, Model, Problem, Session
+from ..estimators import model
+from ..estimators.gaussian.model import WRF_GS_PLUS, FittedField
+from ..estimators.held_out import hold_out_once
+from ..estimators.model import Arrays, Model, Problem, Session
 from ..tasks import task_of
 from ..training.config import TrainConfig, calibration_config, task_settings
 from ..training.trainer import Trainer

@@ -9,7 +9,7 @@ from functools import partial
 from ..core import Split
 from ..core.types import FloatArray
 from ..datasets.observations import rows_received
-from ..models.interpolation.strength_settings import (
+from ..estimators.interpolation.strength_settings import (
     BY_SEARCH,
     DEFAULT,
     LIKELIHOOD,
@@ -19,10 +19,10 @@ from ..models.interpolation.strength_settings import (
     Shadowing,
     StrengthSettings,
 )
-from ..models.interpolation.strength_terms import Hyperparameters
-from ..models.interpolation.strength_trees import LEAST_STOPS
-from ..models.interpolation.strengths import Strengths, calibrated, fit_strengths
-from ..models.model import Problem, Session
+from ..estimators.interpolation.strength_terms import Hyperparameters
+from ..estimators.interpolation.strength_trees import LEAST_STOPS
+from ..estimators.interpolation.strengths import Strengths, calibrated, fit_strengths
+from ..estimators.model import Problem, Session
 from .engine import CONFIDENCE
 from .stage import Option, Stage, State
 

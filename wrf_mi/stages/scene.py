@@ -23,7 +23,7 @@ from ..correction import CorrectionOptions, default_options, write_page, write_s
 from ..correction.edits import TracedScene, fit_edit, refit_edit
 from ..correction.options import FRAME, HIDDEN, MATERIALS, PHASES, PLANES
 from ..correction.state import SceneEdit
-from ..models.model import Problem, Session
+from ..estimators.model import Problem, Session
 from ..scene.correction_data import FILE as CORRECTION
 from ..training.selection import hold_out_groups
 from .engine import CONFIDENCE, OptionReport

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ..core import Prediction, Split
 from ..correction import default_options
-from ..models.error_prior import ErrorPrior
-from ..models.gaussian.model import FittedField
-from ..models.model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem
+from ..estimators.error_prior import ErrorPrior
+from ..estimators.gaussian.model import FittedField
+from ..estimators.model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem
 from ..tasks import instrument_of, task_of
 from ..tracing import TraceOptions
 from ..tracing.tracer import RayTracer, fit_offsets

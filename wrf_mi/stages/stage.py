@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..core import Split
 from ..core.types import FloatArray, IntArray
-from ..models.model import Fitted, Problem, Session
+from ..estimators.model import Fitted, Problem, Session
 
 
 @dataclass(frozen=True)

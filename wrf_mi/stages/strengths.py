@@ -18,9 +18,9 @@ import numpy as np
 from ..core import InputError, Receiver, Record, Split
 from ..core.types import IntArray
 from ..correction.options import STRENGTHS
-from ..models.interpolation.strength_settings import StrengthSettings
-from ..models.interpolation.strengths import Strengths
-from ..models.model import Arrays, Model, Problem, Session
+from ..estimators.interpolation.strength_settings import StrengthSettings
+from ..estimators.interpolation.strengths import Strengths
+from ..estimators.model import Arrays, Model, Problem, Session
 from ..scene.correction_data import read_correction_data
 from ..tracing.options import TraceOptions
 from ..tracing.paths.solve import Prepared

@@ -40,7 +40,7 @@ GROUP_ROWS = 12
 """Least average number of rows in a group: intervals of smaller ones follow their rows and are too narrow elsewhere."""
 MOST_ERRORS = 400_000  # largest number of errors that are sorted; more are thinned evenly
 GAPS = ("distance_m",)
-"""Arrays that may hold infinity (`wrf_mi.models.model.Model.gaps`): distances to receivers without training rows."""
+"""Arrays that may hold infinity (`wrf_mi.estimators.model.Model.gaps`): distances to receivers without rows."""
 SMALLEST = 1e-6  # smallest standard deviation, relative to the median held-out error, and smallest factor
 LEAST = float(np.finfo(np.float32).tiny) / SMALLEST**2
 """Smallest standard deviation: factors do not make it zero in single precision, as intervals of zero width would be."""

@@ -7,11 +7,11 @@ import pytest
 from scipy.constants import speed_of_light
 
 from wrf_mi.core import Receiver, Record, Split
+from wrf_mi.estimators.interpolation.by_receiver import ByReceiver
+from wrf_mi.estimators.interpolation.diffuse import LEAST_ROWS, KrigedChannels, direct_wave, fit_diffuse
+from wrf_mi.estimators.interpolation.kriging import Kriged, KrigingSettings, UncertainKriged
+from wrf_mi.estimators.model import Inputs
 from wrf_mi.models import MODELS, Problem
-from wrf_mi.models.interpolation.by_receiver import ByReceiver
-from wrf_mi.models.interpolation.diffuse import LEAST_ROWS, KrigedChannels, direct_wave, fit_diffuse
-from wrf_mi.models.interpolation.kriging import Kriged, KrigingSettings, UncertainKriged
-from wrf_mi.models.model import Inputs
 from wrf_mi.tasks.scores import cea_db, inside_interval
 from wrf_mi.training.session import FitSession
 

@@ -16,9 +16,9 @@ from sklearn.ensemble import ExtraTreesRegressor
 from wrf_mi.core import InputError, Record
 from wrf_mi.core.settings import describe, settings_from, with_settings
 from wrf_mi.datasets import load, make_splits, write_nerf2_csi, write_spectrum_folder
+from wrf_mi.estimators.interpolation.kriging import Kriging, Trend
+from wrf_mi.estimators.interpolation.trees import GrownTrees, Trees
 from wrf_mi.models import MODELS, known_model
-from wrf_mi.models.interpolation.kriging import Kriging, Trend
-from wrf_mi.models.interpolation.trees import GrownTrees, Trees
 from wrf_mi.runs.api import train
 from wrf_mi.tasks import TASKS
 

@@ -6,10 +6,10 @@ from changed_folders import DATA, needs
 
 from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits
-from wrf_mi.models.interpolation import kriging_equations
-from wrf_mi.models.interpolation.kriging import Kriged, Kriging, Trend
-from wrf_mi.models.interpolation.kriging_equations import KrigingSystem, component_root
-from wrf_mi.models.interpolation.trees import Trees
+from wrf_mi.estimators.interpolation import kriging_equations
+from wrf_mi.estimators.interpolation.kriging import Kriged, Kriging, Trend
+from wrf_mi.estimators.interpolation.kriging_equations import KrigingSystem, component_root
+from wrf_mi.estimators.interpolation.trees import Trees
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import summary
 

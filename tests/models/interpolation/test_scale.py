@@ -10,10 +10,10 @@ from threadpoolctl import threadpool_limits
 from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.datasets import load
+from wrf_mi.estimators.interpolation.strength_settings import SHADOWINGS, StrengthSettings
+from wrf_mi.estimators.interpolation.strengths import Strengths, fit_strengths
+from wrf_mi.estimators.model import default_settings, inputs_of
 from wrf_mi.models import MODELS, Problem, Session
-from wrf_mi.models.interpolation.strength_settings import SHADOWINGS, StrengthSettings
-from wrf_mi.models.interpolation.strengths import Strengths, fit_strengths
-from wrf_mi.models.model import default_settings, inputs_of
 from wrf_mi.runs.api import train
 from wrf_mi.tasks.scores import REAL_90
 

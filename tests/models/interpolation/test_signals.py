@@ -11,8 +11,8 @@ from scipy.stats import rice
 
 from wrf_mi.core.angles import fibonacci_sphere
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.models.interpolation import signals as module
-from wrf_mi.models.interpolation.signals import (
+from wrf_mi.estimators.interpolation import signals as module
+from wrf_mi.estimators.interpolation.signals import (
     Covariances,
     Posterior,
     RowCovariances,
@@ -21,7 +21,7 @@ from wrf_mi.models.interpolation.signals import (
     fit_shares,
     fit_signals,
 )
-from wrf_mi.models.interpolation.spectra import ExpectedSpectrum, rician
+from wrf_mi.estimators.interpolation.spectra import ExpectedSpectrum, rician
 from wrf_mi.receivers.array import bartlett_spectrum
 from wrf_mi.receivers.reports import minmax_scale
 from wrf_mi.receivers.retrieve import mirror_order

@@ -10,14 +10,25 @@ from made_waves import SIZE, WAVELENGTH_M, positions, wave_record, without_array
 from scipy.spatial.distance import cdist
 
 from wrf_mi.core import InputError, Record, Split
+from wrf_mi.estimators.interpolation import kriging_equations as nearby
+from wrf_mi.estimators.interpolation import spectra
+from wrf_mi.estimators.interpolation.by_receiver import ByReceiver
+from wrf_mi.estimators.interpolation.kriging import Kriged, Kriging, UncertainKriged
+from wrf_mi.estimators.interpolation.kriging_equations import (
+    AnisotropicKriging,
+    fit_anisotropic,
+    line_of_sight,
+    sight_axes,
+)
+from wrf_mi.estimators.interpolation.spectra import (
+    GAPS,
+    LEAST_ROWS,
+    KrigedSpectra,
+    SpectrumKrigingSettings,
+    signal_weight,
+)
+from wrf_mi.estimators.model import Inputs, field_arrays, from_field_arrays
 from wrf_mi.models import MODELS, Problem
-from wrf_mi.models.interpolation import kriging_equations as nearby
-from wrf_mi.models.interpolation import spectra
-from wrf_mi.models.interpolation.by_receiver import ByReceiver
-from wrf_mi.models.interpolation.kriging import Kriged, Kriging, UncertainKriged
-from wrf_mi.models.interpolation.kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight, sight_axes
-from wrf_mi.models.interpolation.spectra import GAPS, LEAST_ROWS, KrigedSpectra, SpectrumKrigingSettings, signal_weight
-from wrf_mi.models.model import Inputs, field_arrays, from_field_arrays
 from wrf_mi.tasks.scores import inside_interval, ssim
 from wrf_mi.training.session import FitSession, OnProgress, quiet
 

@@ -18,13 +18,13 @@ from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import settings_from
 from wrf_mi.datasets import load, make_splits
+from wrf_mi.estimators.model import inputs_of
+from wrf_mi.estimators.networks import dcgan, nerf2, vae
+from wrf_mi.estimators.networks.dcgan import DcganSettings
+from wrf_mi.estimators.networks.nerf2 import Nerf2Settings
+from wrf_mi.estimators.networks.nerf2_march import Networks
+from wrf_mi.estimators.networks.vae import VaeSettings
 from wrf_mi.models import Model, Problem
-from wrf_mi.models.model import inputs_of
-from wrf_mi.models.networks import dcgan, nerf2, vae
-from wrf_mi.models.networks.dcgan import DcganSettings
-from wrf_mi.models.networks.nerf2 import Nerf2Settings
-from wrf_mi.models.networks.nerf2_march import Networks
-from wrf_mi.models.networks.vae import VaeSettings
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
 from wrf_mi.receivers.reports import minmax_scale
 from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim

@@ -11,8 +11,8 @@ import pytest
 from wrf_mi.backend.device import to_float, to_tensor
 from wrf_mi.core import InputError
 from wrf_mi.core.settings import with_settings
-from wrf_mi.models.model import field_arrays, from_field_arrays
-from wrf_mi.models.networks.dcgan import (
+from wrf_mi.estimators.model import field_arrays, from_field_arrays
+from wrf_mi.estimators.networks.dcgan import (
     NORM_FLOOR,
     BatchShape,
     Convolution,
@@ -25,10 +25,10 @@ from wrf_mi.models.networks.dcgan import (
     resized,
     softplus,
 )
-from wrf_mi.models.networks.layers import Coordinates, Module, columns
-from wrf_mi.models.networks.nerf2_march import LEAK, Nerf2Network, Networks, constant_parts, look, march
-from wrf_mi.models.networks.training import Network, NetworkSettings, NetworkTrainer
-from wrf_mi.models.networks.vae import Vae, VaeSettings, elbo_loss, normal_divergence, pooled
+from wrf_mi.estimators.networks.layers import Coordinates, Module, columns
+from wrf_mi.estimators.networks.nerf2_march import LEAK, Nerf2Network, Networks, constant_parts, look, march
+from wrf_mi.estimators.networks.training import Network, NetworkSettings, NetworkTrainer
+from wrf_mi.estimators.networks.vae import Vae, VaeSettings, elbo_loss, normal_divergence, pooled
 from wrf_mi.tasks.conditions import channels_from, normalised_uplink
 from wrf_mi.training.adam import NumericsError
 

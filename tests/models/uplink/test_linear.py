@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from wrf_mi.core import InputError, Receiver, Record, Split
+from wrf_mi.estimators.model import Inputs, inputs_of
+from wrf_mi.estimators.uplink.linear import MODEL, PENALTIES, LinearMap, LinearSettings, choose
+from wrf_mi.estimators.uplink.uplink_waves import relative_error
 from wrf_mi.models import Problem
-from wrf_mi.models.model import Inputs, inputs_of
-from wrf_mi.models.uplink.linear import MODEL, PENALTIES, LinearMap, LinearSettings, choose
-from wrf_mi.models.uplink.uplink_waves import relative_error
 from wrf_mi.tasks.conditions import normalised_uplink
 from wrf_mi.training.session import FitSession
 

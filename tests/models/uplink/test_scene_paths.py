@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 import wrf_mi
 from wrf_mi.core import InputError, Record
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.models.uplink.r2f2 import distinct
-from wrf_mi.models.uplink.uplink_paths import Start, find_paths
-from wrf_mi.models.uplink.uplink_waves import Bands, waves_of
+from wrf_mi.estimators.uplink.r2f2 import distinct
+from wrf_mi.estimators.uplink.uplink_paths import Start, find_paths
+from wrf_mi.estimators.uplink.uplink_waves import Bands, waves_of
 from wrf_mi.synthetic.laboratory import RECEIVER, transmitter_path
 from wrf_mi.synthetic.searches import trace_channels
 from wrf_mi.tasks.scores import cea_db

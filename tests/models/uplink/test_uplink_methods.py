@@ -10,19 +10,19 @@ from small_fits import network_settings
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.estimators.model import Inputs, inputs_of
+from wrf_mi.estimators.networks import nerf2
+from wrf_mi.estimators.networks.nerf2 import Nerf2Settings
+from wrf_mi.estimators.networks.nerf2_march import Networks
+from wrf_mi.estimators.networks.training import network_adam
+from wrf_mi.estimators.uplink import fire, linear, optml, r2f2
+from wrf_mi.estimators.uplink.fire import FireSettings
+from wrf_mi.estimators.uplink.linear import LinearSettings
+from wrf_mi.estimators.uplink.optml import OptMLSettings, Simulation
+from wrf_mi.estimators.uplink.r2f2 import PathSettings
+from wrf_mi.estimators.uplink.uplink_paths import find_paths
+from wrf_mi.estimators.uplink.uplink_waves import Bands, bands_of, waves_of
 from wrf_mi.models import Problem
-from wrf_mi.models.model import Inputs, inputs_of
-from wrf_mi.models.networks import nerf2
-from wrf_mi.models.networks.nerf2 import Nerf2Settings
-from wrf_mi.models.networks.nerf2_march import Networks
-from wrf_mi.models.networks.training import network_adam
-from wrf_mi.models.uplink import fire, linear, optml, r2f2
-from wrf_mi.models.uplink.fire import FireSettings
-from wrf_mi.models.uplink.linear import LinearSettings
-from wrf_mi.models.uplink.optml import OptMLSettings, Simulation
-from wrf_mi.models.uplink.r2f2 import PathSettings
-from wrf_mi.models.uplink.uplink_paths import find_paths
-from wrf_mi.models.uplink.uplink_waves import Bands, bands_of, waves_of
 from wrf_mi.tasks.scores import cea_db
 from wrf_mi.training.session import FitSession
 

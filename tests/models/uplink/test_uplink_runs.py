@@ -15,9 +15,9 @@ from made_channels import ANTENNAS, SUBCARRIERS, channels
 from wrf_mi import models
 from wrf_mi.core import InputError, Prediction, Record, Split
 from wrf_mi.datasets import load, write_nerf2_csi
+from wrf_mi.estimators.model import Arrays
+from wrf_mi.estimators.uplink.uplink_waves import UplinkModel
 from wrf_mi.models import Fitted, Inputs, Problem
-from wrf_mi.models.model import Arrays
-from wrf_mi.models.uplink.uplink_waves import UplinkModel
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run

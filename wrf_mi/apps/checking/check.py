@@ -11,7 +11,7 @@ from typing import Any
 from ...core import DataFault, InputError, Record
 from ...datasets.faults import collect_faults
 from ...datasets.registry import find, known, locate
-from ...models.checks import check_parts
+from ...estimators.checks import check_parts
 from ...synthetic import load_record
 from .antennas import antenna_notes
 from .directions import spectrum_axes

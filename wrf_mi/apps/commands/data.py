@@ -189,7 +189,7 @@ def summary(record: Record) -> dict[str, Any]:
     Raises:
         InputError: parts of the record that do not fit together.
     """
-    from ...models.checks import check_parts
+    from ...estimators.checks import check_parts
 
     check_parts(record)
     received = np.asarray(np.isfinite(record.observation).reshape(len(record.receivers), len(record), -1).all(axis=2))

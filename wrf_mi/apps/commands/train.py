@@ -195,7 +195,7 @@ def trace_command(a: Arguments) -> int:
     with open_scheduler(a.scheduler) as scheduler:
         status = run_training(a, scheduler=scheduler if a.scheduler else None)
     if a.deepmimo is not None:
-        from ...models.ray_tracing import PATHS
+        from ...estimators.ray_tracing import PATHS
         from ...tracing import load_trace, write_deepmimo
 
         write_deepmimo(a.deepmimo, load_trace(Path(a.out) / PATHS), a.replace)

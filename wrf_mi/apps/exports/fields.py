@@ -14,8 +14,8 @@ from ...core.angles import FloatArray
 from ...core.array_files import keyed, stored_arrays, under, write_arrays
 from ...core.carriers import carriers_text
 from ...core.files import atomic_folder, one_line, readable, write_atomically
+from ...estimators.gaussian.model import PARAM, FittedField
 from ...gaussians.parameters import Gaussians
-from ...models.gaussian.model import PARAM, FittedField
 from ...runs.folder import CONFIG, FITTED, METRICS, SPLIT, check_format, check_new
 from ...runs.run import Run, open_run
 from .format import ExportOptions

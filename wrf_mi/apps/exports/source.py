@@ -14,7 +14,7 @@ from ...datasets import write_ble_folder, write_nerf2_csi, write_spectrum_folder
 from ...datasets.layouts import is_data
 from ...datasets.record_file import write_record_file
 from ...datasets.registry import KNOWN
-from ...models.ray_tracing import CORRECTED, PATHS
+from ...estimators.ray_tracing import CORRECTED, PATHS
 from ...runs.folder import CONFIG
 from ...runs.run import Run, open_run
 from ...scene.folder import FACTS_FILE

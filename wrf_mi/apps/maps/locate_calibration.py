@@ -29,9 +29,9 @@ from ...core.array_files import stored_arrays, write_arrays
 from ...core.files import readable, write_atomically
 from ...core.types import IntArray
 from ...datasets.observations import fitted_receivers
+from ...estimators.held_out import fit_fold
+from ...estimators.model import Inputs, slices
 from ...models import Fitted, Session
-from ...models.held_out import fit_fold
-from ...models.model import Inputs, slices
 from ...runs.folder import load_rows
 from ...runs.run import Run
 from ...training.selection import hold_out

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...core import Prediction
 from ...core.angles import FloatArray
 from ...core.carriers import FREQUENCY
-from ...models.receiver_places import stored_places
+from ...estimators.receiver_places import stored_places
 from ...runs.figures import without_formulas
 from ...runs.folder import load_rows
 from ...runs.results import RECEPTION

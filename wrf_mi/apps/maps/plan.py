@@ -1,6 +1,6 @@
 """Positions whose measurement lowers the expected error of a run's map most.
 
-Errors of the predictions are a Gaussian process (`wrf_mi.models.error_prior`). With C the covariance of the errors at
+Errors of the predictions are a Gaussian process (`wrf_mi.estimators.error_prior`). With C the covariance of errors at
 all positions after the training rows, a measurement at c with noise of variance s lowers the variance at t by
 
     C(t, c)^2 / (C(c, c) + s),
@@ -37,9 +37,9 @@ from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.files import write_csv
 from ...core.receivers import receiver_index
+from ...estimators.error_prior import ErrorPrior, with_columns
+from ...estimators.interpolation.kriging import Kriging
 from ...models import Inputs, Problem
-from ...models.error_prior import ErrorPrior, with_columns
-from ...models.interpolation.kriging import Kriging
 from ...runs.folder import load_rows
 from ...runs.run import Run, open_run
 from ...scene.correction_data import read_correction_data

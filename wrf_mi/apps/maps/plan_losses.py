@@ -25,7 +25,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from ...core.angles import FloatArray
 from ...core.files import readable
-from ...models.error_prior import JITTER, ErrorPrior
+from ...estimators.error_prior import JITTER, ErrorPrior
 from ...scene.correction_data import FILE, KEY
 from ...training.session import OnProgress, quiet
 

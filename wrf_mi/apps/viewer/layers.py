@@ -18,8 +18,8 @@ from PIL import Image
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ...models.gaussian.model import FittedField
-from ...models.ray_tracing import CORRECTED, PATHS
+from ...estimators.gaussian.model import FittedField
+from ...estimators.ray_tracing import CORRECTED, PATHS
 from ...runs.folder import SPLIT
 from ...runs.results import Results
 from ...runs.run import Run

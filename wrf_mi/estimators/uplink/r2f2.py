@@ -14,8 +14,8 @@ by non-linear least squares, are evaluated at the downlink's frequencies. Differ
 - The Bayesian information criterion chooses the number of paths up to ``max_paths``; the paper sets a threshold of the
   residual.
 - With a scene the paths of its mesh start the search, and their lengths and directions have a prior (`ScenePaths`).
-- Gains have priors, too, each of a power of its own (`wrf_mi.models.uplink.uplink_paths.expected_gains`).
-- The solver is Levenberg and Marquardt's with exact derivatives (`wrf_mi.models.uplink.uplink_paths`).
+- Gains have priors, too, each of a power of its own (`wrf_mi.estimators.uplink.uplink_paths.expected_gains`).
+- The solver is Levenberg and Marquardt's with exact derivatives (`wrf_mi.estimators.uplink.uplink_paths`).
 
 Training rows choose the kind of wave front alone. The method is exact on noise-free channels of few, well separated
 paths. Where paths are many or closer than the resolution of array and band, the error grows with the distance of the

@@ -65,7 +65,7 @@ STORED = ("lengths", "positions_m", "coefficients", "weights", "like")  # attrib
 class Kriged:
     """A fitted kriging: a trend, and weights of the training rows' correlations."""
 
-    kernel: str  # a key of `wrf_mi.models.interpolation.kriging_equations.KERNELS`
+    kernel: str  # a key of `wrf_mi.estimators.interpolation.kriging_equations.KERNELS`
     lengths: FloatArray  # correlation length in metres, and over headings where there are any
     positions_m: FloatArray  # positions of the rows [n, 3]
     circle: FloatArray | None  # cosine and sine of their headings [n, 2], or None
@@ -176,7 +176,7 @@ class CovarianceSettings(CheckedSettings):
         length_m: correlation length, metres, or null.
         noise: variance of the noise as a share of the field's, or null.
         heading_length: correlation length over headings, in chords of the unit circle, or null; unused without.
-        kernel: exponential, matern32 or gaussian, see `wrf_mi.models.interpolation.kriging_equations.KERNELS`.
+        kernel: exponential, matern32 or gaussian, see `wrf_mi.estimators.interpolation.kriging_equations.KERNELS`.
         likelihood_rows: most rows of the likelihood, drawn with the seed; the prediction uses all.
     """
 

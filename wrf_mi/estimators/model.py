@@ -52,7 +52,7 @@ class Problem:
     stated: frozenset[str] | None = None
     #: what `Model.check` computed that the fit after it takes
     checked: list[Any] = field(default_factory=list, repr=False, compare=False)
-    #: what `wrf_mi.models.held_out.hold_out_once` has held out; problems that differ in scene or settings share it
+    #: what `wrf_mi.estimators.held_out.hold_out_once` has held out; problems that differ in scene or settings share it
     hold_outs: list[Any] = field(default_factory=list, repr=False, compare=False)
 
     @cached_property

@@ -12,7 +12,7 @@ and direction; peaks of the map start R2F2's optimisation, which then needs few 
 - A room has more paths than a single map separates: there are ``rounds`` of maps of the uplink's residual, each
   followed by a refinement of all paths found so far. Simulated channels are therefore noisier at times, 5 to 30 dB.
 - After each round a path stays if the Bayesian information criterion would rise without it.
-- Wave fronts and unknown frequencies: as in R2F2 (`wrf_mi.models.uplink.r2f2`).
+- Wave fronts and unknown frequencies: as in R2F2 (`wrf_mi.estimators.uplink.r2f2`).
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def _knows_frequencies(record: Record) -> bool:
 
 
 def unused_spacing(record: Record) -> dict[str, str]:
-    """``spacing_hz`` where the data state their frequencies (`wrf_mi.models.model.Model.unused_settings`)."""
+    """``spacing_hz`` where the data state their frequencies (`wrf_mi.estimators.model.Model.unused_settings`)."""
     return {"spacing_hz": "the data state their frequencies"} if _knows_frequencies(record) else {}
 
 

@@ -1,6 +1,6 @@
 """Fit of signal strengths: expected power, folds, likely hyperparameters, calibration of predictions.
 
-The processes of the receivers are those of `wrf_mi.models.interpolation.pooled_process`.
+The processes of the receivers are those of `wrf_mi.estimators.interpolation.pooled_process`.
 """
 
 from __future__ import annotations

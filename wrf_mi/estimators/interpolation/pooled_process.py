@@ -3,7 +3,7 @@
     y_r(x) = phi_r(x) . beta + f_r(x) + e,    beta ~ N(0, diag(sd^2)),  f_r ~ GP(0, k),  e ~ Student-t
 
 beta is common to all receivers and learned from all of them; the fields f_r are independent, so that the exact
-posterior needs one Cholesky factor for each receiver (`wrf_mi.models.interpolation.kriging_equations`). The noise's
+posterior needs one Cholesky factor for each receiver (`wrf_mi.estimators.interpolation.kriging_equations`). The noise's
 heavy tails are reached by reweighting: a row with a large residual has a larger variance.
 
 Source: Rasmussen and Williams, "Gaussian Processes for Machine Learning" (2006), sections 2.2 and 2.7 (mean with

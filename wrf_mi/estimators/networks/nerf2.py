@@ -1,7 +1,7 @@
 """NeRF2: two networks and a march along rays, for spectra, signal strengths and channels.
 
 Source: Zhao, An, Pan and Yang, "NeRF2: neural radio-frequency radiance fields" (MobiCom 2023), and the authors' code
-(XPengZhao/NeRF2, MIT). The networks and the march are in `wrf_mi.models.networks.nerf2_march`. As in that code all
+(XPengZhao/NeRF2, MIT). The networks and the march are in `wrf_mi.estimators.networks.nerf2_march`. As in that code all
 receivers of a record share a pair of networks, unless ``shared`` is false. Chosen here:
 
 - A step draws some transmitters and some rays and pairs each with each, because the attenuation network, most of the

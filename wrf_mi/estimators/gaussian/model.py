@@ -1,7 +1,7 @@
 """The models of 3D Gaussians: ``wrf-gs``, ``wrf-gs+`` and ``factorised``, trained step by step for every task.
 
 With a scene its paths are trained in the same graph (`wrf_mi.graph.graph`); the graph of paths without Gaussians
-calibrates `wrf_mi.models.ray_tracing`.
+calibrates `wrf_mi.estimators.ray_tracing`.
 """
 
 from __future__ import annotations
