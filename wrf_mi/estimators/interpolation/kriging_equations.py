@@ -8,9 +8,9 @@ where K serves all components of an observation (columns of y). Simple kriging h
 unknown mean, universal kriging any columns B. K and y may be complex (Hermitian covariance), B is real.
 
 Waves that reach one receiver leave the transmitter within a cone around the line of sight
-(`wrf_mi.estimators.interpolation.signals`), so a step along it changes their relative phases less than a step across it:
-on measured spectra half as fast. `AnisotropicKriging` has an exponential correlation with a length for each of three axes,
-and one unknown mean.
+(`wrf_mi.estimators.interpolation.signals`), so a step along it changes their relative phases less than a step across
+it: on measured spectra half as fast. `AnisotropicKriging` has an exponential correlation with a length for each of
+three axes, and one unknown mean.
 
 Source: Rasmussen and Williams, "Gaussian Processes for Machine Learning" (2006), sections 2.2, 2.7 and 5.4; Chiles and
 Delfiner, "Geostatistics" (2012), section 3.4 (universal kriging); Patterson and Thompson, "Recovery of inter-block
