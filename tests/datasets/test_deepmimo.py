@@ -130,6 +130,13 @@ def test_carrier_phase_is_added_where_asked(tmp_path: Path) -> None:
     np.testing.assert_allclose(added, turned, rtol=SINGLE)
 
 
+def test_path_without_delay_has_its_power_and_phase(tmp_path: Path) -> None:
+    folder = scenario(tmp_path, paths=1, users=(4,))
+    for key, value in {"delay": 0.0, "power": -20.0, "phase": 90.0}.items():
+        np.savez(folder / f"{key}_t000_tx000_r001.npz", **{key: np.array([[np.nan], *[[value]] * 3])})
+    np.testing.assert_allclose(read_deepmimo(folder).observation[0, 1:], 0.1j, atol=1e-8)
+
+
 def test_amplitude_and_phase_follow_one_convention(tmp_path: Path) -> None:
     """A line of sight as stored: gain lambda / (4 pi d) exp(-j 2 pi f d / c) at every subcarrier."""
     folder = scenario(tmp_path, paths=1, users=(4,))
@@ -178,6 +185,7 @@ WRONG: dict[str, tuple[Change, str]] = {
     "NaN phase": (stored("phase", np.full((10, 5), np.nan)), r"user 1 \(from 0\) of t000_tx000_r001: power, phase"),
     "infinite power": (stored("power", np.full((10, 5), np.inf)), "user 0 .* is not finite"),
     "no paths": (stored("power", np.full((10, 5), np.nan)), r"0 of 10 users have a path to the base stations \[0\]"),
+    "negative delay": (stored("delay", np.full((10, 5), -1e-8)), "user 1 .* or its delay is negative"),
     "delay beyond the symbol": (stored("delay", np.full((10, 5), 1e-3)), "a delay of 0.001 s, and .* 5.12e-05 s"),
     "no version": (edited(version=None), "version None of DeepMIMO; give a scenario of version 4"),
     "other version": (edited(version="3.2.9"), "version '3.2.9' of DeepMIMO"),

@@ -296,3 +296,13 @@ def test_the_run_of_each_row_is_kept(tmp_path: Path, several: bool):
     assert_same(again(tmp_path / "made-up", record), record)
     header = (tmp_path / "made-up" / POS).read_text().splitlines()[0]
     assert header == ("x,y,z,frequency_hz,run" if several else "x,y,z,run")
+
+
+@pytest.mark.parametrize("columns", ["vx,vy,vz", "t"])
+def test_columns_of_earlier_versions_are_not_read(tmp_path: Path, columns: str):
+    folder, record = tmp_path / "made-up", make_record(4)
+    write_spectrum_folder(folder, record)
+    header, *rows = (folder / POS).read_text().splitlines()
+    fields = ",-" * len(columns.split(","))
+    (folder / POS).write_text("\n".join([f"{header},{columns}", *(row + fields for row in rows)]))
+    assert_same(read_spectrum_folder(folder), record)

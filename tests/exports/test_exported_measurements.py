@@ -49,6 +49,14 @@ def test_npz_holds_a_record_without_loss(record: Record, tmp_path: Path) -> None
     assert_same(load(tmp_path / "two"), record)
 
 
+def test_array_of_an_earlier_version_is_not_read(tmp_path: Path) -> None:
+    record = make_record()
+    file = write_record_file(tmp_path / "one.npz", record)
+    with np.load(file) as stored:
+        np.savez(file, tx_velocity_mps=record.tx_pos_m, **stored)
+    assert_same(load(file), record)
+
+
 def test_damaged_npz_is_refused(tmp_path: Path) -> None:
     file = write_record_file(tmp_path / "one.npz", make_record())
     with np.load(file) as stored:

@@ -110,7 +110,7 @@ PANEL = "constants: {{panel: {{relative_permittivity: 2.9, conductivity: 0.01, t
         ("surfaces: {table: iron}", "surfaces: table: unknown material 'iron'; known are floor, .*itu_metal"),
         ("thickness_m: {itu_wood: -1}", "thickness_m: itu_wood is -1; give metres above 0"),
         ("thickness_m: {itu_wood: thin}", "thickness_m: itu_wood is 'thin'; give metres above 0"),
-        ("walls: {}", "give the keys rules, surfaces, thickness_m, constants, scattering, velocities_mps, no others"),
+        ("walls: {}", "give the keys rules, surfaces, thickness_m, constants, scattering, no others"),
         ("rules: itu_wood", "rules must be a mapping"),
         ("rules: {", "not YAML"),
         (PANEL.format("conductivity_exponent: 1"), "panel: give relative_permittivity, .* with"),
@@ -124,6 +124,13 @@ def test_unusable_materials_are_refused(text, message, folder):
         read_scene_folder(folder)
     assert "\n" not in str(caught.value)
     assert "materials.yml" in str(caught.value)
+
+
+def test_velocities_of_an_earlier_version_are_not_read(folder):
+    materials = read_scene_folder(folder).materials
+    with (folder / "materials.yml").open("a") as file:
+        file.write("velocities_mps: {table: [0, 1.5, 0]}\n")
+    assert read_scene_folder(folder).materials == materials
 
 
 def test_incomplete_folders_are_refused(folder):

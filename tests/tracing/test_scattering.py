@@ -15,7 +15,7 @@ from wrf_mi.apps.checking import check_scene
 from wrf_mi.apps.checking.scene_repair import repair_scene
 from wrf_mi.apps.exports import ExportOptions, export
 from wrf_mi.core import Antenna, InputError
-from wrf_mi.scene.edit import edit_scene
+from wrf_mi.scene.edit import Move, edit_scene
 from wrf_mi.scene.materials import read_materials
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.paths.corrected_scene import write_corrected_scene
@@ -226,7 +226,7 @@ def test_corrected_and_edited_scenes_keep_what_is_stated(tmp_path, kind):
     name = "mat-itu_brick" if kind == "diffuse" else "mat-sheet"
     scene = open_scene(plane(tmp_path / "stated", name, kind, **STATED), FREQUENCY_HZ)
     folder = write_corrected_scene(tmp_path / "corrected", scene, {})
-    edited = edit_scene(folder, tmp_path / "edited", velocities_mps={("plane",): (1.0, 0.0, 0.0)})
+    edited = edit_scene(folder, tmp_path / "edited", [Move(("plane",), (1.0, 0.0, 0.0))])
     for place in (folder, edited):
         material = open_scene(place, FREQUENCY_HZ).objects["plane"].radio_material
         assert scattering_of(material) == STATED

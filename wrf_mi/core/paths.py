@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.constants import speed_of_light
+from numpy.typing import NDArray
 
 from .angles import FloatArray
 from .array_files import stored_arrays, write_arrays
@@ -18,7 +17,6 @@ from .files import readable
 from .types import IntArray
 
 FORMAT = 1  # version of the file format
-RATE = "length_rate_mps"  # array that files of paths at rest may lack
 
 
 @dataclass(frozen=True)
@@ -42,8 +40,6 @@ class Paths:
         object_names: names of the scene's surfaces.
         n_tx: transmitters traced, with or without a path.
         n_rx: receivers traced, with or without a path.
-        length_rate_mps: rate of change of ``length_m`` by the motion of transmitter, receiver and objects, shape [p],
-            m/s; by default 0: nothing moves.
 
     Raises:
         ValueError: arrays of inconsistent shapes.
@@ -61,15 +57,12 @@ class Paths:
     object_names: tuple[str, ...]
     n_tx: int
     n_rx: int
-    length_rate_mps: FloatArray = field(default_factory=lambda: np.zeros(()))
 
     def __len__(self) -> int:
         """Number of paths."""
         return len(self.tx)
 
     def __post_init__(self) -> None:
-        if self.length_rate_mps.ndim == 0:
-            object.__setattr__(self, "length_rate_mps", np.full(len(self.tx), self.length_rate_mps))
         depth = self.interactions.shape[1] if self.interactions.ndim == 2 else -1
         more: dict[str, tuple[int, ...]] = {"departure": (3,), "arrival": (3,), "interactions": (depth,)}
         more |= {"objects": (depth,), "vertices_m": (depth, 3)}
@@ -82,18 +75,6 @@ class Paths:
     def bounces(self) -> IntArray:
         """Number of interactions of each path, shape [p]."""
         return np.asarray(np.count_nonzero(self.interactions, axis=1))
-
-    def doppler_hz(self, frequency_hz: ArrayLike) -> FloatArray:
-        """Doppler shift of each path [p], Hz, at a frequency or the frequencies [p], Hz; positive where paths shorten.
-
-        The shift -(dL/dt) f / c is that of ``sionna.rt.Paths.doppler``: the sum over the segments of a path of
-        (v_i - v_(i+1)) . k_i / lambda, with velocities v of the segment's ends and its direction k.
-        """
-        return np.asarray((0.0 - self.length_rate_mps) * np.asarray(frequency_hz, float) / speed_of_light)
-
-    def after(self, seconds: float) -> Paths:
-        """The paths with the lengths that they have after a short time, and unchanged gains."""
-        return replace(self, length_m=self.length_m + seconds * self.length_rate_mps)
 
     def select(self, which: NDArray[Any]) -> Paths:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
@@ -126,4 +107,4 @@ def read_paths_file(file: str | Path) -> tuple[Paths, dict[str, NDArray[Any]]]:
             raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
         facts: dict[str, Any] = {"object_names": tuple(str(name) for name in arrays.pop("object_names"))}
         facts |= {name: int(arrays.pop(name)) for name in ("n_tx", "n_rx")}
-        return Paths(**facts | {name: arrays.pop(name) for name in ARRAYS if name != RATE or RATE in arrays}), arrays
+        return Paths(**facts | {name: arrays.pop(name) for name in ARRAYS}), arrays

@@ -151,7 +151,6 @@ class Record:
             carriers; None where all rows have the same.
         runs: run of the measurement, such as a day or a session, in which each row was taken, texts [n]; None where
             unknown.
-        tx_velocity_mps: velocity of the moving end in each row, [n, 3], m/s; None: at rest.
         source: file or folder of the data.
 
     Signal strengths of two transmitter positions at one receiver:
@@ -180,7 +179,6 @@ class Record:
     std: FloatArray | None = None
     carriers_hz: FloatArray | None = None
     runs: NDArray[np.str_] | None = None
-    tx_velocity_mps: FloatArray | None = None
     source: str = field(default="", compare=False)
 
     def __len__(self) -> int:

@@ -198,7 +198,7 @@ def _writable(path: str | Path, record: Record) -> list[str]:
     text = f"{path}: {record.name} cannot be written in the layout of {RECEIVERS[0]}"
     if record.task != "rssi":
         raise InputError(f"{text}: it needs signal strengths")
-    files.refuse_unstated(path, record, "truth", "uplink", "tx_velocity_mps")
+    files.refuse_unstated(path, record, "truth", "uplink")
     if record.official is not None:
         files.refuse_unstated(path, record, "folds")
         _check_official(text, record.official, len(record))

@@ -10,14 +10,14 @@ direction of departure u in the base station's frame::
     h[m, k] = sum sqrt(10^(P / 10)) exp(j phi) exp(+j k0 p_m . u) exp(-j 2 pi k bandwidth / N tau)
 
 which is DeepMIMO's times sqrt(N): DeepMIMO divides the sent power among all N subcarriers. By reciprocity it is the
-coefficient from the user to the base station, as in the other layouts.
+coefficient from the user to the base station, as in the other layouts. `wrf_mi.receivers.csi` computes the sum.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,13 +27,14 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 from scipy.spatial.transform import Rotation
 
-from ..core import Antenna, InputError, Receiver, Record
+from ..core import Antenna, InputError, Paths, Receiver, Record
 from ..core.angles import FloatArray, unit_vectors
 from ..core.antenna import ANTENNA, DEVICE_TO_ARRAY
 from ..core.array_files import stored_array, stored_arrays
 from ..core.files import readable, text_lines
 from ..core.settings import CheckedSettings, Positive, settings_from
 from ..core.yaml_files import read_yaml
+from ..receivers import array_response, csi
 from .folder_files import data_folder, fits_single, numbers_of, read_official, shown
 from .read_mat import FAULT, mat_arrays
 
@@ -49,6 +50,7 @@ PATH_MATRICES = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_e
 TEST_FRACTION = 0.2  # share of the users with a path in the official test rows
 SPLIT_SEED = 0
 VALUES_PER_CHUNK = 1 << 20  # complex values of the largest array in a chunk of users
+SHORTEST_M = 1e-9  # length in place of 0, for which a spherical wave has no amplitude
 Pattern = Literal["isotropic", "halfwave-dipole"]
 """DeepMIMO's names of antenna patterns."""
 
@@ -341,18 +343,19 @@ def _channels(
     scenario: _Scenario, pair: str, paths: Mapping[str, NDArray[Any]], chosen: _ChannelParams
 ) -> NDArray[np.complex64]:
     """Channels [n, m, k], NaN for users without a path."""
-    elements, offsets_hz = chosen.elements, chosen.offsets_hz
+    elements_m, offsets_hz = chosen.elements * (speed_of_light / scenario.carrier_hz), chosen.offsets_hz
     if chosen.add_carrier_phase:
         offsets_hz = offsets_hz + scenario.carrier_hz
     n, most = paths["power"].shape
-    channel = np.empty((n, len(elements), len(offsets_hz)), np.complex64)
-    step = max(1, VALUES_PER_CHUNK // max(1, most * max(len(elements), len(offsets_hz))))
+    channel = np.empty((n, len(elements_m), len(offsets_hz)), np.complex64)
+    symbol_s = chosen.ofdm.subcarriers / chosen.ofdm.bandwidth
+    step = max(1, VALUES_PER_CHUNK // max(1, most * len(elements_m), len(offsets_hz)))
     for start in range(0, n, step):
         rows = slice(start, start + step)
+        # Matrices are padded with NaN to the most paths of a user.
         exist = ~np.isnan(paths["power"][rows])
-        # Matrices are padded with NaN to the most paths of a user; as zeros these places add nothing to the sums.
-        power, phase, delay, *angles = (np.where(exist, paths[k][rows], 0.0).astype(float) for k in PATH_MATRICES)
-        symbol_s = chosen.ofdm.subcarriers / chosen.ofdm.bandwidth
+        user, _ = np.nonzero(exist)
+        power, phase, delay, *angles = (paths[key][rows][exist].astype(float) for key in PATH_MATRICES)
         if delay.max(initial=0.0) >= symbol_s:  # the package would leave such a path out
             text = f"{pair} has a delay of {delay.max():.3g} s, and a symbol of subcarriers / bandwidth lasts"
             raise InputError(f"{scenario.folder}: {text} {symbol_s:.3g} s; give more subcarriers in {CHANNEL_PARAMS}")
@@ -360,18 +363,21 @@ def _channels(
             unit_vectors(np.radians(azimuth), np.pi / 2 - np.radians(zenith))
             for azimuth, zenith in (angles[:2], angles[2:])
         )
-        departure = departure @ chosen.rotation  # rows times R: from the world's frame to the array's
+        at_station = departure @ chosen.rotation  # rows times R: from the world's frame to the array's
         with np.errstate(over="ignore", invalid="ignore"):
-            gain = exist * 10 ** (power / 20) * np.exp(1j * np.radians(phase))
-            for antenna, directions in zip(_antennas(chosen), (departure, arrival), strict=True):
+            gain = 10 ** (power / 20) * np.exp(1j * np.radians(phase))
+            for antenna, directions in zip(_antennas(chosen), (at_station, arrival), strict=True):
                 gain = gain * np.linalg.norm(antenna.field(directions), axis=-1)
-            # Elements are in wavelengths, so k0 p . u is 2 pi times the product.
-            at_elements = gain[..., None] * np.exp(2j * np.pi * (departure @ elements.T))
-            waves = np.exp(-2j * np.pi * delay[..., None] * offsets_hz)
-            channel[rows] = np.matmul(at_elements.transpose(0, 2, 1), waves)
+            length_m = np.where(delay >= 0, np.maximum(delay * speed_of_light, SHORTEST_M), np.nan)
+            ends = user, np.zeros_like(user), gain, length_m, arrival, departure
+            none, places = np.zeros((len(user), 0), np.uint8), np.zeros((len(user), 0, 3))
+            to_first = Paths(*ends, none, places, none.astype(np.int32), (), len(exist), 1)
+            # Waves are plane at the array, as DeepMIMO's: each element has the paths of the first, turned in phase.
+            for element, response in enumerate(array_response(elements_m, at_station, scenario.carrier_hz).T):
+                channel[rows, element] = csi(replace(to_first, gain=gain * response), offsets_hz)[0]
         bad = np.flatnonzero(~np.isfinite(channel[rows]).all(axis=(1, 2)))
         if len(bad):
             text = f"user {start + bad[0]} (from 0) of {pair}: power, phase, delay or angle of a path is not finite"
-            raise InputError(f"{scenario.folder}: {text}; correct or remove the path")
+            raise InputError(f"{scenario.folder}: {text}, or its delay is negative; correct or remove the path")
         channel[rows][~exist.any(axis=1)] = np.nan
     return channel

@@ -22,7 +22,7 @@ from .faults import Attempt, attempt, recoverable, refuse, stop_at_faults
 
 POSITIONS = "tx_pos.csv"
 AXES = "x,y,z"  # columns of positions, metres
-VELOCITY, TIME = ("vx", "vy", "vz"), "t"  # columns of velocities in m/s, or of times in s
+NOT_USED = ("vx", "vy", "vz", "t")  # last columns of `POSITIONS` that are allowed and not read
 RUN = "run"  # column with the run of the measurement in which each row was taken: a text without line ends
 INDEX_FILES = ("train_index.txt", "test_index.txt")
 TX_ANTENNA = "tx_antenna"
@@ -252,49 +252,23 @@ def _read_table(path: Path, headers: tuple[str, ...]) -> CsvTable:
 
 @dataclass(frozen=True)
 class PositionTable:
-    """Content of `POSITIONS`: positions [n, 3], metres; carriers [n], Hz, runs [n], velocities [n, 3], m/s, or None."""
+    """Content of `POSITIONS`: positions [n, 3], metres; carriers [n], Hz, and runs [n], None without the column."""
 
     positions_m: FloatArray
     carriers_hz: FloatArray | None = None
     runs: NDArray[np.str_] | None = None
-    velocities_mps: FloatArray | None = None
 
 
 def read_positions(path: Path, optional: tuple[str, ...] = (FREQUENCY, RUN)) -> PositionTable:
-    """Read a CSV file with the header ``x,y,z``, to which optional columns and `VELOCITY` or `TIME` may be added."""
+    """Read a CSV file with the header ``x,y,z``, to which optional columns and `NOT_USED` may be added."""
     table = read_csv(path)
-    table, may_follow = replace(table, header=[name.lower() for name in table.header]), (*optional, *VELOCITY, TIME)
-    if table.header != [*AXES.split(","), *(name for name in may_follow if name in table.header)]:
-        text = f"header is {','.join(table.header)[:40]!r}; it must be {AXES} and then, in this order, any of"
-        raise DataFault(path, f"{text} {', '.join(may_follow)}", line=1)
-    positions, velocities = read_motion(table)
-    carriers = carriers_of(path, table.numbers(FREQUENCY)) if FREQUENCY in table.header else None
-    return PositionTable(positions, carriers, runs_of(table) if RUN in table.header else None, velocities)
-
-
-def read_motion(table: CsvTable) -> tuple[FloatArray, FloatArray | None]:
-    """Positions [rows, 3], metres, and velocities [rows, 3], m/s, of a table with the columns x, y, z.
-
-    Velocities are the columns `VELOCITY`, or differences of the positions by those of `TIME`, central within the table
-    (`numpy.gradient`); None without such columns.
-
-    Raises:
-        InputError: as `CsvTable.numbers`, some columns of `VELOCITY`, or times that do not grow from row to row.
-    """
+    table = replace(table, header=[name.lower() for name in table.header])
+    if table.header != [*AXES.split(","), *(name for name in (*optional, *NOT_USED) if name in table.header)]:
+        may_follow = f" and then, in this order, any of {', '.join(optional)}" if optional else ""
+        raise DataFault(path, f"header is {','.join(table.header)[:40]!r}; it must be {AXES}{may_follow}", line=1)
     positions = np.stack([table.numbers(axis) for axis in AXES.split(",")], axis=-1)
-    if set(VELOCITY) & set(table.header):
-        return positions, np.stack([table.numbers(name) for name in VELOCITY], axis=-1)
-    if TIME not in table.header:
-        return positions, None
-    seconds, remedy = table.numbers(TIME), f"order the rows of one track by {TIME}, or give {','.join(VELOCITY)}"
-    for row in np.flatnonzero(~(np.diff(seconds, prepend=-np.inf) > 0))[:1]:
-        refuse(
-            DataFault(table.path, f"{TIME} is {seconds[row]:g}, not after the row before; {remedy}", row=int(row) + 1)
-        )
-        return positions, None
-    if len(seconds) < 2:
-        raise DataFault(table.path, f"a single row with {TIME} states no velocity; {remedy}", row=1)
-    return positions, np.gradient(positions, seconds, axis=0)
+    carriers = carriers_of(path, table.numbers(FREQUENCY)) if FREQUENCY in table.header else None
+    return PositionTable(positions, carriers, runs_of(table) if RUN in table.header else None)
 
 
 def carriers_of(path: Path, carriers_hz: FloatArray) -> FloatArray:
@@ -385,10 +359,9 @@ def write_lines(path: Path, lines: list[str]) -> None:
 
 
 def write_positions(path: Path, stated: PositionTable) -> None:
-    """Write positions, carriers and velocities to the last digit, and runs; `read_positions` reads them."""
+    """Write positions and carriers to the last digit, and runs; `read_positions` reads them."""
     columns: dict[str, list[Any]] = dict(zip(AXES.split(","), stated.positions_m.astype(float).T.tolist(), strict=True))
-    velocities = zip(VELOCITY, () if stated.velocities_mps is None else stated.velocities_mps.T, strict=False)
-    for name, values in ((FREQUENCY, stated.carriers_hz), (RUN, stated.runs), *velocities):
+    for name, values in ((FREQUENCY, stated.carriers_hz), (RUN, stated.runs)):
         if values is not None:
             columns[name] = values.tolist()
     write_csv(path, columns, zip(*columns.values(), strict=True))

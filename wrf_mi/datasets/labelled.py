@@ -30,7 +30,6 @@ OF_RECEIVERS = ("observation", "truth", "std", "n_readings")  # arrays whose fir
 ROW, FIXED = ("row",), ("receiver",)
 DIMENSIONS: dict[str, tuple[str, ...]] = {
     "tx_pos_m": ("row", "axis"),
-    "tx_velocity_mps": ("row", "axis"),
     **dict.fromkeys(("tx_heading_rad", "carriers_hz", "folds", "runs"), ROW),
     "uplink": ("row", "uplink_antenna", "uplink_subcarrier"),
     "uplink_hz": ("uplink_subcarrier",),
@@ -44,7 +43,7 @@ DIMENSIONS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("receiver_elements", "receiver_frequency_hz"), FIXED),
 }
 """Dimensions of the other variables."""
-UNITS = {"_m": "m", "_hz": "Hz", "_rad": "rad", "_mps": "m s-1", "_deg": "degree"}  # by the end of a name
+UNITS = {"_m": "m", "_hz": "Hz", "_rad": "rad", "_deg": "degree"}  # by the end of a name
 
 
 def xarray_package() -> Any:

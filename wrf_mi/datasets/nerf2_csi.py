@@ -71,7 +71,6 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
         name,
         "csi",
         tx_pos_m=np.full((n.value, 3), np.nan) if stated is None else stated.value.positions_m,
-        tx_velocity_mps=None if stated is None else stated.value.velocities_mps,
         receivers=(receiver.value,),
         observation=channel.value[None, :, :, half:],
         official=official,
@@ -104,8 +103,7 @@ def write_nerf2_csi(
         text = yaml.safe_dump(_station_info(record, array_m), sort_keys=False, default_flow_style=None)
         (part / STATION).write_text(text, encoding="utf-8")
         if np.isfinite(record.tx_pos_m).all():
-            table = files.PositionTable(record.tx_pos_m, velocities_mps=record.tx_velocity_mps)
-            files.write_positions(part / files.POSITIONS, table)
+            files.write_positions(part / files.POSITIONS, files.PositionTable(record.tx_pos_m))
         if record.truth is not None:
             np.save(part / TRUTH, record.truth[0].astype(np.complex64))
         files.write_official(part, record.official, first=0)

@@ -76,7 +76,6 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
         frequencies_hz=stated,
         tx_antenna=tx_antenna,
         runs=table.value.runs,
-        tx_velocity_mps=table.value.velocities_mps,
     ).at_carriers(table.value.carriers_hz)
 
 
@@ -109,7 +108,7 @@ def write_spectrum_folder(
                 Image.fromarray(image).save(images / f"{row:05d}.png")
         info = yaml.safe_dump(_gateway_info(record), sort_keys=False, default_flow_style=None)
         (part / GATEWAYS).write_text(info, encoding="utf-8")
-        stated = files.PositionTable(record.tx_pos_m, record.carriers_hz, record.runs, record.tx_velocity_mps)
+        stated = files.PositionTable(record.tx_pos_m, record.carriers_hz, record.runs)
         files.write_positions(part / files.POSITIONS, stated)
         files.write_official(part, record.official, first=1, digits=5)
         if record.folds is not None:

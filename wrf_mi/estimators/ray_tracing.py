@@ -216,16 +216,15 @@ def _warn_of_walls(traced_dbm: NDArray[Any], measured_dbm: NDArray[Any]) -> None
 def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult:
     """Paths of all positions; every part has the number of rays of all positions."""
     record, scheduler = problem.record, session.scheduler
-    tx_pos_m, carriers, velocity = record.tx_pos_m, record.carriers_hz, record.tx_velocity_mps
+    tx_pos_m, carriers = record.tx_pos_m, record.carriers_hz
     if scheduler is None:
-        return tracer.trace(tx_pos_m, session.progress, carriers_hz=carriers, velocity_mps=velocity)
+        return tracer.trace(tx_pos_m, session.progress, carriers_hz=carriers)
     assert problem.scene is not None
     rays, least = tracer.rays(tx_pos_m), TRACED_AT_LEAST
     if not tracer.options.sampled:
         least = max(least, min(SPECULAR_AT_LEAST, -(-len(tx_pos_m) // (2 * scheduler.workers))))
     parts = row_parts(len(tx_pos_m), scheduler.workers, least, PAIRS_TOGETHER)
-    stated = [[None if each is None else each[part] for each in (carriers, velocity)] for part in parts]
-    rows_of = [(tx_pos_m[part], part.start, *of_part) for part, of_part in zip(parts, stated, strict=True)]
+    rows_of = [(tx_pos_m[part], part.start, None if carriers is None else carriers[part]) for part in parts]
     sizes = [len(positions) for positions, *_ in rows_of]
     options = replace(tracer.options, rays=rays)
     opener = partial(RayTracer, problem.scene, tracer.instrument, options, problem.material)
@@ -233,7 +232,7 @@ def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult
     return replace(join_traces(traces), options=tracer.options)
 
 
-def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int, FloatArray | None, FloatArray | None]) -> TraceResult:
+def _trace_part(tracer: RayTracer, part: tuple[FloatArray, int, FloatArray | None]) -> TraceResult:
     return tracer.trace(part[0], False, *part[1:])
 
 

@@ -20,8 +20,7 @@ from ..core import InputError
 from ..core.array_files import stored_arrays
 from ..core.carriers import FREQUENCY
 from ..core.files import one_line, write_csv
-from ..core.types import FloatArray
-from ..datasets.folder_files import read_csv, read_motion
+from ..datasets.folder_files import read_csv
 from ..estimators.model import Inputs
 from ..tasks import TASKS
 from .evaluate import stored_metrics, without_single_axis, write_predictions
@@ -59,15 +58,6 @@ def read_inputs(csv_file: str | Path | None, npz_file: str | Path | None) -> Inp
         inputs = _from_npz(path)
     _check_finite(path, inputs)
     return inputs
-
-
-def read_track(csv_file: str | Path) -> tuple[FloatArray, FloatArray | None]:
-    """Positions [m, 3], metres, and velocities [m, 3], m/s, or None, of a CSV file (`read_motion`)."""
-    path = Path(csv_file)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give positions x, y, z in metres")
-    table = read_csv(path, skip_blank=True)
-    return read_motion(replace(table, header=[name.lower() for name in table.header]))
 
 
 def _check_uplink(path: Path, uplink: NDArray[Any], positions: int) -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
@@ -18,7 +17,7 @@ from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.files import listed
 from .folder import read_scene_folder, write_scene
-from .materials import Materials, check_velocity
+from .materials import Materials
 from .mesh.files import mesh_parts
 from .mesh.surfaces import KINDS, Kind, Surface, bounds, box_of, moved
 
@@ -87,9 +86,8 @@ def edit_scene(
     moves: Sequence[Move] = (),
     remove: Sequence[str] = (),
     replace_folder: bool = False,
-    velocities_mps: Mapping[tuple[str, ...], Sequence[float]] = MappingProxyType({}),
 ) -> Path:
-    """Write a folder of a scene with parts moved, removed or in motion, and return its path; materials stay.
+    """Write a folder of a scene with parts moved or removed, and return its path; materials stay.
 
     Parts that are moved partly out of the scene, or into other surfaces, are named in the log with the distance.
 
@@ -99,15 +97,14 @@ def edit_scene(
         moves: motions, in their order; a part may move more than once.
         remove: names of surfaces to leave out; ``*`` and ``?`` are wildcards.
         replace_folder: replace an existing folder.
-        velocities_mps: velocity [3], m/s, of the surfaces of some names or wildcards; zeros stop them.
 
     Raises:
         InputError: not a scene folder, a name that no surface has, nothing to change, a part that is moved and removed
             or moved out of the scene, no surface left, or an existing folder.
     """
     surfaces, materials = read_surfaces(folder)
-    if not moves and not remove and not velocities_mps:
-        raise InputError(f"{folder}: nothing to change; name parts to move, to remove or with a velocity")
+    if not moves and not remove:
+        raise InputError(f"{folder}: nothing to change; name parts to move or to remove")
     unmoved, moved_names, gone = surfaces, set[str](), _chosen(folder, surfaces, remove)
     for move in moves:
         names = _chosen(folder, surfaces, move.parts)
@@ -116,20 +113,14 @@ def edit_scene(
     left = [surface for surface in surfaces if surface.name not in gone]
     _check_moves(unmoved, left, moved_names)
     entries = {surface.name: materials.surfaces[surface.name] for surface in left}
-    moving = dict(materials.velocities_mps)
-    for parts, velocity in velocities_mps.items():
-        check_velocity(f"velocity of {','.join(parts)}", velocity)
-        moving |= {name: list(map(float, velocity)) for name in _chosen(folder, left, parts)}
-    moving = {name: velocity for name, velocity in moving.items() if name in entries and any(velocity)}
     changes = [f"{','.join(move.parts)} moved by {move.shift_m} m and {move.turn_deg:g} degrees" for move in moves]
     changes += [f"{name} removed" for name in remove]
-    changes += [f"{','.join(parts)} moving at {tuple(velocity)} m/s" for parts, velocity in velocities_mps.items()]
     return write_scene(
         out,
         left,
         frame=f"that of {folder}",
         source=str(folder),
-        materials=replace(materials, surfaces=entries, velocities_mps=moving),
+        materials=replace(materials, surfaces=entries),
         description=f"An edited scene: {'; '.join(changes)}",
         replace=replace_folder,
     )

@@ -19,10 +19,6 @@ Degli-Esposti et al. (2007), ``lambertian`` by default, ``directive`` (alpha_r) 
 lambda_):
 
     scattering: {itu_brick: {scattering_coefficient: 0.4, scattering_pattern: directive, alpha_r: 4}}
-
-Surfaces that move have velocities, from which Doppler shifts of paths follow:
-
-    velocities_mps: {wall_03: [0.0, 1.5, 0.0]}
 """
 
 from __future__ import annotations
@@ -44,8 +40,7 @@ from .mesh.surfaces import KINDS
 from .scattering import check_scattering
 
 FILE = "materials.yml"
-KEYS = ("rules", "surfaces", "thickness_m", "constants", "scattering", "velocities_mps")
-FASTEST_MPS = 3e6  # 1 % of the speed of light: Doppler shifts are those of first order in v / c
+KEYS = ("rules", "surfaces", "thickness_m", "constants", "scattering")
 EXPONENT, CARRIER = "conductivity_exponent", "carrier_hz"
 """Optional numbers of a material with constants; both or neither."""
 STEEPEST = 5.0  # largest exponent; ITU-R P.2040 has 0 to 2.4
@@ -76,7 +71,6 @@ class Materials:
         thickness_m: slab thickness of each material of `THICKNESS_M` in metres; by default the one there.
         constants: materials of the scene's own.
         scattering: scattering of materials by their names, see `check_scattering`; others do not scatter.
-        velocities_mps: velocities [3] of moving surfaces by their names, m/s; others are at rest.
     """
 
     rules: Mapping[str, str] = field(default_factory=dict)
@@ -84,7 +78,6 @@ class Materials:
     thickness_m: Mapping[str, float] = field(default_factory=dict)
     constants: Constants = field(default_factory=dict)
     scattering: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    velocities_mps: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def of(self, name: str, kind: str) -> str:
         """Material of a surface, by its entry or else by its kind's rule."""
@@ -135,16 +128,13 @@ def read_materials(path: str | Path) -> Materials:
     for name, stated in parts["scattering"].items():
         _check_material(f"{file}: scattering", name, (*parts["constants"], *THICKNESS_M))
         check_scattering(f"{file}: scattering: {name}", stated)
-    for name, velocity in parts["velocities_mps"].items():
-        if name not in parts["surfaces"]:
-            raise InputError(f"{file}: velocities_mps: no surface {shown(name)} among surfaces")
-        check_velocity(f"{file}: velocities_mps: {name}", velocity)
     return Materials(**parts)
 
 
 def _read_parts(file: Path) -> dict[str, dict[Any, Any]]:
     """Mapping of each of `KEYS`, empty where the file has none."""
     content = read_yaml(file)
+    content.pop("velocities_mps", None)  # in files of earlier versions
     if not set(content) <= set(KEYS):
         raise InputError(f"{file}: give the keys {', '.join(KEYS)}, no others")
     parts = {key: content.get(key) or {} for key in KEYS}
@@ -171,13 +161,6 @@ def thicknesses(file: Path, stated: Any) -> dict[str, float]:
             text = f"{file}: thickness_m: {material} is {shown(thickness)}"
             raise InputError(f"{text}; give metres above 0, {THICKEST_M:g} at most")
     return dict(stated)
-
-
-def check_velocity(where: str, velocity: Any) -> None:
-    """Refuse (`InputError`) what is not three numbers of m/s below `FASTEST_MPS`."""
-    numbers = velocity if isinstance(velocity, list | tuple) else ()
-    if len(numbers) != 3 or not all(_is_number(value) and abs(value) < FASTEST_MPS for value in numbers):
-        raise InputError(f"{where} is {shown(velocity)}; give three numbers of m/s below {FASTEST_MPS:g}")
 
 
 def _is_number(value: Any) -> bool:
@@ -209,8 +192,8 @@ def materials_text(materials: Materials) -> str:
     head = (
         "# Radio materials of this scene (of ITU-R P.2040, perfect, or perfect_absorber). rules: of each kind of\n"
         "# surface; surfaces: the kind of each, or a material of its own; constants: relative permittivity,\n"
-        "# conductivity (S/m) and thickness (m) of further materials; scattering: of any material; velocities_mps:\n"
-        "# of moving surfaces, m/s. Edit, then open the scene with wrf-mi: scene.xml follows.\n"
+        "# conductivity (S/m) and thickness (m) of further materials; scattering: of any material.\n"
+        "# Edit, then open the scene with wrf-mi: scene.xml follows.\n"
     )
     facts = {key: dict(part) for key, part in vars(materials).items() if part or key not in KEYS[3:]}
     return head + yaml.safe_dump(facts, sort_keys=False, width=110)

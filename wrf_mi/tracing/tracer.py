@@ -65,7 +65,6 @@ class RayTracer:
         progress: bool = False,
         first_row: int = 0,
         carriers_hz: FloatArray | None = None,
-        velocity_mps: FloatArray | None = None,
     ) -> TraceResult:
         """Paths from transmitter positions to all receivers.
 
@@ -75,7 +74,6 @@ class RayTracer:
             first_row: number of the first position in error messages, from 0.
             carriers_hz: carrier of each position [n], Hz, of the scene's materials and the paths' gains; paths are
                 searched for once. None: the instrument's carrier for all.
-            velocity_mps: velocities of the transmitters [n, 3], m/s; None: at rest.
 
         Raises:
             InputError: a position inside a solid object, or a material that is not known at one of the carriers, among
@@ -83,8 +81,7 @@ class RayTracer:
         """
         receivers, antenna = self.instrument.receivers, self.instrument.tx_antenna
         place = progress, self._prepared, first_row
-        more: dict[str, Any] = {"tx_antenna": antenna, "tx_velocity_mps": velocity_mps}
-        traced = trace_paths(self.scene, tx_pos_m, receivers, self.options, *place, **more)
+        traced = trace_paths(self.scene, tx_pos_m, receivers, self.options, *place, tx_antenna=antenna)
         if carriers_hz is None:
             return traced
 

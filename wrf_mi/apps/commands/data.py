@@ -212,7 +212,6 @@ def summary(record: Record) -> dict[str, Any]:
         "std_db": _range(record.std, received),
         "positions": record.has_positions,
         "headings": record.tx_heading_rad is not None,
-        "velocities": record.tx_velocity_mps is not None,
         "uplink": record.uplink is not None,
         "truth": record.truth is not None,
         "extent_m": np.ptp(record.tx_pos_m, axis=0).tolist() if record.has_positions else None,
@@ -253,8 +252,7 @@ def render(facts: dict[str, Any]) -> str:
         "runs": "not stated" if facts["runs"] is None else _named(facts["runs"]),
         "readings per row": _shown(facts["n_readings"], ""),
         "noise": _shown(facts["std_db"], " dB"),
-        "known": ", ".join(filter(facts.get, ("positions", "headings", "velocities", "uplink", "truth")))
-        or "observations alone",
+        "known": ", ".join(filter(facts.get, ("positions", "headings", "uplink", "truth"))) or "observations alone",
     }
     return "\n".join(f"{label + ':':<18}{text}" for label, text in lines.items())
 

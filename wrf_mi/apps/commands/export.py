@@ -11,7 +11,7 @@ from ...core import InputError
 from .options import Arguments, add_command, add_replace
 from .output import show
 
-POSITION = "X,Y,Z[,VX,VY,VZ]"
+POSITION = "X,Y,Z"
 
 
 def add_parser(commands: Any) -> None:
@@ -28,13 +28,10 @@ def add_parser(commands: Any) -> None:
     add("source", metavar="SOURCE", help="run folder; scene (name, folder, XML, mesh); or data set (name or folder)")
     add("--format", required=True, choices=list(FORMATS), metavar="FORMAT", help=f"one of {', '.join(FORMATS)}")
     add("--out", required=True, metavar="PATH", help="file to write, or folder to make")
-    where = (
-        f"{POSITION} in m and m/s, or a CSV file with columns x,y,z and perhaps vx,vy,vz, or times t in s; repeatable"
-    )
+    where = f"{POSITION} in metres, or a CSV file with such columns; repeatable"
     add("--tx", action="append", metavar=POSITION, help=f"transmitter (3dgs: one; paths of a scene): {where}")
     add("--rx", action="append", metavar=POSITION, help=f"receiver of paths of a scene: {where}")
     add("--frequency", type=float, metavar="HZ", help="carrier of a scene's paths or materials (runs know theirs)")
-    add("--bandwidth", type=float, metavar="HZ", help="bandwidth of delay-Doppler spectra (default: 100e6)")
     add("--material", metavar="NAME", help="radio material of a bare mesh, e.g. concrete")
     add("--paths", metavar="LIST", help="kinds of path of a scene, as for trace")
     add("--depth", type=int, metavar="N", help="largest number of interactions of a scene's paths (default: 3)")
@@ -53,9 +50,9 @@ def export_command(a: Arguments) -> int:
 
     if a.frequency is not None and not a.frequency > 0:
         raise InputError(f"--frequency {a.frequency:g}: give a positive number of Hz")
-    (tx_pos_m, tx_mps), (rx_pos_m, rx_mps) = _ends(a.tx, "--tx"), _ends(a.rx, "--rx")
-    stated = (a.frequency, a.material, a.paths, a.depth, a.replace, tx_mps, rx_mps, a.bandwidth, sys.stderr.isatty())
-    facts = export(a.source, a.format, a.out, ExportOptions(tx_pos_m, rx_pos_m, *stated))
+    ends = _positions(a.tx, "--tx"), _positions(a.rx, "--rx")
+    options = (a.frequency, a.material, a.paths, a.depth, a.replace, sys.stderr.isatty())
+    facts = export(a.source, a.format, a.out, ExportOptions(*ends, *options))
     text = f"{', '.join(f'{name} {value}' for name, value in facts.items())}: {a.out}"
     return show(a.json, {"out": a.out, "format": a.format, **facts}, text)
 
@@ -69,26 +66,24 @@ def import_command(a: Arguments) -> int:
     return 0
 
 
-def _ends(texts: list[str] | None, option: str) -> Any:
-    """Positions [n, 3], m, and velocities [n, 3], m/s, of ``X,Y,Z[,VX,VY,VZ]`` or CSV files; None where unstated."""
+def _positions(texts: list[str] | None, option: str) -> Any:
+    """Positions [n, 3], metres, of ``X,Y,Z`` or CSV files; None where unstated."""
     import numpy as np
 
-    from ...runs.prediction_file import read_track
+    from ...runs.prediction_file import read_inputs
 
     if texts is None:
-        return None, None
-    ends = []
+        return None
+    positions = []
     for text in texts:
         if Path(text).suffix.lower() == ".csv":
-            ends.append(read_track(text))
+            positions.append(read_inputs(text, None).tx_pos_m)
             continue
         try:
-            values = np.array([float(part) for part in text.split(",")])
+            position = np.array([float(part) for part in text.split(",")])
         except ValueError:
-            values = np.zeros(0)
-        if len(values) not in (3, 6) or not np.isfinite(values).all():
-            raise InputError(f"{option} {text}: give three numbers X,Y,Z in metres, six with a velocity, or a CSV file")
-        ends.append((values[None, :3], values[None, 3:] if len(values) == 6 else None))
-    velocities = [np.zeros_like(position) if velocity is None else velocity for position, velocity in ends]
-    moves = any(velocity is not None for _, velocity in ends)
-    return np.concatenate([position for position, _ in ends]), np.concatenate(velocities) if moves else None
+            position = np.zeros(0)
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise InputError(f"{option} {text}: give three numbers {POSITION} in metres, or a CSV file")
+        positions.append(position[None])
+    return np.concatenate(positions)

@@ -141,16 +141,13 @@ def correct_command(a: Arguments) -> int:
 
 
 def _add_edit(commands: Any) -> None:
-    text = "move or remove parts of a scene, or give them a velocity; `trace` then predicts the changed signals; "
-    text += "without --out: list its parts"
+    text = "move or remove parts of a scene; `trace` then predicts the changed signals; without --out: list its parts"
     parser = add_command(commands, "edit", edit_command, text)
     add = parser.add_argument
     add("scene", metavar="SCENE", help="scene folder")
     text = "move parts, together, by metres and turn them by degrees about the vertical axis; * and ? are wildcards"
     add("--move", action="append", default=[], metavar="NAME,...:DX,DY,DZ[,DEG]", help=f"{text}; repeatable")
     add("--remove", action="append", default=[], type=_names, metavar="NAME,...", help="leave parts out; repeatable")
-    text = "velocity of parts in m/s, for Doppler shifts; 0,0,0 stops them"
-    add("--velocity", action="append", default=[], metavar="NAME,...:VX,VY,VZ", help=f"{text}; repeatable")
     add("--out", metavar="SCENE2", help="scene folder to make")
     add("--replace", action="store_true", help="replace an existing scene folder")
 
@@ -161,10 +158,9 @@ def edit_command(a: Arguments) -> int:
 
     if a.out is not None:
         removed = [name for names in a.remove for name in names]
-        moving = dict(_named_numbers("--velocity", text, (3,)) for text in a.velocity)
-        folder = edit_scene(a.scene, a.out, [_move(text) for text in a.move], removed, a.replace, moving)
+        folder = edit_scene(a.scene, a.out, [_move(text) for text in a.move], removed, a.replace)
         return show(a.json, {"scene": str(folder)}, f"scene: {folder}\npicture: {folder / 'preview.png'}")
-    if a.move or a.remove or a.velocity or a.replace:
+    if a.move or a.remove or a.replace:
         raise InputError("edit: give the folder of the edited scene (--out)")
     rows, lines = _parts(a.scene)
     return show(a.json, {"scene": a.scene, "parts": rows}, "\n".join(lines))
@@ -179,11 +175,9 @@ def _parts(scene: str) -> tuple[list[dict[str, Any]], list[str]]:
     lines, rows = [f"{'part':<{width}}{'material':<24}{'from x, y, z (m)':<24}to"], []
     for surface in surfaces:
         material, box_m = materials.of(surface.name, surface.kind), box_of([surface]).round(3)
-        moving = list(materials.velocities_mps.get(surface.name, [0.0, 0.0, 0.0]))
-        rows.append({"part": surface.name, "material": material, "box_m": box_m.tolist(), "velocity_mps": moving})
+        rows.append({"part": surface.name, "material": material, "box_m": box_m.tolist()})
         low, high = (" ".join(f"{value:7.2f}" for value in corner) for corner in box_m)
-        motion = f"  moving at {moving} m/s" if any(moving) else ""
-        lines.append(f"{surface.name:<{width}}{material:<24}{low:<24}{high}{motion}")
+        lines.append(f"{surface.name:<{width}}{material:<24}{low:<24}{high}")
     return rows, lines
 
 
@@ -192,20 +186,14 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _move(text: str) -> Move:
+    """Names and numbers of an option such as ``box:0.5,0,0``."""
     from ...scene.edit import Move
 
-    names, values = _named_numbers("--move", text, (3, 4))
-    return Move(names, (values[0], values[1], values[2]), values[3] if len(values) == 4 else 0.0)
-
-
-def _named_numbers(option: str, text: str, counts: tuple[int, ...]) -> tuple[tuple[str, ...], list[float]]:
-    """Names and numbers of an option such as ``box:0.5,0,0``."""
     names, _, numbers = text.rpartition(":")
     try:
         values = [float(value) for value in numbers.split(",")]
     except ValueError:
         values = []
-    if not _names(names) or len(values) not in counts:
-        what = {"--move": "DX,DY,DZ in metres", "--velocity": "VX,VY,VZ in m/s"}[option]
-        raise InputError(f"{option} {text}: give names, a colon, and {what}, such as box:0.5,0,0")
-    return _names(names), values
+    if not _names(names) or len(values) not in (3, 4):
+        raise InputError(f"--move {text}: give names, a colon, and DX,DY,DZ in metres, such as box:0.5,0,0")
+    return Move(_names(names), (values[0], values[1], values[2]), values[3] if len(values) == 4 else 0.0)

@@ -14,12 +14,11 @@ from .format import DATASET, RUN, SCENE, ExportOptions, Format
 
 ENTRY_POINTS = "wrf_mi.exports"
 SCENES = (SCENE, RUN)  # a run stands for its corrected scene, or else for the scene that it was traced in
-_TRACED = ("tx_pos_m", "rx_pos_m", "frequency_hz", "material", "kinds", "depth", "tx_velocity_mps", "rx_velocity_mps")
+_TRACED = ("tx_pos_m", "rx_pos_m", "frequency_hz", "material", "kinds", "depth")
 _WRITERS: dict[str, tuple[tuple[str, ...], str, str, tuple[str, ...]]] = {
     "3dgs": ((RUN,), ".ply", "fields:write_3dgs", ("tx_pos_m", "frequency_hz")),
     "field": ((RUN,), ".npz", "fields:write_field", ()),
     "paths": ((RUN, SCENE), ".csv", "paths_table:write_paths", _TRACED),
-    "doppler": ((RUN, SCENE), ".npz", "doppler:write_doppler", (*_TRACED, "bandwidth_hz")),
     "deepmimo": ((RUN,), "", "paths_table:write_scenario", ()),
     "sionna": (SCENES, "", "scenes:write_sionna", ("frequency_hz", "material")),
     "glb": (SCENES, ".glb", "scenes:write_glb", ("material",)),
@@ -34,7 +33,6 @@ _TEXTS = {
     "3dgs": "Gaussians for the transmitter of --tx as PLY of 3D Gaussian splatting, which its viewers open",
     "field": "all parameters of a field of Gaussians in one file, without loss; `wrf-mi import` makes a run of it",
     "paths": "paths of a traced run, or of a scene from --tx to --rx at --frequency, one row each",
-    "doppler": "channels over time and delay-Doppler spectra of the paths of moving devices and objects, and a picture",
     "deepmimo": "paths of a traced run as a scenario of DeepMIMO, a folder",
     "sionna": "scene as a folder that sionna.rt.load_scene opens with its materials, and mi.load_file for pictures",
     "glb": "scene as one glTF file (y up) with a mesh for each surface and a coloured material for each radio material",

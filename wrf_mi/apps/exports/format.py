@@ -24,14 +24,10 @@ class ExportOptions:
     kinds: str | None = None  # kinds of path, separated by commas
     depth: int | None = None  # largest number of interactions of a path
     replace: bool = False  # replace an existing folder
-    tx_velocity_mps: FloatArray | None = None  # velocities of the transmitters [n, 3], m/s
-    rx_velocity_mps: FloatArray | None = None  # velocities of the receivers [m, 3], m/s
-    bandwidth_hz: float | None = None  # bandwidth of delay-Doppler spectra, Hz
     progress: bool = False  # show bars on standard error where a tracer takes time
 
 
 NAMES = {"tx_pos_m": "--tx", "rx_pos_m": "--rx", "frequency_hz": "--frequency"}
-NAMES |= {"tx_velocity_mps": "velocity of --tx", "rx_velocity_mps": "velocity of --rx", "bandwidth_hz": "--bandwidth"}
 NAMES |= {"material": "--material", "kinds": "--paths", "depth": "--depth"}
 """Options that belong to some formats, as the command has them."""
 

@@ -41,7 +41,6 @@ def path_columns(traced: TraceResult) -> dict[str, Any]:
         columns |= {f"{name}_{axis}": column.tolist() for axis, column in zip("xyz", values.T, strict=True)}
     columns |= {"gain_re": paths.gain.real.tolist(), "gain_im": paths.gain.imag.tolist()}
     columns |= {"length_m": paths.length_m.tolist(), "delay_s": (paths.length_m / speed_of_light).tolist()}
-    columns["doppler_hz"] = paths.doppler_hz(traced.path_carriers_hz).tolist()
     for end in ("departure", "arrival"):
         for name, radians in zip(ANGLES, azimuth_elevation(getattr(paths, end)), strict=True):
             columns[f"{end}_{name}_deg"] = np.degrees(radians).tolist()
@@ -75,8 +74,7 @@ def _traced_now(source: Source, ends: dict[str, Any], options: ExportOptions) ->
         raise InputError(f"{source.name}: a scene; state where its paths begin and end: give {lacking}")
     scene = open_scene(source.name, options.frequency_hz, material=options.material)
     receivers = [Receiver(f"rx{k}", position, np.array(UPRIGHT)) for k, position in enumerate(options.rx_pos_m)]
-    moving: Any = {"tx_velocity_mps": options.tx_velocity_mps, "rx_velocity_mps": options.rx_velocity_mps}
-    return trace_paths(scene, options.tx_pos_m, receivers, _trace_options(options), options.progress, **moving)
+    return trace_paths(scene, options.tx_pos_m, receivers, _trace_options(options), options.progress)
 
 
 def _trace_options(options: ExportOptions) -> TraceOptions:

@@ -153,7 +153,7 @@ def write_corrected_scene(
     carrier_hz = float(scene.frequency[0])
     parts, thickness = list[Surface](), dict[str, float]()
     entries, constants = dict[str, str](), dict[str, dict[str, float]]()
-    fitted_names, moving, scattering = dict[str, str](), dict[str, list[float]](), dict[str, dict[str, Any]]()
+    fitted_names, scattering = dict[str, str](), dict[str, dict[str, Any]]()
     together = ~changed & _facets(surfaces, slab_of_face, len(slabs.names))
     together[list(absent)] = False
     # Each object in pieces of one material each, which become objects of their own.
@@ -171,8 +171,6 @@ def write_corrected_scene(
             corners = triangles[piece].reshape(-1, 3)
             vertices, indices = np.unique(corners, axis=0, return_inverse=True)
             parts.append(Surface(part, kinds.get(name, "other"), vertices, indices.reshape(-1, 3)))
-            if any(velocity := np.ravel(scene.objects[name].velocity).tolist()):
-                moving[part] = velocity
             # Its material: absorbing, fitted, by constants where ITU-R P.2040 has none at the carrier, or by name.
             radio_material = scene.objects[name].radio_material
             material, facts_of_scattering = radio_material.name, scattering_of(radio_material)
@@ -195,8 +193,7 @@ def write_corrected_scene(
                 scattering[material] = check_scattering(
                     f"object {name}: material {radio_material.name}", facts_of_scattering
                 )
-    how: dict[str, Any] = {"constants": constants, "scattering": scattering, "velocities_mps": moving}
-    facts = Materials(surfaces=entries, thickness_m=thickness, **how)
+    facts = Materials(surfaces=entries, thickness_m=thickness, constants=constants, scattering=scattering)
     source = f"a scene corrected by measurements at {carrier_hz / 1e9:.6g} GHz, for which its constants hold"
     frame, title = "that of the scene it was made from", "A scene corrected by measurements"
     return write_scene(folder, parts, frame=frame, source=source, materials=facts, description=title, replace=replace)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -24,7 +23,6 @@ from ..search.images import image_sources, specular_paths
 from ..search.surfaces import Surfaces, scene_surfaces
 from ..sionna.path_solver import AT_ANTENNA_M, sampled_paths
 from ..sionna.scattering import scattering_coefficients, scattering_materials, scatters
-from .motion import checked_velocities, length_rates
 from .result import TraceResult, device_ends, gains_of_receivers
 
 if TYPE_CHECKING:
@@ -51,12 +49,6 @@ class Prepared:
         self._rays: dict[TraceOptions, int] = {}
         self._tables: dict[MaterialGrouping, SceneTables] = {}
         self._checked: set[bytes | float | None] = set()
-
-    @cached_property
-    def object_velocity_mps(self) -> FloatArray:
-        """Velocities of the scene's objects [n_objects, 3], m/s, in the order of ``surfaces.names``."""
-        stated = [np.ravel(self.scene.objects[name].velocity) for name in self.surfaces.names]
-        return checked_velocities(np.reshape(stated, (-1, 3)), len(stated), "object")
 
     def check(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...], first_row: int = 0) -> None:
         """Refuse antennas inside solids and warn of those near surfaces (`check_devices`), each position once."""
@@ -150,8 +142,6 @@ def trace_paths(
     tx_antenna: Antenna = ANTENNA,
     check: bool = True,
     gains: bool = True,
-    tx_velocity_mps: ArrayLike | None = None,
-    rx_velocity_mps: ArrayLike | None = None,
     search_from: Literal["receivers", "transmitters"] | None = None,
 ) -> TraceResult:
     """Trace the paths from every transmitter position to every receiver.
@@ -176,9 +166,6 @@ def trace_paths(
         tx_antenna: antenna of the transmitters; receivers hold their antennas.
         check: refuse antennas inside solids, warn of those near surfaces.
         gains: evaluate the gains of the paths; otherwise they are NaN, for callers that need geometry alone.
-        tx_velocity_mps: velocities of the transmitters [n, 3], m/s, for Doppler shifts; None: at rest. Objects have
-            those of the scene (``SceneObject.velocity``).
-        rx_velocity_mps: velocities of the receivers [n_rx, 3], m/s; None: at rest.
         search_from: side from which rays leave, a second for each position; a path and its gain are the same both ways,
             but rays miss some that take small surfaces, others from each side. None: receivers, but transmitters with
             diffraction (always) or scattering, whose fields at lossy wedges, and by the angle of incidence, are not
@@ -194,8 +181,6 @@ def trace_paths(
     """
     positions, devices = _stated_devices(tx_pos_m, receivers)
     shared = prepared or Prepared(scene)
-    tx_mps = checked_velocities(tx_velocity_mps, len(positions), "transmitter")
-    rx_mps = checked_velocities(rx_velocity_mps, len(devices), "receiver")
     if check:
         shared.check(positions, devices, first_row)
         shared.report_scattering(options)
@@ -217,8 +202,6 @@ def trace_paths(
             gain = gains_of_receivers(scene, shared.surfaces, legs, ends, rays, devices, receiver)
         # Sorted from transmitters to receivers, with each triangle's number in its object, as in a file.
         paths, legs = _paths(legs.reverse() if swap else legs, gain, shared.surfaces, positions, rx_devices.position_m)
-        rate = length_rates(paths, positions, rx_devices.position_m, tx_mps, rx_mps, shared.object_velocity_mps)
-        paths = replace(paths, length_rate_mps=rate)
         primitives = np.where(legs.face >= 0, legs.face - shared.surfaces.first_face[paths.objects], -1)
         hz, arrays = float(scene.frequency[0]), (primitives.astype(np.int32), legs.probability, legs.wedge)
         traced = TraceResult(paths, positions, devices, *arrays, options, int(rays), swap, hz, tx_antenna)

@@ -349,8 +349,6 @@ def load_scene(
     except InputError as error:
         raise InputError(f"{error} (wrf-mi check {source} names every fault)") from None
     set_scattering(scene, stated.scattering)
-    for name, velocity_mps in stated.velocities_mps.items():
-        scene.objects[name].velocity = list(velocity_mps)
     return scene, dict(stated.thickness_m), stated.laws
 
 
