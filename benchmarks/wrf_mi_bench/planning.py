@@ -1,11 +1,9 @@
-"""Where to measure next: errors of maps by number of rows, of planned rows and of rows chosen otherwise.
+"""Where to measure next: errors of maps by number of rows, of planned rows and of random ones.
 
-From ten random training rows, rows are added ten at a time by each rule, a model is fitted to them, and its error on
-the official test rows is stored. Rules are random rows, those that fill space (each the farthest from all before),
-those of the greatest variance, and those of `wrf_mi.plan`: `wrf_mi.apps.maps.plan.greedy` on the model's
-`error_prior`, for the error over the area in which rows could be chosen. Strengths are predicted by kriging about the
-local mean of the power traced in a known scene, as by the hybrid's mean and residual, spectra by kriging of their
-pixels. A scene is traced once for all fits.
+From ten random training rows, rows are added ten at a time, a model is fitted to them, and its error on the official
+test rows is stored. Added rows are random ones, or each the farthest from all before, as `wrf_mi.apps.maps.plan` does
+it. Strengths are predicted by kriging about the local mean of the power traced in a known scene, as by the hybrid's
+mean and residual, spectra by kriging of their pixels. A scene is traced once for all fits.
 """
 
 import tempfile
@@ -17,16 +15,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.spatial.distance import cdist
 
 import wrf_mi
-from wrf_mi.apps.maps.plan import greedy
+from wrf_mi.apps.maps.plan import farthest_points
 from wrf_mi.core import Record
-from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.types import IntArray
 from wrf_mi.datasets import make_splits
-from wrf_mi.estimators.error_prior import ErrorPrior
 from wrf_mi.estimators.interpolation.kriging import Kriging
 from wrf_mi.estimators.interpolation.strengths import fit_strengths
 from wrf_mi.models import Inputs
@@ -48,35 +43,26 @@ SIZES = (10, 20, 30, 40, 50, 60)
 STARTS = range(10)
 MOST_CANDIDATES, MOST_TESTS = 400, 400  # training rows among which rules choose, and test rows, drawn at random
 MOST_RECEIVERS = 6
-NEIGHBOURS = 5  # of a position, whose mean distance is the width of the kernel of its density
 COARSE = slice(None, None, 3)  # every third row and column of a spectrum
-RANDOM, FILLING, VARIANCE, OURS = "random", "space-filling", "greatest variance", "plan"
-RULES = (RANDOM, FILLING, VARIANCE, OURS)
-ASKED = "clearly better than random rows, not clearly worse than space-filling ones"
+RANDOM, PLAN = "random", "plan"
+RULES = (RANDOM, PLAN)
+ASKED = "not clearly worse than random rows"
 Errors = dict[str, list[list[float]]]  # scores by rule, start and number of rows
 
 
 @dataclass(frozen=True)
-class Fit:
-    """A model that is fitted to some rows: predictions of test rows [n_rx, m, ...], processes of its errors."""
-
-    test: Any
-    priors: Sequence[ErrorPrior]
-
-
-@dataclass(frozen=True)
 class Place:
-    """Data, rows that rules choose from, test rows, and the fit of a model to rows."""
+    """Data, rows that rules choose from, test rows, and their predictions [n_rx, m, ...] by a model fitted to rows."""
 
     record: Record
     able: IntArray
     test: IntArray
-    fit: Callable[[IntArray], Fit]
+    fit: Callable[[IntArray], Any]
 
-    def score(self, fit: Fit) -> float:
-        """Mean over test rows and receivers."""
+    def score(self, rows: IntArray) -> float:
+        """Mean over test rows and receivers of a model that is fitted to rows."""
         truth = self.record.observation[:, self.test]
-        return float(np.nanmean(task_of(self.record).of_rows(fit.test, truth)))
+        return float(np.nanmean(task_of(self.record).of_rows(self.fit(rows), truth)))
 
 
 def _drawn(record: Record, in_scene: bool) -> tuple[Record, IntArray, IntArray]:
@@ -109,10 +95,9 @@ def _strengths(full: Record, scene: Path) -> Place:
     heading, receivers = record.tx_heading_rad, range(len(record.receivers))
     inputs = Inputs(record.tx_pos_m[test], None if heading is None else heading[test])
 
-    def fit(rows: IntArray) -> Fit:
+    def fit(rows: IntArray) -> Any:
         fitted = fit_strengths(record, rows, mean)
-        predicted = np.stack([fitted.predict_mean(inputs, receiver) for receiver in receivers])
-        return Fit(predicted, [fitted.error_prior(receiver) for receiver in receivers])
+        return np.stack([fitted.predict_mean(inputs, receiver) for receiver in receivers])
 
     return Place(record, able, test, fit)
 
@@ -140,9 +125,8 @@ def _spectra(name: str, folder: Path) -> Place:
     record, able, test = _drawn(wrf_mi.load(name), in_scene=False)
     values = record.observation[0].astype(float)
 
-    def fit(rows: IntArray) -> Fit:
-        fitted = Kriging().fit(record.tx_pos_m[rows], values[rows])
-        return Fit(fitted.predict(record.tx_pos_m[test])[None], [fitted.error_prior()])
+    def fit(rows: IntArray) -> Any:
+        return Kriging().fit(record.tx_pos_m[rows], values[rows]).predict(record.tx_pos_m[test])[None]
 
     return Place(record, able, test, fit)
 
@@ -156,63 +140,21 @@ PLACES: Mapping[str, Callable[[Path], Place]] = {
 }
 
 
-def farthest_points(positions_m: FloatArray, count: int, known_m: FloatArray) -> IntArray:
-    """Indices of positions [n, 3] each of which is the farthest from those before and from known ones [k, 3].
-
-    Source: Gonzalez, "Clustering to minimize the maximum intercluster distance" (1985), Theor. Computer Science 38.
-    """
-    distance, chosen = cdist(positions_m, known_m).min(axis=1), []
-    for _ in range(count):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(positions_m - positions_m[chosen[-1]], axis=1))
-    return np.asarray(chosen)
-
-
-def greatest_variances(priors: Sequence[ErrorPrior], positions_m: FloatArray, count: int) -> IntArray:
-    """Indices of positions [n, 3] each of the greatest variance after those before, summed over receivers."""
-    covariances, chosen = [prior.posterior(positions_m) for prior in priors], list[int]()
-    for _ in range(count):
-        variance = np.sum([covariance.diagonal() for covariance in covariances], axis=0)
-        variance[chosen] = -np.inf
-        chosen.append(int(np.argmax(variance)))
-        for covariance, prior in zip(covariances, priors, strict=True):
-            column = covariance[:, chosen[-1]].copy()
-            covariance -= np.outer(column, column / (column[chosen[-1]] + prior.new_noise))
-    return np.asarray(chosen)
-
-
-def even_weights(positions_m: FloatArray) -> FloatArray:
-    """Weights of positions [n, 3] by which sums over them are over the area: the inverse of their local density."""
-    # A robot stands still at some places; a map has as many positions there as elsewhere.
-    distance = cdist(positions_m, positions_m)
-    width = np.sort(distance, axis=1)[:, NEIGHBOURS].mean()
-    return np.asarray(1 / np.exp(-np.square(distance / width)).sum(axis=1))
-
-
-def next_rows(rule: str, place: Place, fit: Fit, rows: IntArray, count: int, seed: int) -> IntArray:
-    """Rows that a rule adds to those of a fit."""
-    left = np.setdiff1d(place.able, rows)
-    positions_m = place.record.tx_pos_m
+def next_rows(rule: str, place: Place, rows: IntArray, count: int, seed: int) -> IntArray:
+    """Rows that a rule adds to others."""
+    left, positions_m = np.setdiff1d(place.able, rows), place.record.tx_pos_m
     if rule == RANDOM:
         return np.random.default_rng([seed, len(rows)]).choice(left, count, replace=False)
-    if rule == FILLING:
-        return left[farthest_points(positions_m[left], count, positions_m[rows])]
-    if rule == VARIANCE:
-        return left[greatest_variances(fit.priors, positions_m[left], count)]
-    covariances = [prior.posterior(positions_m[place.able]) for prior in fit.priors]
-    noise = [prior.new_noise for prior in fit.priors]
-    weights = np.tile(even_weights(positions_m[place.able]), (len(noise), 1))
-    return place.able[greedy(covariances, noise, weights, np.isin(place.able, left), count)[0]]
+    return left[farthest_points(positions_m[left], count, positions_m[rows])[0]]
 
 
 def scores_of(place: Place, rule: str, start: int) -> list[float]:
     """Scores by the number of rows, from one start."""
     rows, scores = np.sort(np.random.default_rng([start, 7]).permutation(place.able)[: SIZES[0]]), list[float]()
     for size, following in zip(SIZES, (*SIZES[1:], SIZES[-1]), strict=True):
-        fit = place.fit(rows)
-        scores.append(place.score(fit))
+        scores.append(place.score(rows))
         if following > size:
-            rows = np.sort(np.concatenate([rows, next_rows(rule, place, fit, rows, following - size, start)]))
+            rows = np.sort(np.concatenate([rows, next_rows(rule, place, rows, following - size, start)]))
     return scores
 
 
@@ -228,48 +170,39 @@ def measure(name: str) -> dict[str, Any]:
 
 
 def row_of(name: str, part: Mapping[str, Any]) -> dict[str, Any]:
-    """Row of the table: mean scores, gains over other rules, and planned rows that equal 60 random ones."""
+    """Row of the table: mean scores, gain over random rows, and planned rows that equal 60 random ones."""
     errors = {rule: np.asarray(part["errors"][rule]) for rule in RULES}
     sign = 1 if part["higher_is_better"] else -1
     means = {rule: values.mean(axis=0) for rule, values in errors.items()}
-    gains = {}
-    for rule in (RANDOM, FILLING, VARIANCE):
-        gain = bootstrap(sign * (errors[OURS] - errors[rule])[:, 1:].mean(axis=1), statistic=np.mean)
-        gains[rule] = [gain.value, gain.low, gain.high]
-    reached = np.flatnonzero(sign * (means[OURS] - means[RANDOM][-1]) >= 0)
-    equal = SIZES[reached[0]] if len(reached) else None
-    value = f"{means[OURS][2]:.3g} with 30 planned rows, {means[RANDOM][-1]:.3g} with 60 random ones"
-    known: dict[str, Any] = {
-        "mean": {rule: mean.tolist() for rule, mean in means.items()},
-        "gain": gains,
-        "equal": equal,
-    }
-    known["label"] = "SSIM" if part["higher_is_better"] else "error, dB"
+    gain = bootstrap(sign * (errors[PLAN] - errors[RANDOM])[:, 1:].mean(axis=1), statistic=np.mean)
+    reached = np.flatnonzero(sign * (means[PLAN] - means[RANDOM][-1]) >= 0)
+    value = f"{means[PLAN][2]:.3g} with 30 planned rows, {means[RANDOM][-1]:.3g} with 60 random ones"
     return {
         **line(name, value, ASKED),
-        **known,
+        "mean": {rule: mean.tolist() for rule, mean in means.items()},
+        "gain": [gain.value, gain.low, gain.high],
+        "equal": SIZES[reached[0]] if len(reached) else None,
+        "label": "SSIM" if part["higher_is_better"] else "error, dB",
     }
 
 
 def main() -> dict[str, Any]:
-    """Measure the places that are not stored; ``failed`` where other rows are clearly better than planned ones."""
+    """Measure the places that are not stored; ``failed`` where random rows are clearly better than planned ones."""
     data_folder(FLAT)
     parts = {name: stored_part("plan", name.replace(" ", "-"), partial(measure, name)) for name in PLACES}
     rows = [row_of(name, part) for name, part in parts.items()]
     result: dict[str, Any] = {"rows": rows, "measured": measured_on(parts.values())}
     if PICTURE.parent.is_dir():
         write_figure(PICTURE, picture(rows))
-    worse = [f"{row['what']} ({rule})" for row in rows for rule in (RANDOM, FILLING) if row["gain"][rule][2] < 0]
-    return result | ({"failed": f"clearly worse than other rows: {', '.join(worse)}"} if worse else {})
+    worse = [row["what"] for row in rows if row["gain"][2] < 0]
+    return result | ({"failed": f"clearly worse than random rows: {', '.join(worse)}"} if worse else {})
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of the gains of planned rows; `picture` shows the scores."""
-    head = ["place", "gain over random", "gain over space-filling", "planned rows as good as 60 random"]
-    lines = []
-    for row in rows:
-        gains = ["{:.3f} ({:.3f} to {:.3f})".format(*row["gain"][rule]) for rule in (RANDOM, FILLING)]
-        lines.append([row["what"], *gains, str(row["equal"] or "more than 60")])
+    head = ["place", "gain over random", "planned rows as good as 60 random"]
+    gains = ["{:.3f} ({:.3f} to {:.3f})".format(*row["gain"]) for row in rows]
+    lines = [[row["what"], gain, str(row["equal"] or "more than 60")] for row, gain in zip(rows, gains, strict=True)]
     return markdown_table(head, lines)
 
 
@@ -278,7 +211,7 @@ def picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
     figure = Figure(figsize=(11, 5), layout="constrained", facecolor="white")
     panels = figure.subplots(2, -(-len(rows) // 2), squeeze=False).ravel()
     for axes, row in zip(panels, rows, strict=False):
-        for rule, colour in zip(RULES, ("0.6", "#2a6f97", "#e09f3e", "#c1121f"), strict=True):
+        for rule, colour in zip(RULES, ("0.6", "#c1121f"), strict=True):
             axes.plot(SIZES, row["mean"][rule], ".-", color=colour, linewidth=1.2, label=rule)
         axes.set(xlabel="rows", ylabel=row["label"])
         axes.set_title(row["what"], fontsize=9)

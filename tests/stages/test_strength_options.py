@@ -89,14 +89,6 @@ def test_deviations_of_the_mean_by_trees_are_as_large_as_its_errors(tmp_path: Pa
     assert 0.5 < np.sqrt(np.mean(stated**2) / np.mean(errors**2)) < 2
 
 
-def test_planned_rows_lower_the_errors_of_trees_nearby(tmp_path: Path) -> None:
-    """Before anything else is measured, errors of trees are those of a process with shadowing."""
-    prior = fit(made("walls"), tmp_path, "shadowing=trees").error_prior(0)
-    at_m = np.array([[8.0, 8, 1.3], [8.2, 8, 1.3], [0.5, 15, 1.3]])
-    correlation = prior.covariance(at_m, at_m) / prior.covariance(at_m[:1], at_m[:1])
-    assert correlation[0, 1] > correlation[0, 2] + 0.1
-
-
 @pytest.mark.parametrize("shadowing", [TREES, NONE])
 def test_model_is_stored_bit_for_bit(shadowing: str, tmp_path: Path) -> None:
     record = made("walls", headings=True)

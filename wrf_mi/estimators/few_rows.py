@@ -25,7 +25,6 @@ from ..core.array_files import under
 from ..core.types import IntArray
 from ..datasets.observations import FEW_ROWS, rows_received
 from ..tasks import TASKS
-from .error_prior import ErrorPrior
 from .interpolation.kriging import Trend
 from .model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, field_arrays, from_field_arrays
 
@@ -175,10 +174,6 @@ class FittedWithFew(Fitted):
         if refit is None:
             return None
         return FittedWithFew(refit, self._numbers, SharedLaw.fit(record, rows, self.law.number))
-
-    def error_prior(self, receiver: int) -> ErrorPrior | None:
-        """That of the model; none of receivers with few rows."""
-        return self.fitted.error_prior(self._place[receiver]) if receiver in self._place else None
 
     @property
     def depends_on_heading(self) -> bool:

@@ -23,7 +23,6 @@ from ..core.types import IntArray
 from ..parallel import Scheduler
 from ..receivers.spreads import PathStatistics
 from ..training.session import FitSession
-from .error_prior import ErrorPrior
 
 Kind = TypeVar("Kind")
 Arrays = dict[str, NDArray[Any]]
@@ -176,10 +175,6 @@ class Fitted(ABC):
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
         """Stored predictions for rows of the record; None: `predict` makes them."""
-        return None
-
-    def error_prior(self, receiver: int) -> ErrorPrior | None:
-        """Process that the errors of a receiver's predictions are taken to be; None: the model states none."""
         return None
 
     def in_scene(self, scene: str) -> Fitted:

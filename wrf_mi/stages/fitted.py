@@ -14,7 +14,6 @@ from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.array_files import keyed, under
 from ..core.types import IntArray
-from ..estimators.error_prior import ErrorPrior
 from ..estimators.held_out import HoldOut, predicted_rows
 from ..estimators.interpolation.kriging import Kriged, Kriging
 from ..estimators.model import (
@@ -311,14 +310,6 @@ class FittedMixture(Fitted):
         distance_m = RowDistance.of_rows(record, rows.fold.all_train).of_pairs(record, *pairs)
         stated = self.with_intervals(mixed(self.weights(distance_m), every, self._states), distance_m)
         self.reception = Reception.fit(record, self.known, rows.fold.all_train, rows.held_out, stated)
-
-    def error_prior(self, receiver: int) -> ErrorPrior | None:
-        """That of what the scene's side leaves, or else of the first part that states one."""
-        kriged = None if self.residuals is None else self.residuals.by_receiver.get(receiver)
-        if kriged is not None:
-            return kriged.error_prior()
-        priors = (part.error_prior(receiver) for part in self.parts.values())
-        return next((prior for prior in priors if prior is not None), None)
 
     def arrays(self) -> Arrays:
         """Weights, residuals, intervals, training rows, and the arrays of the parts."""

@@ -16,7 +16,6 @@ import numpy as np
 from ..core import Split
 from ..core.array_files import keyed, under
 from ..core.registry import Registry
-from ..estimators.error_prior import ErrorPrior
 from ..estimators.model import Arrays, Fitted, Model, PredictAll, Problem, Session
 from .engine import Engine
 from .fitted import FittedMixture
@@ -57,10 +56,6 @@ class Further(Fitted):
     def in_scene(self, scene: str) -> Self:
         """The stage after the prediction in an edited scene."""
         return self._about(self.before.in_scene(scene))
-
-    def error_prior(self, receiver: int) -> ErrorPrior | None:
-        """As before."""
-        return self.before.error_prior(receiver)
 
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions by the stages before, up to each and to the last of them."""

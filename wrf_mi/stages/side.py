@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from ..core import Prediction, Split
 from ..correction import default_options
-from ..estimators.error_prior import ErrorPrior
 from ..estimators.gaussian.model import FittedField
 from ..estimators.model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem
 from ..tasks import instrument_of, task_of
@@ -49,10 +48,6 @@ class FittedInScene(Fitted):
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Observations, and the paths' and the Gaussians' share of them where there are both."""
         return self.fitted.decompose(inputs, receiver, std)
-
-    def error_prior(self, receiver: int) -> ErrorPrior | None:
-        """As of the fitted model."""
-        return self.fitted.error_prior(receiver)
 
     def tracing_once(self) -> FittedInScene:
         """As of the fitted model."""

@@ -10,8 +10,6 @@ from ...core import InputError
 from .options import Arguments, add_command, add_scheduler, refuse
 from .output import Watch, show, summary_table
 
-LITTLE = 0.05  # relative reduction of the error below which a plan is said to change little
-
 
 def add_parser(commands: Any) -> None:
     """Add ``map``, ``plan``, ``locate`` and ``view`` to the commands."""
@@ -73,28 +71,17 @@ def map_command(a: Arguments) -> int:
 
 
 def _add_plan(commands: Any) -> None:
-    text = "positions whose measurement lowers the expected error of a run's map most"
+    text = "positions to measure next, each as far as possible from all measured or planned before it"
     parser = add_command(commands, "plan", plan_command, text)
     add = parser.add_argument
     add("run", metavar="RUN", help="run folder")
-    text = "file to write: order, x, y, z, expected error after each, distance walked; FILE.png beside it"
+    text = "file to write: order, x, y, z, distance from the nearest position before; FILE.png beside it"
     add("--out", required=True, metavar="FILE.csv", help=text)
     add("--count", type=int, default=10, metavar="N", help="number of positions (default: 10)")
     text = "positions that can be measured, x, y, z in metres, with a header (default: the map, 0.5 m from walls)"
     add("--candidates", metavar="FILE.csv", help=text)
-    text = "corners of the area whose errors count, metres (default: the scene, or all rows of the data)"
+    text = "corners of the area to measure in, metres (default: the scene, or the box of all rows of the data)"
     add("--area", type=float, nargs=4, metavar=("X0", "Y0", "X1", "Y1"), help=text)
-    text = (
-        "what is to become small: error over the map, error of coverage about a threshold, or uncertainty of the loss "
-    )
-    text += "at the least certain surface of the scene (default: error)"
-    add("--criterion", choices=("error", "coverage", "material"), default="error", help=text)
-    add("--threshold", type=float, metavar="DBM", help="threshold of coverage (default: -90 dBm)")
-    text = "distance that is worth half of a reduction, for plans that are short to walk (default: distances are free)"
-    add("--walk", type=float, metavar="M", help=text)
-    add("--start", type=float, nargs=3, metavar=("X", "Y", "Z"), help="where the walk begins (default: nowhere)")
-    text = "name of a receiver whose errors count, repeatable (default: all)"
-    add("--receiver", action="append", metavar="NAME", help=text)
     add("--step", type=float, metavar="M", help="spacing of the map (default: 0.25 m, more for large areas)")
     add("--height", type=float, metavar="M", help="height of the transmitter (default: the median of the data's)")
 
@@ -112,22 +99,15 @@ def plan_command(a: Arguments) -> int:
         raise InputError(f"{out}: positions are written as .csv; give such a name")
     run = open_run(a.run)
     candidates_m = None if a.candidates is None else read_inputs(a.candidates, None).tx_pos_m
-    options = {"criterion": a.criterion, "threshold_dbm": a.threshold, "walk_m": a.walk, "start_m": a.start}
-    options |= {"receivers": a.receiver, "step_m": a.step, "height_m": a.height}
-    options["area_m"] = None if a.area is None else (a.area[:2], a.area[2:])
-    with Watch() as watch:
-        planned = plan(run, a.count, candidates_m=candidates_m, **options, on_progress=watch.on_progress)
+    area_m = None if a.area is None else (a.area[:2], a.area[2:])
+    planned = plan(run, a.count, candidates_m=candidates_m, area_m=area_m, step_m=a.step, height_m=a.height)
     planned.write(out)
-    picture = write_figure(out.with_suffix(".png"), plan_figure(planned, run))
-    gain, text = 1 - planned.expected_error[-1] / planned.expected_error[0], summary(planned, run)
-    if gain < LITTLE:
-        text += f"\nthat is {gain:.1%} lower: the planned measurements change little"
+    picture, text = write_figure(out.with_suffix(".png"), plan_figure(planned, run)), summary(planned)
     text += "\norder      x      y      z  (m)\n"
     for order, place in enumerate(planned.tx_pos_m, start=1):
         text += f"{order:5d}" + "".join(f"{value:7.2f}" for value in place) + "\n"
-    figures = {"out": str(out), "picture": str(picture), "expected_error": planned.expected_error.tolist()}
+    figures = {"out": str(out), "picture": str(picture), "distance_m": planned.distance_m.round(2).tolist()}
     figures["positions_m"] = planned.tx_pos_m.round(2).tolist()
-    figures |= {"surfaces": planned.surfaces} if planned.surfaces else {}
     return show(a.json, figures, f"{text}positions: {out}\npicture: {picture}")
 
 

@@ -26,7 +26,7 @@ Powers of a made-up receiver with noise of 2 dB, mapped by kriging with interval
     >>> write_map(dataset, folder / "map.nc").name
     'map.nc'
     >>> planned = run.plan(count=2)
-    >>> planned.tx_pos_m.shape, bool(planned.expected_error[2] < planned.expected_error[0])
+    >>> planned.tx_pos_m.shape, bool(planned.distance_m[2] < planned.distance_m[0])
     ((2, 3), True)
     >>> shutil.rmtree(folder)
 """

@@ -18,7 +18,6 @@ from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
 from ...datasets.observations import LEAST_ROWS, rows_received
 from ...training.session import OnProgress
-from ..error_prior import ErrorPrior
 from ..model import Arrays, Fitted, Inputs, Model, Problem, Session, known_positions
 
 # Keys of the arrays: whether headings are used; of several carriers, these and the numbers of models that are missing.
@@ -158,11 +157,6 @@ class ByReceiver(Fitted):
         # Models run through the receivers of the first carrier, then of the next.
         models = enumerate(self.models[receiver :: len(self.models) // carriers])
         return {number: model for number, model in models if model is not None}
-
-    def error_prior(self, receiver: int) -> ErrorPrior | None:
-        """That of the receiver's model, where it states one; of several carriers that of the first."""
-        stated = getattr(next(iter(self._of(receiver).values())), "error_prior", None)
-        return None if stated is None else stated()
 
     @property
     def depends_on_heading(self) -> bool:

@@ -22,7 +22,6 @@ from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, names_of
 from ...tasks import task_of
-from ..error_prior import ErrorPrior, with_columns
 from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
@@ -34,7 +33,6 @@ HEADING_LENGTH = (0.1, 100.0)
 NOISE = (1e-4, 10.0)
 """Limits of the likelihood's maximum: metres, chords of the unit circle (2 is the opposite heading), shares of the
 variance."""
-UNKNOWN = 10.0  # deviation of a trend's coefficients a priori, in deviations of the field: nothing is known of them
 LIKELIHOOD_EVALUATIONS = 200  # Nelder-Mead on three logarithms settles to 0.01 in 60 to 150
 
 
@@ -90,23 +88,6 @@ class Kriged:
         cross = correlation(requested, _coordinates(self.positions_m, self.circle, self.lengths), self.kernel)
         mean = self.trend(positions) @ self.coefficients + cross @ self.weights
         return mean.astype(self.like.dtype).reshape(len(mean), *self.like.shape[1:])
-
-    def error_prior(self) -> ErrorPrior:
-        """The field about its trend, with the variance of greatest restricted likelihood, mean over components."""
-        rows = self.positions_m / self.lengths[0]
-        covariance = correlation(rows, rows, self.kernel)
-        covariance[np.diag_indices(len(rows))] += self.noise
-        # Observations are y = K w + B beta with weights w, which the trend's columns do not see: y^H w = w^H K w.
-        square = np.einsum("nq,nq->q", self.weights.conj(), covariance @ self.weights).real
-        free = max(len(rows) - len(self.coefficients), 1)
-        variance = float(np.mean(square) / free)
-
-        def field(a_m: FloatArray, b_m: FloatArray) -> FloatArray:
-            return variance * correlation(a_m / self.lengths[0], b_m / self.lengths[0], self.kernel)
-
-        noise = variance * self.noise
-        total = with_columns(field, self.trend, np.full(len(self.coefficients), UNKNOWN * np.sqrt(variance)))
-        return ErrorPrior(total, self.positions_m, np.full(len(rows), noise), noise)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a run file."""

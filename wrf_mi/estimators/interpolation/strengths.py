@@ -11,7 +11,7 @@ import json
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +25,6 @@ from ...datasets.observations import FEW_ROWS
 from ...parallel.threads import one_blas_thread
 from ...tasks import require
 from ...training.session import OnProgress, quiet
-from ..error_prior import ErrorPrior, with_columns
 from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
 from .by_receiver import finite_positions
 from .strength_fit import (
@@ -148,38 +147,6 @@ class Strengths(Fitted):
             (rows, [Poses(position_m[rows], None if turn is None else np.asarray(turn, float)[rows]) for turn in turns])
             for rows in parts
         ]
-
-    @cached_property
-    def _field_of_errors(self) -> Hyperparameters:
-        """Hyperparameters of the errors before anything is measured; those of trees are likely ones of a process."""
-        field = self.field
-        if not field.trees:
-            return field.spread
-        return likely_deviations(field.prior, field.stops, Hyperparameters(), ())
-
-    def error_prior(self, receiver: int) -> ErrorPrior:
-        """Shadowing and the uncertain terms of the mean, about the stops of the training rows."""
-        field, widen = self.field, self.widen[receiver] ** 2
-        h, received = self._field_of_errors, np.isfinite(field.stops.value_dbm[receiver])
-        # Headings of a plan are not known: the part of the field that depends on them is noise there.
-        turned = h.body_db**2 if field.headings else 0.0
-
-        def covariance(a_m: FloatArray, b_m: FloatArray) -> FloatArray:
-            return np.asarray(widen * h.covariance(Poses(a_m), Poses(b_m)))
-
-        def columns(position_m: FloatArray) -> FloatArray:
-            turns = np.zeros(len(position_m)) if field.headings else None
-            return field.prior.columns(Poses(position_m, turns), receiver)[1]
-
-        deviation = field.prior.deviations(field.headings)
-        noise = h.drift_db**2 + h.noise_db**2 / field.stops.count[receiver, received]
-        scale = widen * field.ratio[receiver] ** 2
-        return ErrorPrior(
-            with_columns(covariance, columns, deviation),
-            field.stops.poses.position_m[received],
-            scale * noise + widen * turned,
-            float(scale * (h.drift_db**2 + h.noise_db**2) + widen * turned),
-        )
 
     def arrays(self) -> Arrays:
         """Arrays for `from_arrays`."""
