@@ -17,7 +17,7 @@ from wrf_mi.apps.commands.data import render, summary
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.datasets import load
 from wrf_mi.datasets.observations import fitted_receivers, scorable, warn_of_left_out, warn_of_one_place
-from wrf_mi.models import ray_tracing
+from wrf_mi.estimators import ray_tracing
 from wrf_mi.runs import api as runs
 from wrf_mi.runs import sweep
 from wrf_mi.runs.api import train

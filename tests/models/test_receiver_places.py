@@ -13,8 +13,9 @@ from made_walls import heard_through_walls
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import load, make_splits, write_ble_folder
+from wrf_mi.estimators import receiver_places
 from wrf_mi.estimators.receiver_places import place_of_receiver, placed, placed_problem
-from wrf_mi.models import MODELS, Problem, receiver_places
+from wrf_mi.models import MODELS, Problem
 from wrf_mi.runs.api import open_run, resume, train
 from wrf_mi.scene.make import make_scene
 from wrf_mi.stages.correct import correct_scene

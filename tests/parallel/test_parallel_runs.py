@@ -21,7 +21,7 @@ from wrf_mi import parallel
 from wrf_mi.apps.maps.api import radio_map
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import load, write_spectrum_folder
-from wrf_mi.models import ray_tracing
+from wrf_mi.estimators import ray_tracing
 from wrf_mi.parallel import Scheduler
 from wrf_mi.runs.api import predict_to_file, train
 from wrf_mi.tracing import TraceOptions

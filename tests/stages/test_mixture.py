@@ -11,9 +11,10 @@ import wrf_mi
 from wrf_mi.core import InputError, Prediction, Record, Split
 from wrf_mi.core.array_files import stored_arrays, write_arrays
 from wrf_mi.datasets import make_splits
+from wrf_mi.estimators import held_out
 from wrf_mi.estimators.few_rows import with_few_rows
 from wrf_mi.estimators.model import Arrays, Decomposition, Fitted, Inputs, default_settings
-from wrf_mi.models import MODELS, Problem, Session, held_out
+from wrf_mi.models import MODELS, Problem, Session
 from wrf_mi.runs.folder import FITTED
 from wrf_mi.stages.fitted import DEVIATIONS, STATED, FittedMixture, deviation_weights
 from wrf_mi.stages.mixture import ChosenWeights, MixtureFit, Part
