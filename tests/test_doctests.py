@@ -11,7 +11,10 @@ import wrf_mi
 
 MOST_NAMES = 25  # names of the library in short
 NAMES = {getattr(wrf_mi, name).__module__ for name in wrf_mi.__all__}
-NAMES |= {f"wrf_mi.{name}" for name in ("core.settings", "maps.api", "maps.locate", "scene.make", "viewer.view")}
+NAMES |= {
+    f"wrf_mi.{name}"
+    for name in ("core.settings", "scene.make", "apps.maps.api", "apps.maps.locate", "apps.viewer.view")
+}
 
 
 @pytest.mark.parametrize("name", sorted(NAMES))

@@ -173,8 +173,9 @@ class MixtureFit:
         """
         task, observed = task_of(self._problem.record), held_out.observed(self._problem.record)
         states = np.array([name in used and each.std is not None for name, each in self.predictions.items()])
-        # Of channels mixed from traced paths and kriging, errors follow the magnitude, not kriging's deviations.
-        states &= not task.is_complex or states.all()
+        # Mixed spectra and channels have errors like their magnitudes: what kriging of few rows states is next to
+        # nothing at some values, and a factor that suits these is much too wide elsewhere.
+        states &= task.in_decibel or states.all()
         predicted = mixed(weights, [*self.predictions.values()], states)
         mean, of_rows = predicted.mean, (held_out.distance_m, held_out.row, held_out.group)
         # Kriging of two or three rows may pass through all of them.

@@ -38,6 +38,7 @@ LEVEL = 0.9
 SIZES, DISTANCES = 8, 4  # largest numbers of groups by size and by distance
 GROUP_ROWS = 12
 """Least average number of rows in a group: intervals of smaller ones follow their rows and are too narrow elsewhere."""
+LEAST_GROUPS = 3  # fewest groups that tell how much they differ: of two, each would be judged by the other alone
 MOST_ERRORS = 400_000  # largest number of errors that are sorted; more are thinned evenly
 GAPS = ("distance_m",)
 """Arrays that may hold infinity (`wrf_mi.estimators.model.Model.gaps`): distances to receivers without rows."""
@@ -349,7 +350,7 @@ def fit_intervals(
     one_each = mean.ndim == 1
     of_all = _fitted_intervals(sizes, error / inside, distance, rows, floor, one_each)
     names = np.unique(number)
-    if len(names) < 2:
+    if len(names) < LEAST_GROUPS:
         return of_all
     # Few rows differ in how large their errors are: those of a group that intervals do not know exceed them more often.
     # Never narrower: the groups are a handful, and a factor below 1 is chance.
