@@ -202,6 +202,7 @@ def test_damaged_files_are_refused_in_one_line_or_give_finite_numbers(name: str,
     )
     @given(damaged(whole))
     @example(b"")
+    @example(whole.replace(b"1.0", b"\x80", 1))
     @example(whole.decode("latin-1").encode("utf-16"))
     def refused_or_finite(content: bytes) -> None:
         file.write_bytes(content)
