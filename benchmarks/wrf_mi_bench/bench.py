@@ -127,8 +127,6 @@ _OWN: Mapping[str, Check] = {
     "closed-forms": _here("traced channels against closed forms", "closed_forms:main", table="closed_forms:table"),
     "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),
     "gpu": _here("a GPU beside the CPU", "gpu:main", table="gpu:table", gpu=True),
-    "robustness": _here("faults and hostile files", "robustness:main", quick="robustness:quick", resumes=True),
-    "damaged-scenes": _here("faults of scenes named", "damaged_scenes:main"),
     "plan": _here("where to measure next", "planning:main", FLAT, resumes=True, table="planning:table"),
     "waits": _here("what a person waits for", "waits:main", RFID, FLAT, resumes=True, table="page_tables:waits"),
     "sentinels": _here(

@@ -8,7 +8,7 @@ import trimesh
 import yaml
 from calling import call, refused
 from changed_folders import DATA, needs
-from wrf_mi_bench.damaged_scenes import DAMAGES, Damaged, damaged_scene
+from damaged_scenes import DAMAGES, Damaged, damaged_scene
 from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi_scenes.random_rooms import random_room
 
@@ -42,9 +42,7 @@ def gains_db(xml: Path) -> np.ndarray:
 
 
 def repaired(kind: str, folder: Path, turn: int = 0, material: str | None = "concrete") -> tuple[Repair, Damaged]:
-    seed = list(DAMAGES).index(kind) + turn * len(DAMAGES)
-    made, damaged = damaged_scene(seed, folder / "damaged")
-    assert made == kind
+    damaged = damaged_scene(kind, turn, folder / "damaged")
     return repair_scene(damaged.folder / "scene.xml", folder / "repaired", material=material), damaged
 
 
@@ -66,10 +64,8 @@ def test_repaired_scene_opens_in_sionna(kind, turn, tmp_path):
 
 
 @pytest.mark.parametrize("kind", SAME_GEOMETRY)
-def test_repaired_scene_has_the_paths_of_the_whole_one(kind, tmp_path, monkeypatch):
-    with monkeypatch.context() as patched:
-        patched.setitem(DAMAGES, kind, lambda d: setattr(d, "at", ""))
-        _, whole = damaged_scene(list(DAMAGES).index(kind), tmp_path / "whole")
+def test_repaired_scene_has_the_paths_of_the_whole_one(kind, tmp_path):
+    whole = damaged_scene(kind, 0, tmp_path / "whole", damage=False)
     expected = gains_db(whole.folder / "scene.xml")
     repair, _ = repaired(kind, tmp_path)
     assert repair.folder is not None, repair.lines()
@@ -228,7 +224,7 @@ def test_shapes_of_one_id_keep_their_materials_and_none_is_lost(tmp_path):
 
 
 def test_command_repairs_a_copy(tmp_path, capsys):
-    _, damaged = damaged_scene(list(DAMAGES).index("no-material"), tmp_path / "damaged")
+    damaged = damaged_scene("no-material", 0, tmp_path / "damaged")
     xml, out = damaged.folder / "scene.xml", tmp_path / "out"
     status, printed, _ = call(["check", xml, "--repair", out], capsys)
     assert status == 2

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import re
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from calling import contents, copied
 from commands import Command, arrays_in
@@ -27,6 +30,8 @@ from wrf_mi.training.checkpoint import cut_log
 
 DEAD = 2**22 + 1
 """No process of Linux has this number."""
+GROWTH_BYTES = 3e6
+"""Growth of memory by 300 predictions, whose results take 6 MB, or by 30 opened runs of more than 100 kB."""
 
 
 @pytest.fixture(scope="module")
@@ -195,3 +200,20 @@ def test_odd_configurations_are_refused(line: str, kriging: Path, tmp_path: Path
     text = (kriging / "config.yaml").read_text()
     (tmp_path / "config.yaml").write_text(re.sub(rf"(?m)^{line.partition(':')[0]}:.*$", line, text))
     command.refused(["evaluate", tmp_path], "config.yaml")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["kriging", "wrf-gs+"])
+def test_predictions_and_opened_runs_keep_no_memory(model: str, kriging: Path, folder: Path, tmp_path: Path) -> None:
+    run = kriging if model == "kriging" else train(folder, model, out=tmp_path, settings=settings("steps=4")).folder
+    opened, positions = open_run(run), np.random.default_rng(0).uniform(1, 4, (16, 3))
+
+    def resident_after(work: Callable[[], object], calls: int) -> int:
+        for _ in range(calls):
+            work()
+        gc.collect()
+        return int(psutil.Process().memory_info().rss)
+
+    for work, calls in ((lambda: opened.predict(positions), 300), (lambda: open_run(run).predict(positions), 30)):
+        before = resident_after(work, calls // 10)  # kernels, caches, arenas of the allocator
+        assert resident_after(work, calls) - before < GROWTH_BYTES

@@ -29,6 +29,7 @@ from ..estimators.receiver_places import placed_problem, write_places
 from ..models import Problem, Session
 from ..parallel import Scheduler
 from ..scene.correction_data import read_correction_data
+from ..stages.engine import FOLDER as OPTIONS
 from ..synthetic import load_record
 from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
 from ..training.session import Interrupted, OnProgress, quiet
@@ -249,6 +250,7 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             session.discarded.clear()
             del fitted  # what is scored is the stored one, beside which this would be in memory a second time
         (part / CHECKPOINT).unlink(missing_ok=True)  # also of a process that was killed before
+        shutil.rmtree(part / OPTIONS, ignore_errors=True)
         parts.append(FittedPart(part, rows, *load_fitted(config, problem, part)))
         if len(rows.test):
             scores.append(score_part(folder, config, problem, parts[-1]))

@@ -160,8 +160,20 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
             text = f"{xml}: must follow {MATERIALS_FILE} and cannot be written ({one_line(error.strerror or error)})"
             raise InputError(f"{text}; copy the folder and open the copy") from None
     counts = facts.get("counts")
-    origin_m = tuple(map(float, facts["origin_m"])) if facts.get("origin_m") else None
-    return SceneFolder(folder, xml, full, counts if isinstance(counts, dict) else {}, origin_m)
+    return SceneFolder(folder, xml, full, counts if isinstance(counts, dict) else {}, _origin(folder, facts))
+
+
+def _origin(folder: Path, facts: Mapping[Any, Any]) -> tuple[float, ...] | None:
+    stated = facts.get("origin_m")
+    if not stated:
+        return None
+    try:
+        origin_m = tuple(map(float, stated))
+    except (TypeError, ValueError):
+        origin_m = ()
+    if len(origin_m) != 3 or not np.isfinite(origin_m).all():
+        raise InputError(f"{folder / FACTS_FILE}: origin_m is not a point; give x, y and z in metres")
+    return origin_m
 
 
 def scene_file(folder: Path, facts: Mapping[Any, Any]) -> Path:

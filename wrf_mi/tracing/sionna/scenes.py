@@ -135,7 +135,7 @@ def triangles_by_mitsuba(file: Path, plugin: str) -> NDArray[np.float32]:
         with quiet_mitsuba():
             # Normals of vertices are not needed, and cannot be computed for every file.
             mesh: Any = mi.load_dict({"type": plugin, "filename": str(file), "face_normals": True})
-    except RuntimeError:
+    except (RuntimeError, UnicodeDecodeError):  # the latter of a message that quotes bytes of the file
         return np.zeros((0, 3, 3), np.float32)
     corners = mesh.vertex_positions_buffer().numpy().reshape(-1, 3)
     return cast(NDArray[np.float32], corners[mesh.faces_buffer().numpy().reshape(-1, 3)])
