@@ -95,7 +95,8 @@ def imported(file: Path) -> Iterable[Any]:
 
 def heard(file: Path) -> Iterable[Any]:
     upright = np.array([0.0, 0, 0, 1])
-    return read_observations(file, [Receiver(name, np.zeros(3), upright) for name in ("one", "other")])[1:]
+    places = read_observations(file, [Receiver(name, np.zeros(3), upright) for name in ("one", "other")])[1]
+    return () if places is None else (places,)
 
 
 def of_folder(read: Callable[[Path], Any]) -> Callable[[Path], Iterable[Any]]:
