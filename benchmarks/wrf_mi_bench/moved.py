@@ -93,7 +93,7 @@ def furnished(seed: int, folder: Path) -> Room:
     new = {name: (room.parts[name][0], room.parts[name][1].copy().apply_translation(m)) for name, m in shifts_m.items()}
     old = {f"{name}_before": room.parts[name] for name in shifts_m}
     moved, both = (
-        write_scene(folder / name, room.parts | parts, f"Random room {seed}", "wrf_mi_scenes.random_rooms").parent
+        write_scene(folder / name, {**room.parts, **parts}, f"Random room {seed}", "wrf_mi_scenes.random_rooms").parent
         for name, parts in (("moved", new), ("both", new | old))
     )
     # Free in both states, as the field from before is asked for the same positions.

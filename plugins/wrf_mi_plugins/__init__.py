@@ -40,4 +40,4 @@ def register_all() -> None:
         return
     for name in MODULES:
         importlib.import_module(f".{name}", __name__).register()
-    _registered.add(variant)
+    _registered.add(str(variant))

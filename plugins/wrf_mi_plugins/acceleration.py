@@ -78,7 +78,8 @@ def traced_lists(gaussians: Gaussians, footprints: RayFootprints, pose: Pose, bu
         bundles: rays of the receiver.
     """
     order = depth_order(footprints.depth, gaussians.position)
-    order = dr.gather(mi.UInt32, order, dr.compress(dr.gather(mi.Bool, footprints.visible, order)))
+    visible: Any = dr.compress(dr.gather(mi.Bool, footprints.visible, order))
+    order = dr.gather(mi.UInt32, order, visible)
     lists = dr.width(bundles.axis[0])
     if dr.width(order) == 0:
         return RayLists(mi.UInt32(0), dr.zeros(mi.UInt32, lists), dr.zeros(mi.UInt32, lists))
@@ -97,7 +98,8 @@ def traced_lists(gaussians: Gaussians, footprints: RayFootprints, pose: Pose, bu
     keys = dr.sort(dr.concat(found))
     number = dr.arange(mi.UInt32, dr.width(keys))
     first = (number == 0) | (keys != dr.gather(key_type, keys, dr.maximum(number, 1) - 1))
-    keys = dr.gather(key_type, keys, dr.compress(first))
+    distinct: Any = dr.compress(first)
+    keys = dr.gather(key_type, keys, distinct)
     length = dr.zeros(mi.UInt32, lists)
     dr.scatter_add(length, mi.UInt32(1), mi.UInt32(keys // count))
     end = dr.cumsum(length)
@@ -147,7 +149,7 @@ def _hits(ellipsoids: Hulls, rank: Any, pose: Pose, bundles: Bundles, count: Any
     back = ray >= parts * lists
     end = SIZE + STEP
     origin = _place((ray // lists) % parts, across) + turned * dr.select(back, end, -behind)
-    rays = mi.Ray3f(origin, dr.select(back, -turned, turned), end + behind, 0.0, [])
+    rays: Any = mi.Ray3f(origin, dr.select(back, -turned, turned), end + behind, 0.0, [])  # type: ignore[call-overload]
     first = key_type(ray % lists) * count
     dr.eval(rays, first, rank)
     room = max(ENTRIES, ENTRIES_EACH * n)

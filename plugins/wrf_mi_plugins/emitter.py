@@ -62,7 +62,7 @@ class GaussianEmitter(mi.Emitter):
         super().traverse(callback)
         self.source.traverse(callback)
 
-    def parameters_changed(self, keys: list[str]) -> None:
+    def parameters_changed(self, keys: Any = ()) -> None:
         """Evaluate the field and update the shape and media."""
         super().parameters_changed(keys)
         if list(keys) == ["parent"]:  # a change of the shape that this emitter made
@@ -92,7 +92,8 @@ class GaussianEmitter(mi.Emitter):
         if g.opacity is not None:
             amplitude *= dr.gather(mi.Float, g.opacity, index)
         re, im = (dr.gather(mi.Float, part, index) * amplitude for part in g.signal)
-        return mi.depolarizer(mi.UnpolarizedSpectrum(re * re + im * im))
+        radiance: Any = mi.UnpolarizedSpectrum(re * re + im * im)
+        return mi.depolarizer(radiance)
 
     def sample_direction(
         self, it: mi.Interaction3f, sample: mi.Point2f, active: Any = True
@@ -100,7 +101,7 @@ class GaussianEmitter(mi.Emitter):
         """No sample: density zero, so rays that hit the Gaussians count in full."""
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
 
-    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Any = True) -> mi.Float:
+    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: Any = True) -> Any:
         """Density of `sample_direction`: zero."""
         return mi.Float(0)
 
@@ -115,7 +116,8 @@ class GaussianEmitter(mi.Emitter):
 
     def to_string(self) -> str:
         """Model, number of Gaussians and transmitter."""
-        where = ", ".join(f"{x:g}" for x in dr.ravel(dr.detach(self.source.tx_position)))
+        position: Any = dr.ravel(dr.detach(self.source.tx_position))
+        where = ", ".join(f"{x:g}" for x in position)
         model = type(self.source.field).__name__
         return f"GaussianEmitter[{model}, {self.gaussians.count} Gaussians, transmitter at ({where}) m]"
 

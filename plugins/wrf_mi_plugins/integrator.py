@@ -101,7 +101,7 @@ class TracedField(ADIntegrator):
             material, a sensor that is no point.
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: Any) -> None:
         super().__init__(props)
         self.with_walls = bool(props.get("walls", True))
         self.frequency_hz = mi.Float(float(props.get("frequency_hz", 0.0)))
@@ -261,7 +261,7 @@ def _write_film(film: Any, image: Any) -> None:
     unit = dr.full(mi.Float, 1, dr.width(size))
     channels = [size, size, size] + [unit] * (2 if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else 1) + [re, im]
     tensor = mi.TensorXf(interleave(channels), (*image.shape[:2], len(channels)))
-    film.put_block(mi.ImageBlock(tensor, mi.ScalarPoint2i(film.crop_offset())))
+    film.put_block(mi.ImageBlock(tensor, mi.ScalarPoint2i(film.crop_offset())))  # type: ignore[call-overload]
 
 
 def register() -> None:

@@ -64,7 +64,7 @@ class GaussianMedium(mi.Medium):
     ``volpathmis`` does not work in polarised variants.
     """
 
-    def __init__(self, props: mi.Properties) -> None:
+    def __init__(self, props: Any) -> None:
         super().__init__(props)
         self.m_is_homogeneous = False
         self.m_has_spectral_extinction = False
@@ -104,7 +104,7 @@ class GaussianMedium(mi.Medium):
             flags = mi.ParamFlags.Discontinuous if name in _GEOMETRY else mi.ParamFlags.Differentiable
             callback.put(name, values, flags)
 
-    def parameters_changed(self, keys: list[str]) -> None:
+    def parameters_changed(self, keys: Any = ()) -> None:
         """Update extinction, grid and bound."""
         super().parameters_changed(keys)
         self.gaussians_changed()
@@ -120,7 +120,7 @@ class GaussianMedium(mi.Medium):
         """Extinction at points for rays through them in unit ``direction``, 1/m; differentiable."""
         return extinction(self._attenuators, self._cells, list(position), list(direction), mi.Bool(active))
 
-    def intersect_aabb(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+    def intersect_aabb(self, ray: mi.Ray3f) -> Any:
         """Entry and exit of rays at the box around all cut-off ellipsoids."""
         return self._box.ray_intersect(ray)
 
@@ -141,7 +141,7 @@ class GaussianMedium(mi.Medium):
         return f"GaussianMedium[{count} Gaussians, extinction below {self.majorant_per_m:g} per m]"
 
 
-def _gaussians_given(props: mi.Properties) -> tuple[GaussianEmitter | None, FieldSource | None, dict[str, Any]]:
+def _gaussians_given(props: Any) -> tuple[GaussianEmitter | None, FieldSource | None, dict[str, Any]]:
     """The given one of emitter, run folder and arrays.
 
     Raises:
@@ -173,10 +173,13 @@ def _gaussians_given(props: mi.Properties) -> tuple[GaussianEmitter | None, Fiel
 
 def _from_arrays(arrays: dict[str, Any]) -> Gaussians:
     count = arrays["centers"].shape[0]
-    columns = {name: deinterleave(values.array, count) for name, values in arrays.items()}
+    columns: dict[str, Any] = {name: deinterleave(values.array, count) for name, values in arrays.items()}
     zero = dr.zeros(mi.Float, count)
+    centers, scales, quaternions = (columns[name] for name in _GEOMETRY)
     return Gaussians(
-        *(columns[name] for name in _GEOMETRY),
+        centers,
+        scales,
+        quaternions,
         signal=[zero, zero],
         opacity=columns["opacity"][0] if "opacity" in arrays else None,
         attenuation=columns.get("attenuation"),

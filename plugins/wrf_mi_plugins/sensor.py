@@ -105,7 +105,7 @@ class PerceptionPlane(mi.Sensor):
         column, row = (dr.minimum(mi.UInt32(sample2[k] * int(crop[k])), int(crop[k]) - 1) for k in range(2))
         local = self._direction(row, column, active)
         wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
-        ray = mi.Ray3f(self.to_world.translation(), self.to_world @ local, time, wavelengths)
+        ray: Any = mi.Ray3f(self.to_world.translation(), self.to_world @ local, time, wavelengths)  # type: ignore[call-overload]
         return ray, weight
 
     def sample_ray_differential(
@@ -124,7 +124,7 @@ class PerceptionPlane(mi.Sensor):
         super().traverse(callback)
         callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
 
-    def parameters_changed(self, keys: list[str]) -> None:
+    def parameters_changed(self, keys: Any = ()) -> None:
         """Check and adopt a new pose.
 
         Raises:
@@ -157,7 +157,7 @@ def receiver_to_world(position_m: ArrayLike, orientation_xyzw: ArrayLike) -> mi.
         raise InputError(f"orientation_xyzw: expected a unit quaternion x, y, z, w, got {orientation_xyzw!r}")
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation_matrix(quaternion), position
-    return mi.ScalarTransform4f(matrix)
+    return mi.ScalarTransform4f(matrix.tolist())
 
 
 def pose_of(to_world: Any) -> Pose:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -35,7 +36,8 @@ class FieldSource:
 
     def gaussians(self) -> Gaussians:
         """The Gaussians for the transmitter (batch 1). Differentiable in parameters and transmitter position."""
-        return self.field.gaussians(self.params, mi.TensorXf(dr.ravel(self.tx_position), (3, 1)))
+        position: Any = dr.ravel(self.tx_position)
+        return cast(Gaussians, self.field.gaussians(self.params, mi.TensorXf(position, (3, 1))))
 
     def traverse(self, callback: Any) -> None:
         """Expose the transmitter position and every parameter; dots in names become underscores.
@@ -49,7 +51,7 @@ class FieldSource:
             callback.put(name.replace(".", "_"), values, flags)
 
 
-def source_of(field: Any, params: dict[str, ArrayLike], tx_position_m: ArrayLike) -> FieldSource:
+def source_of(field: Any, params: Mapping[str, ArrayLike], tx_position_m: ArrayLike) -> FieldSource:
     """A source from a model and its parameters.
 
     Args:
@@ -77,6 +79,7 @@ def source_from_properties(props: Any) -> FieldSource:
     for key, what in (("run", "a run folder made by wrf-mi train"), ("tx_position", "x, y, z in metres")):
         if key not in props:
             raise InputError(f"{name}: no {key}; give {what}")
-    path = Path(str(mi.file_resolver().resolve(props["run"])))
+    resolver: Any = mi.file_resolver
+    path = Path(str(resolver().resolve(props["run"])))
     trained = open_run(path.parent if path.name == FITTED else path).field
     return source_of(trained.field, trained.params, list(props["tx_position"]))

@@ -92,7 +92,8 @@ def find_crossings(
         te = dr.cross(d, si.n)
         sine = dr.squared_norm(te) * dr.squared_norm(field)
         across = dr.select(sine > SMALLEST_SINE**2, dr.square(dr.dot(field, te)) / sine, 0.5)
-        wall = dr.gather(mi.UInt32, number, dr.reinterpret_array(mi.UInt32, si.shape), active)
+        met: Any = dr.reinterpret_array(mi.UInt32, si.shape)
+        wall = dr.gather(mi.UInt32, number, met, active)
         ray = dr.select(active, si.spawn_ray(d), ray)
         dr.eval(active, distance, cosine, across, wall, ray)
         if not dr.any(active):
@@ -127,7 +128,8 @@ def walls_of(
     re, im = mi.Float(1), mi.Float(0)
     passed = [(re, im)]
     for distance, cosine, across, wall in zip(*vars(crossings).values(), strict=True):
-        c = slab(cosine, *(dr.gather(mi.Float, column, wall) for column in columns), frequency_hz)
+        permittivity, conductivity, thickness = (dr.gather(mi.Float, column, wall) for column in columns)
+        c = slab(cosine, permittivity, conductivity, thickness, frequency_hz)
         t = c.transmitted_te * across + c.transmitted_tm * (1 - across)
         there = dr.isfinite(distance)
         t_re, t_im = dr.select(there, t.real, 1), dr.select(there, t.imag, 0)
@@ -184,4 +186,5 @@ def _itu(kind: str, frequency_hz: float) -> tuple[float, float]:
 
 
 def _registry(shape: Any) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+    number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+    return int(number[0])

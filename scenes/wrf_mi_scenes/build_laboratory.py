@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import trimesh
@@ -52,7 +53,12 @@ def wall(axis: int, at: float, along: Span, up: Span, openings: Iterable[tuple[S
         start = right
     if start < along[1]:
         pieces.append(sheet(axis, at, (start, along[1]), up))
-    return trimesh.util.concatenate(pieces)
+    return joined(pieces)
+
+
+def joined(meshes: Iterable[Mesh]) -> Mesh:
+    """One mesh of several."""
+    return cast(Mesh, trimesh.util.concatenate(list(meshes)))
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Mesh:
@@ -65,13 +71,13 @@ def table(x: Span, y: Span, top: float) -> Mesh:
     longer = 0 if x[1] - x[0] >= y[1] - y[0] else 1
     ends, across = (x, y) if longer == 0 else (y, x)
     panels = [sheet(longer, end, across, (0.0, top)) for end in (ends[0] + 0.1, ends[1] - 0.1)]
-    return trimesh.util.concatenate([sheet(2, top, x, y), *panels])
+    return joined([sheet(2, top, x, y), *panels])
 
 
 def shelf(x: Span, y: Span, boards: Iterable[float], top: float, back_axis: int, back_at: float) -> Mesh:
     """A metal shelf: boards at the given heights and a back sheet."""
     back = sheet(back_axis, back_at, y if back_axis == 0 else x, (0.0, top))
-    return trimesh.util.concatenate([back, *(sheet(2, z, x, y) for z in boards)])
+    return joined([back, *(sheet(2, z, x, y) for z in boards)])
 
 
 def laboratory_parts() -> Parts:
@@ -90,11 +96,11 @@ def laboratory_parts() -> Parts:
         "wall_north": ("itu_brick", wall(1, WIDTH, x, z, windows)),
         "wall_west": ("itu_brick", wall(0, 0.0, y, z)),
         "wall_east": ("itu_brick", wall(0, LENGTH, y, z)),
-        "windows": ("itu_glass", trimesh.util.concatenate([sheet(1, WIDTH, *w) for w in windows])),
+        "windows": ("itu_glass", joined([sheet(1, WIDTH, *w) for w in windows])),
         "door": ("itu_wood", sheet(1, 0.0, *door)),
         "inner_room": (
             "itu_plasterboard",
-            trimesh.util.concatenate(
+            joined(
                 [
                     wall(1, inner_y, (inner_x, LENGTH), z, [pane]),
                     wall(0, inner_x, (inner_y, WIDTH), z, [doorway]),
@@ -104,7 +110,7 @@ def laboratory_parts() -> Parts:
         "inner_pane": ("itu_glass", sheet(1, inner_y, *pane)),
         "tables": (
             "itu_wood",
-            trimesh.util.concatenate(
+            joined(
                 [
                     table((3.4, 5.2), (1.1, 1.9), 0.74),
                     table((3.8, 5.6), (5.6, 6.4), 0.74),
@@ -115,7 +121,7 @@ def laboratory_parts() -> Parts:
         ),
         "shelves": (
             "itu_metal",
-            trimesh.util.concatenate(
+            joined(
                 [
                     shelf((0.05, 0.45), (0.6, 2.4), (0.2, 0.7, 1.2, 1.7), 1.9, 0, 0.05),
                     shelf((5.0, 6.6), (0.05, 0.45), (0.2, 0.8, 1.4), 1.8, 1, 0.05),
@@ -124,7 +130,7 @@ def laboratory_parts() -> Parts:
         ),
         "cabinets": (
             "itu_metal",
-            trimesh.util.concatenate([box((8.5, 0.9, 0.0), (8.95, 2.1, 1.9)), box((3.2, 0.05, 0.0), (4.95, 0.5, 2.0))]),
+            joined([box((8.5, 0.9, 0.0), (8.95, 2.1, 1.9)), box((3.2, 0.05, 0.0), (4.95, 0.5, 2.0))]),
         ),
         "whiteboard": ("itu_metal", sheet(0, 0.02, (2.8, 4.0), (0.9, 2.1))),
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from .build_laboratory import HEIGHT, LENGTH, WIDTH, Mesh
+from .build_laboratory import HEIGHT, LENGTH, WIDTH, Mesh, joined
 
 CLUTTER_M2 = 60.0
 """Total surface of the clutter, a quarter of the room's, so that the free path of rays does not depend on the
@@ -50,4 +50,4 @@ def cluttered_room(triangles: int, clear: np.ndarray, seed: int = 0) -> Mesh:
     faces = np.asarray(box.faces)[None] + np.arange(count)[:, None, None] * corners.shape[1]
     shell = divided_room(12)
     boxes = Mesh(vertices=corners.reshape(-1, 3), faces=faces.reshape(-1, 3), process=False)
-    return trimesh.util.concatenate([shell, boxes])
+    return joined([shell, boxes])

@@ -9,9 +9,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 
-from .build_laboratory import Mesh, Span, box, sheet, table, wall
+from .build_laboratory import Mesh, Span, box, joined, sheet, table, wall
 from .furnished import GENERIC
 from .mitsuba_xml import Parts
 
@@ -48,10 +47,6 @@ def measured(plan: FloorPlan, error_m: float, seed: int) -> Parts:
     return {name: (GENERIC, mesh) for name, mesh in moved.items()}
 
 
-def _joined(*meshes: Mesh) -> Mesh:
-    return trimesh.util.concatenate(list(meshes))
-
-
 def _shell(length: float, width: float, height: float, windows: Mapping[str, Iterable[Opening]]) -> dict[str, Mesh]:
     """Floor, ceiling, the four outer walls with openings for windows, and the panes in these."""
     sides = {
@@ -69,7 +64,7 @@ def _shell(length: float, width: float, height: float, windows: Mapping[str, Ite
         openings = list(windows.get(name, ()))
         found[f"wall_{name}"] = wall(axis, at, (0, along), (0, height), openings)
         panes += [sheet(axis, at, *opening) for opening in openings]
-    return {**found, "windows": _joined(*panes)}
+    return {**found, "windows": joined(panes)}
 
 
 def _doors(*along: Span) -> list[Opening]:
@@ -96,11 +91,11 @@ def flat() -> FloorPlan:
         "bath_east": sheet(0, 6.0, (4.8, 8.0), up),
     }
     wood = {
-        "tables": _joined(table((2.6, 4.2), (1.5, 2.3), 0.74), table((9.3, 10.3), (0.9, 1.9), 0.74)),
-        "beds": _joined(sheet(2, 0.5, (0.1, 1.2), (6.3, 7.9)), sheet(2, 0.5, (9.2, 10.9), (6.2, 7.9))),
+        "tables": joined([table((2.6, 4.2), (1.5, 2.3), 0.74), table((9.3, 10.3), (0.9, 1.9), 0.74)]),
+        "beds": joined([sheet(2, 0.5, (0.1, 1.2), (6.3, 7.9)), sheet(2, 0.5, (9.2, 10.9), (6.2, 7.9))]),
     }
     boards = {
-        "wardrobes": _joined(box((3.35, 5.6, 0.0), (3.95, 7.8, 2.1)), box((6.05, 5.4, 0.0), (6.65, 7.4, 2.1))),
+        "wardrobes": joined([box((3.35, 5.6, 0.0), (3.95, 7.8, 2.1)), box((6.05, 5.4, 0.0), (6.65, 7.4, 2.1))]),
         "kitchen_units": box((6.9, 0.05, 0.0), (10.9, 0.6, 0.9)),
     }
     metal = {
@@ -140,14 +135,14 @@ def office() -> FloorPlan:
     inner["corridor_south"] = wall(1, 5.5, (11.0, 18.0), up, _doors((14.0, 15.0)))
     desks = [(x, y + 0.05 * k) for k, x in enumerate((3.0, 6.2, 12.6, 15.6)) for y in (1.2, 3.4)]
     wood = {
-        "desks": _joined(*(table((x, x + 1.6), (y, y + 0.8), 0.74) for x, y in desks)),
-        "room_desks": _joined(*(table((x, x + 1.4), (8.6, 9.4), 0.74) for x in (0.6, 5.1, 9.6, 14.1))),
+        "desks": joined((table((x, x + 1.6), (y, y + 0.8), 0.74) for x, y in desks)),
+        "room_desks": joined(table((x, x + 1.4), (8.6, 9.4), 0.74) for x in (0.6, 5.1, 9.6, 14.1)),
     }
-    boards = {"partitions": _joined(*(sheet(1, y + 0.4, (x, x + 1.6), (0.74, 1.4)) for x, y in desks))}
+    boards = {"partitions": joined((sheet(1, y + 0.4, (x, x + 1.6), (0.74, 1.4)) for x, y in desks))}
     metal = {
         "core": box((8.6, 2.2, 0.0), (10.4, 4.0, 3.0)),
-        "cabinets": _joined(box((11.1, 0.05, 0.0), (12.3, 0.5, 1.9)), box((0.05, 6.2, 0.0), (0.5, 6.9, 1.9))),
-        "shelves": _joined(*(sheet(0, x, (8.2, 9.8), (0.1, 1.9)) for x in (4.3, 8.8, 13.3))),
+        "cabinets": joined([box((11.1, 0.05, 0.0), (12.3, 0.5, 1.9)), box((0.05, 6.2, 0.0), (0.5, 6.9, 1.9))]),
+        "shelves": joined(sheet(0, x, (8.2, 9.8), (0.1, 1.9)) for x in (4.3, 8.8, 13.3)),
     }
     materials = {name: "itu_concrete" for name in shell} | {"ceiling": "itu_ceiling_board", "windows": "itu_glass"}
     materials |= {"fronts": "itu_glass"} | {name: "itu_plasterboard" for name in inner}
@@ -157,10 +152,30 @@ def office() -> FloorPlan:
     plan = ((1.4, 0.7), (8.2, 0.7), (8.2, 4.8), (1.6, 4.8), (1.6, 2.7))
     aisle = ((5.4, 0.8), (5.4, 4.85), (11.5, 4.85), (11.5, 1.1), (8.2, 0.8))
     corridor = ((1.2, 6.2), (17.0, 6.2), (14.5, 6.2), (14.5, 4.8), (11.5, 4.8), (8.0, 5.0), (2.0, 5.1))
-    rooms_west = ((3.65, 6.2), (3.65, 7.9), (1.6, 7.7), (3.65, 7.7), (3.65, 6.2), (8.15, 6.2), (8.15, 7.9), (6.2, 7.7))
-    rooms_west += ((8.15, 7.7), (8.15, 6.2))
-    rooms_east = ((12.65, 6.2), (12.65, 7.9), (10.6, 7.7), (12.65, 7.7), (12.65, 6.2), (17.15, 6.2), (17.15, 7.9))
-    rooms_east += ((15.0, 7.7), (17.15, 7.7), (17.15, 6.2))
+    rooms_west = (
+        (3.65, 6.2),
+        (3.65, 7.9),
+        (1.6, 7.7),
+        (3.65, 7.7),
+        (3.65, 6.2),
+        (8.15, 6.2),
+        (8.15, 7.9),
+        (6.2, 7.7),
+        (8.15, 7.7),
+        (8.15, 6.2),
+    )
+    rooms_east = (
+        (12.65, 6.2),
+        (12.65, 7.9),
+        (10.6, 7.7),
+        (12.65, 7.7),
+        (12.65, 6.2),
+        (17.15, 6.2),
+        (17.15, 7.9),
+        (15.0, 7.7),
+        (17.15, 7.7),
+        (17.15, 6.2),
+    )
     parts = {name: (materials[name], mesh) for name, mesh in meshes.items()}
     return FloorPlan(
         parts, (*shell, "fronts", *inner), (0.3, 3.0, 2.4), (plan, aisle, corridor, rooms_west, rooms_east)

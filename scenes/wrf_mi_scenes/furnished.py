@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from .build_laboratory import HEIGHT, LENGTH, WIDTH, Mesh, box, laboratory_parts, sheet, table, wall
+from .build_laboratory import HEIGHT, LENGTH, WIDTH, Mesh, box, joined, laboratory_parts, sheet, table, wall
 from .mitsuba_xml import Parts
 
 GENERIC = "itu_concrete"
@@ -27,7 +27,7 @@ def turned(mesh: Mesh, degrees: float, place: tuple[float, float]) -> Mesh:
 
 def _chair() -> Mesh:
     seat, back = sheet(2, 0.45, (-0.22, 0.22), (-0.22, 0.22)), sheet(1, 0.22, (-0.2, 0.2), (0.5, 0.95))
-    return trimesh.util.concatenate([seat, back])
+    return joined([seat, back])
 
 
 def furnished_parts() -> Parts:
@@ -36,21 +36,17 @@ def furnished_parts() -> Parts:
     screens = [(4.2, 1.4, 25.0), (5.0, 6.05, 190.0), (0.45, 4.9, -70.0)]
     return {
         **laboratory_parts(),
-        "chairs": ("itu_wood", trimesh.util.concatenate([turned(_chair(), a, (x, y)) for x, y, a in chairs])),
+        "chairs": ("itu_wood", joined([turned(_chair(), a, (x, y)) for x, y, a in chairs])),
         "screens": (
             "itu_metal",
-            trimesh.util.concatenate(
-                [turned(box((-0.3, -0.02, 0.85), (0.3, 0.02, 1.2)), a, (x, y)) for x, y, a in screens]
-            ),
+            joined([turned(box((-0.3, -0.02, 0.85), (0.3, 0.02, 1.2)), a, (x, y)) for x, y, a in screens]),
         ),
         "rack": ("itu_metal", turned(box((-0.3, -0.35, 0.0), (0.3, 0.35, 1.6)), 25.0, (1.6, 6.3))),
         "divider": ("itu_chipboard", turned(sheet(1, 0.0, (-0.8, 0.8), (0.1, 1.6)), 35.0, (5.6, 3.9))),
         "bench": ("itu_wood", turned(table((-0.7, 0.7), (-0.3, 0.3), 0.9), -20.0, (2.9, 4.6))),
         "lamps": (
             "itu_metal",
-            trimesh.util.concatenate(
-                [sheet(2, 2.7, (x, x + 1.2), (y, y + 0.3)) for x in (1.5, 4.5) for y in (1.8, 4.6)]
-            ),
+            joined([sheet(2, 2.7, (x, x + 1.2), (y, y + 0.3)) for x in (1.5, 4.5) for y in (1.8, 4.6)]),
         ),
     }
 
