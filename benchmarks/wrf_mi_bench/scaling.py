@@ -24,7 +24,7 @@ from wrf_mi.tasks.scores import Interval
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.training.config import TrainConfig
-from wrf_mi.training.fit_plan import make_field
+from wrf_mi.training.fields import make_field
 from wrf_mi.training.predictor import Predictor
 
 from .comparison import line

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from wrf_mi.core import InputError
 from wrf_mi.core.settings import describe, settings_from, with_settings
 from wrf_mi.training.config import PRESETS, TrainConfig
-from wrf_mi.training.fit_plan import make_field
+from wrf_mi.training.fields import make_field
 
 
 def leaves(values, prefix=""):

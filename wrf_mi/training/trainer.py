@@ -20,7 +20,8 @@ from ..tracing.paths.traced_field import TracedField
 from .adam import NonFiniteReport
 from .by_distance import Reach
 from .config import TrainConfig
-from .fit_plan import FitPlan, check_params
+from .fields import check_params
+from .fit_plan import FitPlan
 from .initial import starting_values
 from .loop import OF_FIT, FitState, TrainingLoop
 from .predictor import Predictor

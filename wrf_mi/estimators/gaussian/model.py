@@ -28,7 +28,8 @@ from ...tracing.paths.edited_scene import parameters_in
 from ...training.by_distance import Reach
 from ...training.checkpoint import CHECKPOINT, LOG, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, task_settings, unused_of_loop, validates
-from ...training.fit_plan import FitPlan, check_params, field_of
+from ...training.fields import check_params, field_of
+from ...training.fit_plan import FitPlan
 from ...training.initial import initial_gaussians, starting_values
 from ...training.loop import FitState, Progress
 from ...training.predictor import Predictor
