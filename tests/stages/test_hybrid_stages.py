@@ -206,6 +206,11 @@ def test_first_stage_of_a_training_that_went_further_is_continued_with_all_rows(
             **how,
         )
     position = record.tx_pos_m[:6]
+    with monkeypatch.context() as ended:
+        ended.setattr("wrf_mi.runs.api.write_fitted", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            wrf_mi.resume(out)
+    # The training has ended and its log has its place, but nothing is stored.
     np.testing.assert_array_equal(wrf_mi.resume(out).predict(position).mean, whole.predict(position).mean)
 
 

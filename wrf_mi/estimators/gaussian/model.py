@@ -332,7 +332,7 @@ class GaussianField(Model):
     def _finished(self, trainer: Trainer, problem: Problem, split: Split, session: Session) -> FittedField:
         """The field after the last step of the chosen training, whose log is that of the fit."""
         folder = _folder(session, trainer.plan)
-        if folder != session.folder:
+        if folder != session.folder and (folder / LOG).exists():  # a resumed fit may have moved it before it ended
             (folder / LOG).replace(session.folder / LOG)
         session.discarded.extend(session.folder / name for name in trainer.plan.curriculum[:-1])
         return self._fitted(trainer, problem, split, session.folder)
