@@ -161,3 +161,11 @@ def count_not_finite(values: NDArray[np.generic]) -> str:
     if np.isfinite(values).all():
         what = f"larger than {LARGEST:g}, as no amplitude or power is"
     return f"{count} of {values.size} values are {what}"
+
+
+def check_rows(split: Split, record: Record, source: str) -> None:
+    """Refuse a split with rows beyond the record's; ``source`` names the split, for the message; raises InputError."""
+    rows = np.concatenate([split.train, split.validation, split.test])
+    bad = rows[(rows < 0) | (rows >= len(record))]
+    if len(bad):
+        raise InputError(f"{source}: row {bad[0]}, but {record.name} has rows 0 to {len(record) - 1}; use other rows")

@@ -39,12 +39,11 @@ from ..core.settings import settings_from
 from ..core.yaml_files import read_yaml
 from ..datasets import load_split, save_split
 from ..datasets.folder_files import shown
-from ..datasets.observations import count_not_finite
+from ..datasets.observations import check_rows, count_not_finite
 from ..estimators.few_rows import with_few_rows
 from ..estimators.model import Arrays
 from ..models import Model, known_model
 from ..tasks import TASKS
-from ..training.fit_plan import check_rows
 from ..version import __version__
 
 FORMAT = 4  # version of ``config.yaml`` and ``model.npz``

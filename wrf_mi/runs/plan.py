@@ -18,6 +18,7 @@ from ..datasets.folder_files import read_positions
 from ..datasets.observations import (
     LEAST_ROWS,
     check_observations,
+    check_rows,
     fitted_receivers,
     place_of,
 )
@@ -28,7 +29,6 @@ from ..estimators.receiver_places import check_placeable, placed_problem, tell_p
 from ..models import MODELS, Model, Problem, known_model
 from ..synthetic import load_record
 from ..tasks import TASKS, task_of
-from ..training.fit_plan import check_rows
 from ..training.session import OnProgress, quiet
 from .folder import (
     GIVEN,

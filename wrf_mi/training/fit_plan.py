@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..datasets.observations import check_observations
+from ..datasets.observations import check_observations, check_rows
 from ..graph.graph import Field, Graph
 from ..graph.receivers import AUTO, Form, receiver_kind
 from ..tasks import Loss, known_loss, task_of
@@ -165,14 +165,6 @@ def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128
 
 PATHS, SURFACES, FIELD = "paths", "surfaces", "field"
 """Parameters that a training adds to those before: of paths, of Gaussians on surfaces, and of the field's Gaussians."""
-
-
-def check_rows(split: Split, record: Record, source: str) -> None:
-    """Refuse a split with rows beyond the record's; ``source`` names the split, for the message; raises InputError."""
-    rows = np.concatenate([split.train, split.validation, split.test])
-    bad = rows[(rows < 0) | (rows >= len(record))]
-    if len(bad):
-        raise InputError(f"{source}: row {bad[0]}, but {record.name} has rows 0 to {len(record) - 1}; use other rows")
 
 
 class FitPlan:
