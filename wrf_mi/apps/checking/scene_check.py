@@ -45,7 +45,7 @@ from ...synthetic import load_record
 from ...tracing.sionna.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ, in_itu_range
 from ...tracing.sionna.scenes import HIGHEST_M as HIGHEST_SCENE_M
 from ...tracing.sionna.scenes import REFUSALS, quiet_mitsuba, reason
-from .building import device_findings
+from .devices import device_findings
 from .scene_findings import Finding, SceneReport
 from .scene_geometry import ShapePart, between_parts, mesh_file_parts, part_findings, scene_parts
 from .scene_xml_faults import SceneXml, itu_type, read_xml, xml_findings
