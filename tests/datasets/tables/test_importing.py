@@ -125,15 +125,6 @@ def test_positions_of_another_file(match: str, tmp_path: Path) -> None:
     assert max(np.linalg.norm(record.tx_pos_m[:, :2] - place, axis=1).min() for place in expected) < 1e-5
 
 
-def test_positions_in_the_names_of_cells(tmp_path: Path) -> None:
-    cells = [f"L{floor}-{x}-{y}" for floor, x, y in zip([4, 5] * 15, range(30), range(30, 60), strict=True)]
-    frame = wide().drop(columns=["x", "y"]).assign(Cid=cells)
-    record = imported(tmp_path, frame, columns="cell=Cid", pitch_m=2.0, storey_m=4.0)
-    x, storey = np.arange(30), np.array([4, 5] * 15)
-    expected = np.column_stack([2.0 * x, 2.0 * x + 60, TAG_HEIGHT_M + 4.0 * storey])
-    np.testing.assert_allclose(record.tx_pos_m[np.argsort(record.tx_pos_m[:, 0])], expected)
-
-
 def test_times_of_another_unit_are_refused(tmp_path: Path) -> None:
     positions = tmp_path / "positions.csv"
     pandas.DataFrame(PLACES_M, columns=["x", "y"]).assign(time=np.arange(30)).to_csv(positions, index=False)

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from changed_folders import refusal
 
-from wrf_mi.apps.importing.columns import Columns, find_columns, parsed_columns, unit_of
 from wrf_mi.apps.importing.files import read_table
+from wrf_mi.apps.importing.forms import Columns, find_columns, parsed_columns, unit_of
 
 pytest.importorskip("pandas")
 

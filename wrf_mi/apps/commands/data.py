@@ -73,7 +73,6 @@ def _add_import(data: Any) -> None:
     add("--anchor-height", dest="anchor_height_m", **metres, help="height of receivers without z (default: 2.5)")
     text = "carrier of all rows (default: of the table, or 2.44e9)"
     add("--frequency", type=float, dest="frequency_hz", metavar="HZ", help=text)
-    add("--merge-radios", action="store_true", default=None, help="make networks of one radio (BSSIDs) one receiver")
     text = "leave out receivers with fewer training rows (default: 1)"
     add("--min-rows", type=int, dest="min_heard", metavar="N", help=text)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,8 +19,8 @@ from ...core.files import listed, one_line
 from ...core.types import IntArray
 from ...datasets.ble_folder import CARRIER_HZ, write_ble_folder
 from ...datasets.unknown import SENT, name_words
-from .columns import HERTZ, described, find_columns, parsed_columns, unit_of
 from .files import Table, joined, read_table
+from .forms import HERTZ, described, find_columns, parsed_columns, unit_of, without_slots
 from .options import ImportOptions, option_name
 from .picture import plan_picture
 from .places import (
@@ -41,16 +40,12 @@ from .readings import (
     Means,
     Readings,
     chosen,
-    file_offsets,
     further_columns,
     mean_strengths,
-    merged,
     read_readings,
-    virtual_networks,
     without_not_heard,
 )
 from .receivers_table import read_receivers
-from .slots import without_slots
 
 FACTS, PICTURE = "import.yml", "plan.png"  # files beside the tables: what the import assumed, and a plan of the rows
 MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
@@ -58,7 +53,6 @@ MOST_CELLS = 50_000_000  # largest number of receivers times places: 2 GB while 
 TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
 RADIOS = frozenset({"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "umts", "tdscdma", "lte", "nr", "5g"})
 """Values of a column of kinds of radio, in small letters."""
-SENT_IN_NAME = re.compile(r"(?<![\d.])(-?\d+(?:\.\d+)?)[ _]?dbm", re.IGNORECASE)
 STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
 
 
@@ -145,7 +139,6 @@ class _Import:
         keys = {"z": xyz_m[:, 2], **conditions, "part": self.is_test}
         place = place_numbers(keys, xyz_m[:, :2], self.options.place_m)
         count = np.bincount(place)
-        self.notes += file_offsets(readings, place, self._file, [path.name for path, _ in self.table.files])
         first = np.unique(place, return_index=True)[1]
         readings, means = self._means(readings, place, len(count))
         position_m = np.column_stack([np.bincount(place, axis) / count for axis in xyz_m.T]).round(POSITION_DIGITS)
@@ -270,10 +263,6 @@ class _Import:
                 text = f"{one_line(name)} is {counts}: these are not pooled"
                 remedy = f"choose one by --where {shlex.quote(f'{name}={values.value_counts().index[0]}')}"
                 raise DataFault(self.table.files[0][0], f"{text}; {remedy}")
-        powers = {match[1] for path, _ in self.table.files if (match := SENT_IN_NAME.search(path.stem))}
-        if len(powers) > 1:
-            text = f"files at {', '.join(sorted(powers, key=float))} dBm sent, by their names, are not pooled"
-            raise InputError(f"{self.table.files[0][0].parent}: {text}; import each into a folder of its own")
 
     def _conditions(self, readings: Readings) -> dict[str, Any]:
         """Heading, carrier and run of each row where stated; rows that differ in them are not averaged."""
@@ -309,14 +298,6 @@ class _Import:
             text = f"{places} places of {len(readings.ids)} receivers do not fit into memory ({MOST_CELLS} values do)"
             raise InputError(f"{self.out}: {text}; average by --place, or leave receivers out by --receivers")
         means = mean_strengths(readings, place, places, options.average)
-        groups = virtual_networks(readings.ids, means.dbm)
-        if groups:
-            names = listed(readings.ids[number] for number in groups[0])
-            text = f"{sum(map(len, groups))} addresses are networks of {len(groups)} radios (the first: {names})"
-            self.notes.append(text + (": merged" if options.merge_radios else "; --merge-radios makes them one"))
-            if options.merge_radios:
-                readings = merged(readings, groups)
-                means = mean_strengths(readings, place, places, options.average)
         trains = ~self.is_test[np.unique(place, return_index=True)[1]]
         heard = (means.count[:, trains] > 0).sum(axis=1)
         remaining = np.flatnonzero(heard >= max(1, options.min_heard))

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
 from ...core.files import one_line
-from .columns import METRES, MOST_FLOORS, named_columns, shown_names, unit_of
 from .files import Table, package
+from .forms import METRES, named_columns, shown_names, unit_of
 
 DEGREES = "EPSG:4326"
 FAR_M = 10_000.0  # largest coordinate without a shift: single precision resolves a millimetre to 16 km
@@ -32,6 +32,7 @@ PAIR = re.compile(
     r"\D{0,2}?([+-]?\d+(?:\.\d*)?)\s*[,;\s]\s*([+-]?\d+(?:\.\d*)?)(?:\s*[,;\s]\s*([+-]?\d+(?:\.\d*)?))?\D{0,2}"
 )
 """Coordinates x, y and, if stated, z in one text, as in ``(3.5, -2.0)``."""
+MOST_FLOORS = 20  # numbers of a third column without name from which it is no floor
 PLACES = ("x", "y", "z", "lat", "lon", "floor", "heading")
 
 
@@ -290,29 +291,16 @@ def _interpolated(values: Table, time: str, positions: Table, other: str, new: S
 
 
 def with_cells(table: Table, column: str) -> Table:
-    """A table with the columns x, y, and z or floor if stated, from the numbers in the texts of a column.
-
-    Texts are coordinates, ``(3.5, -2.0)``, or names of cells whose last whole numbers are floor, x and y, ``L4-31-2``.
-    """
+    """A table with the columns x, y, and z if stated, from the coordinates in a column's texts, ``(3.5, -2.0)``."""
     if column not in table.frame:
         raise DataFault(table.files[0][0], f"no column {one_line(column)}; correct --columns", line=1)
     texts = table.frame[column].astype(str).str.strip()
-    pairs = texts.str.extract(f"^{PAIR.pattern}$")
-    if pairs[1].notna().all():
-        names = ["x", "y", "z"][: 3 if pairs[2].notna().all() else 2]
-        return replace(
-            table, frame=table.frame.assign(**{name: pairs[k].astype(float) for k, name in enumerate(names)})
-        )
-    numbers = texts.str.findall(r"\d+")
-    # A decimal point joins two numbers to one, so that the last whole numbers are no x and y.
-    wrong = (numbers.str.len() < 2) | texts.str.contains(r"\d\.\d")
-    if wrong.any():
+    parts = texts.str.extract(f"^{PAIR.pattern}$").astype(float)
+    if (wrong := parts[1].isna().to_numpy()).any():
         row = int(np.argmax(wrong))
-        text = f"{one_line(column)} is {texts.iloc[row][:40]!r}"
-        raise table.fault(f"{text}; give a text such as (3.5, 2.0), or whole numbers as in L4-31-2", row)
-    names = ["floor", "x", "y"][-int(numbers.str.len().min()) :]
-    columns = {name: numbers.str[place - len(names)].astype(float) for place, name in enumerate(names)}
-    return replace(table, frame=table.frame.assign(**columns))
+        raise table.fault(f"{one_line(column)} is {texts.iloc[row][:40]!r}; give a text such as (3.5, 2.0)", row)
+    names = ["x", "y", "z"][: 3 if parts[2].notna().all() else 2]
+    return replace(table, frame=table.frame.assign(**{name: parts[k] for k, name in enumerate(names)}))
 
 
 def seconds(table: Table, column: str) -> FloatArray:

@@ -1,35 +1,26 @@
-"""Readings of a table: numbers for "not heard", virtual networks of one radio, means of places, and other columns."""
+"""Readings of a table: numbers for "not heard", means of places, and other columns."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ...core.angles import FloatArray
 from ...core.files import listed, one_line
 from ...core.types import IntArray
 from ...datasets.receivers_file import plain_id
 from ...datasets.sentinels import CUSTOMARY_DBM, suspicious_values
-from .columns import MAC, METRES, RANGES, Columns, unit_of
 from .files import Table, package
+from .forms import MAC, METRES, RANGES, Columns, unit_of
 
 POOLED_READINGS = 4.0
 """Weight, in readings, of all places' variance in that of a place, of which few readings tell little."""
 LEAST_STD_DB = 0.05  # noise of a mean of whole dB is not below this
-FEWEST_SHARED, LEAST_CORRELATION, MOST_DIFFERENCE_DB = 5, 0.8, 3.0
-"""Places at which two networks were heard, correlation and median difference from which they are one radio's: the bands
-of one access point differ by more, and so do neighbouring access points."""
-FEWEST_COMPARED, LEAST_OFFSET_DB, OFFSET_STANDARD_ERRORS = 10, 2.0, 4.0
-"""Places and receivers that files share, and the difference of their strengths, from which it is said: one in 16,000
-files differs by four standard errors by chance, and a quantisation to whole dB by less than 2 dB."""
 RESERVED = ("x", "y", "z", "heading", "frequency_hz", "run", "split")
 PREFIXES = ("rssi_", "count_", "std_")  # columns of the layout, which kept columns must not be taken for
 FEWEST_EQUAL = 3
@@ -170,74 +161,6 @@ def mean_strengths(readings: Readings, place: IntArray, places: int, average: st
         variance = (squares + POOLED_READINGS * pooled) / (freedom + POOLED_READINGS)
         std = np.where(count > 0, np.maximum(np.sqrt(variance / count), LEAST_STD_DB), np.nan)
     return Means(dbm.reshape(shape), count.reshape(shape).astype(np.int64), std.reshape(shape))
-
-
-def file_offsets(readings: Readings, place: IntArray, file: IntArray, names: Sequence[str]) -> list[str]:
-    """Notes on files whose strengths differ from those of the others by a constant at the same places.
-
-    Args:
-        readings: all readings.
-        place: number of the place of each row of the table.
-        file: number of the file of each row.
-        names: names of the files.
-    """
-    cell, of_file, notes = readings.receiver * (place.max() + 1) + place[readings.row], file[readings.row], list[str]()
-    for number, name in enumerate(names) if len(names) > 1 else ():
-        in_file = of_file == number
-        shared = np.intersect1d(cell[in_file], cell[~in_file])
-        means = [
-            _means(readings.dbm[part], np.searchsorted(shared, cell[part]), len(shared))
-            for part in (in_file & np.isin(cell, shared), ~in_file & np.isin(cell, shared))
-        ]
-        if len(shared) < FEWEST_COMPARED:
-            continue
-        difference = means[0] - means[1]
-        offset = float(np.median(difference))
-        # Standard error of a median of Gaussian differences, by their median absolute deviation (Rousseeuw and Croux,
-        # J. Am. Stat. Assoc. 88, 1993).
-        error = 1.2533 * 1.4826 * float(np.median(np.abs(difference - offset))) / np.sqrt(len(difference))
-        if abs(offset) > max(LEAST_OFFSET_DB, OFFSET_STANDARD_ERRORS * error):
-            text = f"{name}: strengths are {offset:+.1f} dB from those of the other files at {len(shared)} equal places"
-            notes.append(f"{text}: another sent power or device, pooled here; import it into a folder of its own")
-    return notes
-
-
-def virtual_networks(ids: Sequence[str], dbm: FloatArray) -> list[list[int]]:
-    """Groups of receivers that are networks of one radio, by their hardware addresses and strengths [n_rx, n].
-
-    Addresses of a radio's networks differ in the last digit or in the first byte, which marks local administration.
-    """
-    by_address: dict[str, list[int]] = {}
-    for number, name in enumerate(ids):
-        if MAC.fullmatch(name):
-            by_address.setdefault(re.sub("[^0-9a-f]", "", name.lower())[2:-1], []).append(number)
-    candidates = [pair for numbers in by_address.values() for pair in combinations(numbers, 2)]
-    pairs = [pair for pair in candidates if _is_one_radio(dbm[pair[0]], dbm[pair[1]])]
-    if not pairs:
-        return []
-    graph = coo_array((np.ones(len(pairs)), np.array(pairs).T), shape=(len(ids), len(ids)))
-    radio = connected_components(graph, directed=False)[1]
-    return [np.flatnonzero(radio == number).tolist() for number in np.flatnonzero(np.bincount(radio) > 1)]
-
-
-def _is_one_radio(first_dbm: FloatArray, second_dbm: FloatArray) -> bool:
-    both = ~np.isnan(first_dbm) & ~np.isnan(second_dbm)
-    first, second = first_dbm[both], second_dbm[both]
-    if len(first) < FEWEST_SHARED or np.abs(np.median(first - second)) > MOST_DIFFERENCE_DB:
-        return False
-    if not np.ptp(first) or not np.ptp(second):
-        return bool(not np.ptp(first) and not np.ptp(second))
-    return bool(np.corrcoef(first, second)[0, 1] >= LEAST_CORRELATION)
-
-
-def merged(readings: Readings, groups: Sequence[Sequence[int]]) -> Readings:
-    """Readings in which each group of receivers is its first one."""
-    number = np.arange(len(readings.ids))
-    for first, *others in groups:
-        number[others] = first
-    remaining = np.unique(number)
-    ids = tuple(readings.ids[k] for k in remaining)
-    return replace(readings, ids=ids, receiver=np.searchsorted(remaining, number)[readings.receiver])
 
 
 def chosen(readings: Readings, receivers: IntArray) -> Readings:
