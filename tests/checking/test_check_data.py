@@ -84,13 +84,15 @@ def test_faults_of_parts_and_files_are_named_from_the_folder_of_the_data(tmp_pat
 
 def test_suspicions_have_names_and_can_be_ignored():
     record = strengths()
-    wrong = replace(record, observation=-record.observation, tx_pos_m=np.repeat(record.tx_pos_m[:1], len(record), 0))
+    observation = -record.observation
+    observation[0] = 50
+    wrong = replace(record, observation=observation)
     report = check_data(wrong)
-    names = ["strengths", "single-position"]
+    names = ["strengths", "constant"]
     assert [one.name for one in report.suspicions] == [one["name"] for one in report.as_dict()["suspicions"]] == names
     assert [line.partition(":")[0] for line in report.lines()] == [*(f"suspicion {name}" for name in names), "walk"]
     assert report.lines()[-1] == "walk: no fault, 2 suspicions"
-    assert [one.name for one in check_data(wrong, ignore=["strengths"]).suspicions] == ["single-position"]
+    assert [one.name for one in check_data(wrong, ignore=["strengths"]).suspicions] == ["constant"]
     with pytest.raises(InputError, match=r"suspicion 'strength': unknown; known are not-heard, few-rows, "):
         check_data(wrong, ignore=["strength"])
     text = (CHECKOUT / "docs" / "data.md").read_text(encoding="utf-8")

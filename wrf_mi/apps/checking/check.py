@@ -14,7 +14,7 @@ from ...datasets.registry import find, known, locate
 from ...estimators.checks import check_parts
 from ...synthetic import load_record
 from .distances import unlike_units
-from .rows import constant_observations, few_rows, not_heard, repeated_observations, repeated_rows, single_position
+from .rows import constant_observations, few_rows, not_heard, repeated_rows
 from .units import Found, degrees, far_from_origin, strength_scale
 
 logger = logging.getLogger(__name__)
@@ -25,18 +25,13 @@ SUSPICIONS = {
     "strengths": "powers on a linear scale, or without their sign, for dBm",
     "repeated-rows": "rows that repeat an earlier row",
     "train-test": "test rows that are training rows too",
-    "repeated-observations": "spectra or channels of a row elsewhere",
     "constant": "receivers that observe the same in every row, and blank spectra",
-    "single-position": "a single position of the transmitter",
     "degrees": "longitudes and latitudes in degrees for metres",
     "unlike-units": "receivers and transmitters in different units, or rows in steps of a grid",
 }
 """Names of the suspicions, and what the data are instead."""
 Check = Callable[[Record], Found]
-OF_VALUES: tuple[Check, ...] = (
-    *(not_heard, few_rows, strength_scale, repeated_rows, repeated_observations),
-    *(constant_observations, single_position),
-)
+OF_VALUES: tuple[Check, ...] = (not_heard, few_rows, strength_scale, repeated_rows, constant_observations)
 """Suspicions about the values of a record."""
 WARNED: tuple[Check, ...] = (not_heard, degrees)
 """Suspicions that a fit warns of: without a warning the scores alone would show them, as errors of some 10 dB."""

@@ -133,18 +133,6 @@ def repeated_rows(record: Record) -> Found:
         yield "repeated-rows", f"{what}: {named_rows(repeated)}; remove them, or give what was measured there"
 
 
-def repeated_observations(record: Record) -> Found:
-    """Spectra and channels that are those of a row elsewhere."""
-    if record.task == "rssi" or not record.has_positions:
-        return
-    first = _first_equal([np.moveaxis(record.observation, 1, 0)])
-    elsewhere = (record.tx_pos_m != record.tx_pos_m[first]).any(axis=1) & (_received_values(record) > 0)
-    copied = np.flatnonzero(elsewhere)
-    if len(copied) and len(np.unique(first)) > 1:
-        what = f"{len(copied)} of {len(record)} rows have the observation of an earlier row at another position"
-        yield "repeated-observations", f"{what}: {named_rows(copied)}; give what was measured there"
-
-
 def constant_observations(record: Record) -> Found:
     """Receivers whose observations are all the same, and spectra of a single grey value."""
     if len(record) < 2:
@@ -161,13 +149,6 @@ def constant_observations(record: Record) -> Found:
             if len(blank):
                 what = f"spectra of a single grey value in {named_rows(blank)}"
                 yield "constant", f"receiver {receiver.name}: {what}; give what was measured, or remove the rows"
-
-
-def single_position(record: Record) -> Found:
-    """A single position of the transmitter."""
-    if len(record) > 1 and record.has_positions and (record.tx_pos_m == record.tx_pos_m[0]).all():
-        place = ", ".join(f"{value:g}" for value in record.tx_pos_m[0])
-        yield "single-position", f"all {len(record)} transmitters are at ({place}); give the position of each row"
 
 
 def _received_values(record: Record) -> IntArray:
