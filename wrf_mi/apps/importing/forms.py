@@ -38,9 +38,9 @@ MEANINGS = {
 }
 """Names of the columns of each meaning, in all forms."""
 STATED = (*MEANINGS, "id", "rssi", "cell")  # meanings of `parsed_columns`
-RANGES = ("rtt", "range", "distance", "dist")
-QUANTITIES = (*RANGES, "tof", "rsrq", "snr", "sinr", "std", "count", "variance", "noise", "quality")
-"""Words of columns that hold another quantity of a receiver; `RANGES` are lengths."""
+RANGES = ("rtt", "range", "distance", "dist", "tof")
+QUANTITIES = frozenset({*RANGES, "rsrq", "snr", "sinr", "std", "count", "variance", "noise", "quality"})
+"""Words of columns that hold another quantity of a receiver, which is kept and not used."""
 NEVER_STRENGTHS = frozenset({0.0, 1.0, 100.0, 127.0})
 """Numbers above or at 0 dBm that columns of strengths hold where nothing was heard."""
 LOWEST_DBM = -150.0
@@ -52,7 +52,7 @@ MOST_SHOWN = 6
 
 @dataclass(frozen=True)
 class ColumnName:
-    """What the name of a column says: its words, its unit or "", and the quantity it has beside strengths or ""."""
+    """What the name of a column says."""
 
     text: str
 
@@ -78,19 +78,14 @@ class ColumnName:
         return re.sub("[^a-z0-9]", "", self.without_unit.lower())
 
     @property
-    def quantity(self) -> str:
-        """Word of `QUANTITIES`."""
-        return next((word for word in QUANTITIES if word in self.words), "")
-
-    @property
     def is_strength(self) -> bool:
         """Whether the column may hold strengths that were received."""
-        return bool(self.words & STRENGTH) and not self.quantity and not self.words & SENT
+        return bool(self.words & STRENGTH) and not self.words & {*QUANTITIES, *SENT}
 
     @property
     def is_identity(self) -> bool:
         """Whether the column may name receivers."""
-        return bool(self.words & {*RECEIVER}) and not self.words & STRENGTH and not self.quantity
+        return bool(self.words & {*RECEIVER}) and not self.words & {*STRENGTH, *QUANTITIES}
 
     @property
     def receiver(self) -> str:
@@ -126,33 +121,16 @@ class Columns:
     Attributes:
         of: name of the column of each meaning, of `STATED`.
         strengths: id of the receiver of each column of strengths of a wide table; empty for a long one.
-        others: quantity and id of further columns of single receivers.
-        kept: columns of no known meaning.
+        kept: further columns.
     """
 
     of: dict[str, str] = field(default_factory=dict)
     strengths: dict[str, str] = field(default_factory=dict)
-    others: dict[str, tuple[str, str]] = field(default_factory=dict)
     kept: list[str] = field(default_factory=list)
 
     def unit(self, meaning: str) -> str:
         """Unit in the name of a meaning's column, or ""."""
         return unit_of(self.of[meaning]) if meaning in self.of else ""
-
-
-@dataclass(frozen=True)
-class Form:
-    """A form of tables.
-
-    Attributes:
-        name: what it is called.
-        rule: how it is recognised, in words.
-        find: columns of a table by meanings that are known and patterns of receivers; None: another form.
-    """
-
-    name: str
-    rule: str
-    find: Callable[[Table, dict[str, str], Sequence[str]], Columns | None]
 
 
 def parsed_columns(text: str) -> dict[str, str]:
@@ -184,9 +162,9 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
         text = f"no column {one_line(min(lacking))} (columns: {shown_names(names)})"
         raise DataFault(table.files[0][0], f"{text}; correct --columns", line=1)
     of = named_columns([name for name in names if not _in_pattern(name, receivers)], stated)
-    for form in FORMS:
-        if (columns := form.find(table, of, receivers)) is not None:
-            _sort_others(table, columns)
+    for columns_of in FORMS.values():
+        if (columns := columns_of(table, of, receivers)) is not None:
+            columns.kept = list(table.frame.columns.drop([*columns.of.values(), *columns.strengths]))
             return columns
     text = f"no column of signal strengths among {shown_names(names)}"
     remedy = "name it by --columns rssi=...,id=... or by --receivers 'PATTERN*'"
@@ -209,6 +187,7 @@ def named_columns(names: Sequence[str], stated: Mapping[str, str]) -> dict[str, 
 
 
 def _readings(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Columns | None:
+    """A row for each reading: a column that names receivers, and one of strengths."""
     if patterns:
         return None
 
@@ -229,10 +208,12 @@ def _readings(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Colu
 
 
 def _by_pattern(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Columns | None:
+    """A column for each receiver, whose name a pattern states."""
     return _wide(of, [name for name in table.frame.columns if _in_pattern(name, patterns)])
 
 
 def _by_name(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Columns | None:
+    """A column for each receiver, with a word such as RSSI in its name."""
     names = [name for name in table.frame.columns if name not in of.values() and ColumnName(name).is_strength]
     # Of several quantities of receivers one counts: RSRP and RSSI of a cell are not two receivers.
     by_receiver: dict[str, list[str]] = {}
@@ -245,13 +226,14 @@ def _by_name(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Colum
 
 
 def _by_values(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Columns | None:
+    """A column for each receiver, named alike, whose numbers are dBm or marks of "not heard"."""
     by_stem: dict[str, list[bool | None]] = {}
     names = [] if patterns else [name for name in table.frame.columns if name not in of.values()]
     for name in names:
         by_stem.setdefault(ColumnName(name).stem, []).append(_is_dbm(table, name))
     stems = {stem for stem, verdicts in by_stem.items() if any(verdicts) and False not in verdicts}
     columns = map(ColumnName, names)
-    return _wide(of, [column.text for column in columns if column.stem in stems and not column.quantity])
+    return _wide(of, [column.text for column in columns if column.stem in stems and not column.words & QUANTITIES])
 
 
 def _wide(of: dict[str, str], names: Sequence[str]) -> Columns | None:
@@ -261,13 +243,16 @@ def _wide(of: dict[str, str], names: Sequence[str]) -> Columns | None:
     return Columns(of, dict(zip(names, ids, strict=True))) if names else None
 
 
-FORMS = (
-    Form("readings", "a row for each reading: a column that names receivers, and one of strengths", _readings),
-    Form("receivers, stated", "columns of strengths that patterns state (--receivers)", _by_pattern),
-    Form("receivers, by name", "a column for each receiver, with a word such as RSSI in its name", _by_name),
-    Form("receivers, by value", "columns named alike whose numbers are dBm or marks of 'not heard'", _by_values),
-)
-"""Forms in the order of trial. Tables of slots (`without_slots`) become tables of readings first."""
+FORMS: Mapping[str, Callable[[Table, dict[str, str], Sequence[str]], Columns | None]] = {
+    "readings": _readings,
+    "receivers by stated patterns": _by_pattern,
+    "receivers by names of columns": _by_name,
+    "receivers by values of columns": _by_values,
+}
+"""Forms in the order of trial, and how their columns are found from meanings that are known and patterns of receivers.
+
+Tables of slots (`without_slots`) become tables of readings first.
+"""
 
 
 def without_slots(table: Table) -> Table:
@@ -301,18 +286,6 @@ def _is_slot(columns: Sequence[ColumnName]) -> bool:
     return any(column.is_identity for column in columns) and any(column.is_strength for column in columns)
 
 
-def _sort_others(table: Table, columns: Columns) -> None:
-    """Sort further columns into quantities of single receivers and those that are kept."""
-    ids = {*columns.strengths.values()} if columns.strengths else {""}
-    for name in table.frame.columns.drop([*columns.of.values(), *columns.strengths]):
-        column = ColumnName(name)
-        receiver = (column.receiver or name.strip()) if columns.strengths else ""
-        if column.quantity and receiver in ids and table.is_numeric(name):
-            columns.others[name] = column.quantity, receiver
-        else:
-            columns.kept.append(name)
-
-
 def _is_dbm(table: Table, name: str) -> bool | None:
     """Whether a column holds strengths; None where nothing was heard."""
     if not table.is_numeric(name):
@@ -330,9 +303,6 @@ def described(table: Table, columns: Columns, units: Mapping[str, str]) -> list[
     """Lines of a table: column, meaning, unit and number of values; columns of many receivers in one line."""
     groups = [(meaning, units.get(meaning, ""), [name]) for meaning, name in columns.of.items()]
     groups.append(("strength of a receiver", "dBm", list(columns.strengths)))
-    for quantity in dict.fromkeys(quantity for quantity, _ in columns.others.values()):
-        names = [name for name, (other, _) in columns.others.items() if other == quantity]
-        groups.append((f"{quantity} of a receiver, kept", unit_of(names[0]), names))
     groups.append(("kept, not used", "", columns.kept))
     rows = [("column", "meaning", "unit", "values")]
     for meaning, unit, names in groups:

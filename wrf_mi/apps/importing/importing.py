@@ -39,7 +39,6 @@ from .places import (
 from .readings import (
     Means,
     Readings,
-    chosen,
     further_columns,
     mean_strengths,
     read_readings,
@@ -129,28 +128,37 @@ class _Import:
         """Read, average and write."""
         self._check_idle()
         self._check_strengths()
+
+        # Positions of the rows, and single readings without numbers for "not heard".
         frame, xyz_m = self._positions()
         readings, notes, not_heard = without_not_heard(read_readings(self.table, self.columns), self.options.not_heard)
         self.notes += notes
         if not len(readings.dbm):
             raise DataFault(self.table.files[0][0], "no reading was heard; correct --columns or --not-heard")
         self._check_sent(readings)
+
+        # Rows of one position, heading, carrier, run and part of the split are averaged.
         conditions = self._conditions(readings)
         keys = {"z": xyz_m[:, 2], **conditions, "part": self.is_test}
         place = place_numbers(keys, xyz_m[:, :2], self.options.place_m)
         count = np.bincount(place)
         first = np.unique(place, return_index=True)[1]
-        readings, means = self._means(readings, place, len(count))
+        ids, means = self._means(readings, place, len(count))
         position_m = np.column_stack([np.bincount(place, axis) / count for axis in xyz_m.T]).round(POSITION_DIGITS)
-        receivers, notes = self._receivers(readings, frame)
+
+        # The record, with what its rows state.
+        receivers, notes = self._receivers(ids, frame)
         self.notes += notes
         record = self._record(means, position_m, receivers)
         record = self._with_conditions(record, {name: values[first] for name, values in conditions.items()})
         record = self._with_split(record, self.is_test[first])
-        further, notes = further_columns(self.table, self.columns, readings, place)
+
+        # Files: tables, facts and picture.
+        if further := further_columns(self.table, self.columns, place):
+            self.notes.append(f"kept as columns that no model uses: {listed(further)}")
         fixed = one_line(self.columns.of.get("id", "the columns of strengths"))
         text = f"the fixed ends, named by {fixed}, are the receivers, and the moving end is the transmitter"
-        self.notes += [*notes, f"{text}: by reciprocity it does not matter who sends"]
+        self.notes.append(f"{text}: by reciprocity it does not matter who sends")
         lines = described(self.table, self.columns, self.units)
         self.facts |= {"columns": lines, "frame": frame.facts(), "not_heard_dbm": not_heard, "notes": self.notes}
         extra: dict[str, str | bytes] = {
@@ -163,6 +171,8 @@ class _Import:
     def _read(self, files: Sequence[str | Path]) -> tuple[Table, NDArray[np.bool_]]:
         """All rows with their positions, and which of them test."""
         options = self.options
+
+        # Tables, each with positions of another file, if any.
         paths = [*files, *options.test]
         tables, positions = ([read_table(path, options.sheet) for path in part] for part in (paths, options.positions))
         if len(positions) not in (0, 1, len(paths)):
@@ -173,6 +183,8 @@ class _Import:
             pairs = [with_positions(*pair, self.stated) for pair in zip(tables, positions, strict=True)]
             tables = [table for table, _ in pairs]
             self.notes.append(f"positions of {options.positions[0]} are matched {pairs[0][1]}")
+
+        # One table of all rows that are chosen, and the number of each row's file.
         tables = [without_slots(table) for table in tables]
         self._file = np.repeat(np.arange(len(paths)), list(map(len, tables)))
         table = joined(tables)
@@ -291,8 +303,8 @@ class _Import:
             return {}
         return {"frequency_hz": carriers_hz}
 
-    def _means(self, readings: Readings, place: IntArray, places: int) -> tuple[Readings, Means]:
-        """Readings of the receivers that remain, and their means at each place."""
+    def _means(self, readings: Readings, place: IntArray, places: int) -> tuple[list[str], Means]:
+        """Ids of the receivers that remain, and the means of their readings at each place."""
         options = self.options
         if places * len(readings.ids) > MOST_CELLS:
             text = f"{places} places of {len(readings.ids)} receivers do not fit into memory ({MOST_CELLS} values do)"
@@ -308,15 +320,15 @@ class _Import:
         if not len(remaining):
             text = f"no receiver was heard in {options.min_heard} training rows; lower --min-rows"
             raise InputError(f"{self.out}: {text}")
-        readings = chosen(readings, remaining)
-        return readings, Means(means.dbm[remaining], means.count[remaining], means.std[remaining])
+        ids = [readings.ids[number] for number in remaining]
+        return ids, Means(means.dbm[remaining], means.count[remaining], means.std[remaining])
 
-    def _receivers(self, readings: Readings, frame: LocalFrame) -> tuple[tuple[Receiver, ...], list[str]]:
+    def _receivers(self, ids: Sequence[str], frame: LocalFrame) -> tuple[tuple[Receiver, ...], list[str]]:
         """Receivers with the carriers of their readings, if these state any."""
         options = self.options
         table = None if options.anchors is None else read_table(options.anchors, options.sheet)
-        receivers, notes = read_receivers(table, readings.ids, frame, options.units, options.anchor_height_m)
-        pairs = list(zip(readings.ids, receivers, strict=True))
+        receivers, notes = read_receivers(table, ids, frame, options.units, options.anchor_height_m)
+        pairs = zip(ids, receivers, strict=True)
         carriers = [self.carrier_of.get(name, receiver.frequency_hz) for name, receiver in pairs]
         if None in carriers or options.frequency_hz:  # one carrier for all
             carriers = [None] * len(carriers)
