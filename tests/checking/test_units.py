@@ -66,13 +66,11 @@ SALT_LAKE, SINGAPORE, LONDON, SYDNEY = (-111.8442, 40.7672), (103.8198, 1.3521),
 PER_DEGREE_M = 111e3
 
 
-def at(record: Record, offset: tuple[float, ...], scale: float, of: str = "receivers and transmitters") -> Record:
-    """The record with horizontal positions offset + scale * metres, those of some parts alone."""
+def at(record: Record, offset: tuple[float, ...], scale: float) -> Record:
+    """The record with horizontal positions offset + scale * metres."""
     shift, factor = np.array([*offset, 0.0]), np.array([scale, scale, 1.0])
-    if "receivers" in of:
-        moved = tuple(replace(one, position_m=shift + factor * one.position_m) for one in record.receivers)
-        record = replace(record, receivers=moved)
-    return replace(record, tx_pos_m=shift + factor * record.tx_pos_m) if "transmitters" in of else record
+    moved = tuple(replace(one, position_m=shift + factor * one.position_m) for one in record.receivers)
+    return replace(record, receivers=moved, tx_pos_m=shift + factor * record.tx_pos_m)
 
 
 @pytest.mark.parametrize("size", [1.0, 30.0, 1000.0], ids=["a building", "a campus", "a town"])
@@ -99,9 +97,9 @@ def test_positions_in_degrees_alone_are_suspected_and_map_projections_noted():
         for receivers in (metres.receivers, metres.receivers[:1]):
             assert list(degrees(replace(metres, receivers=receivers))) == []
     assert list(degrees(replace(record, tx_pos_m=np.full_like(record.tx_pos_m, np.nan)))) == []
-    for part in ("receivers", "transmitters"):
-        ((_, text),) = list(degrees(at(record, SALT_LAKE, 1 / PER_DEGREE_M, part)))
-        assert text.startswith(f"{part} have x from -111.84")
+    unsurveyed = tuple(replace(one, position_m=np.full(3, np.nan)) for one in record.receivers)
+    ((_, text),) = list(degrees(at(replace(record, receivers=unsurveyed), SALT_LAKE, 1 / PER_DEGREE_M)))
+    assert text.startswith("transmitters have x from -111.84")
     report = check_data(at(building(), (423456.0, 4512345.0), 1.0))
     (note,) = report.notes
     assert report.suspicions == ()

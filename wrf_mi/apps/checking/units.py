@@ -9,61 +9,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import Record
-from ...core.angles import FloatArray
 from ...core.files import listed
+from ..importing.places import LATITUDE, is_geographic
 
 Found = Iterator[tuple[str, str]]  # name and text of suspicions
 
-LONGITUDE, LATITUDE = 180.0, 90.0
-WIDEST_DEG = 1.0  # largest extent of a place in degrees, 111 km of latitude
-AWAY = 20.0
-"""Least distance from the origin in extents of the place: 1 km at 0.2 degrees. A room of metres whose origin is twenty
-of its lengths away is not less than a metre wide."""
 MILLIMETRES = 1e3  # degrees of a place have five decimals or more, metres of a survey three at most
 FINE_SHARE = 0.5  # least share of coordinates with a fraction of a millimetre
 ROUNDING = 1e-6  # of a coordinate in millimetres, which a file states in decimals
-APART_M = 20.0  # least distance between receivers and transmitters where the ones are in degrees and the others are not
 RESOLUTION_M = 1e-3  # resolution of single precision from which positions are said to be far from the origin
 METRES_PER_DEGREE = 111e3
 
 
 def degrees(record: Record) -> Found:
-    """Positions in longitude and latitude, in either order, of receivers, of transmitters or of both."""
-    receivers = np.stack([receiver.position_m for receiver in record.receivers])[:, :2]
-    for what, xy in _in_degrees(receivers, record.tx_pos_m[:, :2]).items():
-        low, high = xy.min(axis=0), xy.max(axis=0)
-        order = "longitude, latitude" if np.abs(high[1]) <= LATITUDE else "latitude, longitude"
-        if np.abs(high).max() <= LATITUDE:
-            order = "longitude and latitude"  # either order is possible
-        extent_m = float((high - low).max()) * METRES_PER_DEGREE
-        text = f"{what} have x from {low[0]:.6f} to {high[0]:.6f} and y from {low[1]:.6f} to {high[1]:.6f}"
-        remedy = "project them to metres, of a local origin or UTM (pyproj), receivers and transmitters alike"
-        yield "degrees", f"{text}: {order} in degrees, of a place some {extent_m:.2g} m wide; {remedy}"
-
-
-def _in_degrees(receivers: FloatArray, transmitters: FloatArray) -> dict[str, FloatArray]:
-    """Distinct coordinates [n, 2] that are in degrees, of both together or of the ones where both are apart."""
-    groups = {"receivers": receivers, "transmitters": transmitters}
-    groups = {what: np.unique(xy[np.isfinite(xy).all(axis=1)], axis=0) for what, xy in groups.items()}
-    if all(map(len, groups.values())):
-        both = np.concatenate(list(groups.values()))
-        if _is_in_degrees(both):
-            return {"receivers and transmitters": both}
-        first, second = (np.median(xy, axis=0) for xy in groups.values())
-        if np.linalg.norm(first - second) < APART_M:
-            return {}
-    return {what: xy for what, xy in groups.items() if _is_in_degrees(xy)}
-
-
-def _is_in_degrees(xy: FloatArray) -> bool:
-    """Whether distinct coordinates [n, 2] look like degrees of a place: fine, close together, and far from zero."""
-    if len(xy) < 2:
-        return False
-    extent, largest = float(np.ptp(xy, axis=0).max()), np.abs(xy).max(axis=0)
-    in_range = largest.max() <= LONGITUDE and largest.min() <= LATITUDE
+    """Positions of receivers and transmitters in longitude and latitude, in either order."""
+    places = np.stack([receiver.position_m for receiver in record.receivers])[:, :2]
+    xy = np.concatenate([places, record.tx_pos_m[:, :2]])
+    xy = np.unique(xy[np.isfinite(xy).all(axis=1)], axis=0)
     thousandths = xy * MILLIMETRES
-    fine = np.mean(np.abs(thousandths - np.round(thousandths)) > ROUNDING)
-    return bool(in_range and 0 < extent <= WIDEST_DEG and largest.max() >= AWAY * extent and fine >= FINE_SHARE)
+    fine = np.mean(np.abs(thousandths - np.round(thousandths)) > ROUNDING) if len(xy) > 1 else 0.0
+    if fine < FINE_SHARE or not is_geographic(xy):
+        return
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    order = "longitude, latitude" if np.abs(high[1]) <= LATITUDE else "latitude, longitude"
+    if np.abs(high).max() <= LATITUDE:
+        order = "longitude and latitude"  # either order is possible
+    what = "receivers and transmitters" if np.isfinite(places).any() else "transmitters"
+    text = f"{what} have x from {low[0]:.6f} to {high[0]:.6f} and y from {low[1]:.6f} to {high[1]:.6f}"
+    extent_m = float((high - low).max()) * METRES_PER_DEGREE
+    remedy = "project them to metres, of a local origin or UTM (pyproj), receivers and transmitters alike"
+    yield "degrees", f"{text}: {order} in degrees, of a place some {extent_m:.2g} m wide; {remedy}"
 
 
 def far_from_origin(record: Record) -> str | None:
