@@ -38,14 +38,9 @@ FIELD_UNIT = re.compile(r"([+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?)\s*([a-
 MOST_PREAMBLE = 20  # lines above the header that name the program, the device or the survey
 CONVERSIONS = {
     ".json": "write its points as a table with a row for each reading: x,y,bssid,rssi",
-    ".geojson": "write its points as a table with a row for each reading: lon,lat,bssid,rssi",
-    ".kml": "write its points as a table with a row for each reading: lon,lat,bssid,rssi",
-    ".kmz": "write its points as a table with a row for each reading: lon,lat,bssid,rssi",
+    **dict.fromkeys((".geojson", ".kml", ".kmz"), "write its points as a table of readings: lon,lat,bssid,rssi"),
     ".gpx": "write its track as a table time,lat,lon and give it by --positions",
-    ".xls": "save it as .xlsx or .csv",
-    ".xlsb": "save it as .xlsx or .csv",
-    ".ods": "save it as .xlsx or .csv",
-    ".numbers": "save it as .xlsx or .csv",
+    **dict.fromkeys((".xls", ".xlsb", ".ods", ".numbers"), "save it as .xlsx or .csv"),
     **dict.fromkeys((".sqlite", ".db"), "export its table of readings as .csv"),
     **dict.fromkeys((".pcap", ".pcapng", ".cap"), "export time, address and strength of each frame as .csv"),
     **dict.fromkeys((".zip", ".gz", ".7z"), "unpack it"),
@@ -210,6 +205,7 @@ def _check_size(path: Path, rows: int, columns: int) -> None:
 
 
 def _read_text(path: Path) -> Table:
+    """A table of text, whose separator, decimal mark and header are recognised from its first lines."""
     missing = DataFault(path, "missing; give a file that exists")
     with readable(path, missing, "give a table as text (CSV), Parquet (.parquet) or Excel (.xlsx)"):
         encoding, text = _decoded(path)
@@ -223,10 +219,13 @@ def _read_text(path: Path) -> Table:
             comment = plain
     if not rows:
         raise DataFault(path, "empty; give a row per measurement")
+
+    # Separator and decimal mark, without lines above the header.
     separator, above = _separator_below([line for _, line in rows[:SAMPLE]])
     rows = rows[above:]
     sample = [_fields(line, separator) for _, line in rows[: SAMPLE - above]]
     decimal = _decimal_mark(sample)
+
     # The header is the first line, the comment above it, or absent.
     header, named = "in its first line", sample[0]
     if _is_row(named, decimal):
@@ -235,8 +234,9 @@ def _read_text(path: Path) -> Table:
             header, named = "absent", [str(number + 1) for number in range(len(sample[0]))]
     names = [name.strip() or f"column_{number + 1}" for number, name in enumerate(named)]
     _check_names(path, names)
+
+    # Fields: pandas fills missing ones silently.
     for number, line in rows if separator != SPACES else ():
-        # Pandas fills missing fields silently.
         if (fields := line.count(separator) + 1) != len(names) and '"' not in line:
             text = f"{fields} fields, but the first line has {len(names)}; correct or remove the line"
             raise DataFault(path, text, line=number)
@@ -248,6 +248,8 @@ def _read_text(path: Path) -> Table:
             **{"sep": separator, "decimal": decimal, "header": None, "names": names, "index_col": False},
             **{"na_values": EMPTY, "skipinitialspace": True, "low_memory": False},
         )
+
+    # What was recognised, in words.
     form = f"separated by {SEPARATORS.get(separator, 'blanks')}" + ", decimal comma" * (decimal == ",")
     form += f", encoding {encoding}" * (encoding != "utf-8-sig")
     note = f"{path.name}: {len(frame)} rows, {form}, header {header}"

@@ -265,12 +265,7 @@ def without_slots(table: Table) -> Table:
     for name in table.frame.columns if table.has_header else ():
         if len(numbers := DIGITS.findall(name)) == 1:
             columns_of.setdefault(numbers[0], {})[ColumnName(name).without_slot] = name
-    slots = [
-        columns
-        for columns in columns_of.values()
-        if any(ColumnName(stem).is_identity for stem in columns)
-        and any(ColumnName(stem).is_strength for stem in columns)
-    ]
+    slots = [columns for columns in columns_of.values() if _is_slot([*map(ColumnName, columns)])]
     if len(slots) < FEWEST_SLOTS:
         return table
     shared = table.frame.drop(columns=[name for columns in slots for name in columns.values()])

@@ -230,7 +230,10 @@ class _Import:
         if "z" in of:
             self.units["z"] = self.columns.unit("z") or options.units.replace("deg", "m") or "m"
             return finite_columns(table, [of["z"]])[:, 0] * unit_scale(self.units["z"], "--units")
-        height_m = self._stated_heights_m()[self._file]
+        count, stated_m = int(self._file.max()) + 1, np.atleast_1d(np.asarray(options.height_m, float))
+        if len(stated_m) not in (1, count):
+            raise InputError(f"--height: {len(stated_m)} heights for {count} tables; give one for each, or one for all")
+        height_m = np.broadcast_to(stated_m, count)[self._file]
         if "floor" in of:
             floors = floor_numbers(table, of["floor"])
             names = dict(zip(table.frame[of["floor"]].astype(str), floors * options.storey_m, strict=True))
@@ -243,13 +246,6 @@ class _Import:
         text = "all rows are" if len(heights_m) == 1 else "rows are"
         self.notes.append(f"no column z: {text} {listed([f'{z:g}' for z in heights_m])} m above the floor (--height)")
         return height_m
-
-    def _stated_heights_m(self) -> FloatArray:
-        """Height above the floor of the rows of each table."""
-        count, stated = int(self._file.max()) + 1, np.atleast_1d(np.asarray(self.options.height_m, float))
-        if len(stated) not in (1, count):
-            raise InputError(f"--height: {len(stated)} heights for {count} tables; give one for each, or one for all")
-        return np.broadcast_to(stated, count)
 
     def _check_strengths(self) -> None:
         """Refuse strengths in per cent, whose scale is that of each program."""
