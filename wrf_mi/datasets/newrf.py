@@ -186,7 +186,7 @@ def read_pickled_table(path: Path) -> dict[str, NDArray[Any]]:
     except ImportError:
         raise InputError(f"{path}: reading it needs pandas; install it: pip install '.[tables]'") from None
 
-    class TableUnpickler(Unpickler):  # type: ignore[misc]
+    class TableUnpickler(Unpickler):
         """Pandas' reader of tables of former versions, which looks up no other names."""
 
         def find_class(self, module: str, name: str) -> Any:
