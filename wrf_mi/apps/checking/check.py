@@ -15,7 +15,7 @@ from ...estimators.checks import check_parts
 from ...synthetic import load_record
 from .distances import unlike_units
 from .rows import constant_observations, few_rows, not_heard, repeated_rows
-from .units import Found, degrees, far_from_origin, strength_scale
+from .units import NamedTexts, degrees, far_from_origin, strength_scale
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ SUSPICIONS = {
     "unlike-units": "receivers and transmitters in different units, or rows in steps of a grid",
 }
 """Names of the suspicions, and what the data are instead."""
-Check = Callable[[Record], Found]
+Check = Callable[[Record], NamedTexts]
 OF_VALUES: tuple[Check, ...] = (not_heard, few_rows, strength_scale, repeated_rows, constant_observations)
 """Suspicions about the values of a record."""
 WARNED: tuple[Check, ...] = (not_heard, degrees)
@@ -162,7 +162,7 @@ def check_data(data: str | Path | Record, ignore: Collection[str] = (), progress
     return DataReport(name, record.source, record, (), suspicions, () if note is None else (note,))
 
 
-def _suspected(record: Record) -> Found:
+def _suspected(record: Record) -> NamedTexts:
     for check in OF_VALUES:
         yield from check(record)
     yield from list(degrees(record)) or unlike_units(record)  # distances mean nothing in degrees

@@ -7,7 +7,7 @@ import numpy as np
 from ...core import Prediction, Record
 from ...core.angles import FloatArray
 from ...tasks import task_of
-from .units import Found
+from .units import NamedTexts
 
 FEWEST_ROWS = 30
 MOST_ROWS = 1000  # rows from which factors of units are found: 482 of them in a second
@@ -23,7 +23,7 @@ UNITS = {0.3048: "feet", 0.0254: "inches", 0.01: "centimetres", 0.001: "millimet
 UNIT_TOLERANCE = 0.15  # of a factor to be that of a unit: the fit is not sharper, and the units are further apart
 
 
-def unlike_units(record: Record) -> Found:
+def unlike_units(record: Record) -> NamedTexts:
     """Receivers and transmitters in different units, by the factor with which strengths follow a distance law."""
     places = np.stack([receiver.position_m for receiver in record.receivers])
     surveyed = np.isfinite(places).all(axis=1)
@@ -35,15 +35,18 @@ def unlike_units(record: Record) -> Found:
     levels, places = levels_db(record)[surveyed][:, rows], places[surveyed]
     at_m = record.tx_pos_m[rows]
     stated, _ = explained(levels, _distances_m(at_m, places))
-    # A walk on a grid has its height in metres, while anchors in feet have theirs in feet, too.
-    plane = [(factor, "positions of rows", at_m * [factor, factor, 1], places) for factor in FACTORS]
-    whole = [(factor, "positions of receivers", at_m, places * factor) for factor in FACTORS]
-    fits = [(*explained(levels, _distances_m(rx, tx)), factor, what) for factor, what, rx, tx in (*plane, *whole)]
+
+    # Factors of the unit of either end. A walk on a grid has its height in metres, anchors in feet have theirs in feet.
+    scaled = [(factor, "positions of rows", at_m * [factor, factor, 1], places) for factor in FACTORS]
+    scaled += [(factor, "positions of receivers", at_m, places * factor) for factor in FACTORS]
+    fits = [(*explained(levels, _distances_m(rows_m, rx_m)), factor, what) for factor, what, rows_m, rx_m in scaled]
     share, exponent, factor, what = max(fits)
     if max(factor, 1 / factor) < LEAST_FACTOR or 1 - share > UNEXPLAINED * (1 - stated):
         return
     if not EXPONENTS[0] <= exponent <= EXPONENTS[1]:
         return
+
+    # The unit that such a factor means.
     units = [name for unit, name in UNITS.items() if abs(np.log(factor / unit)) < UNIT_TOLERANCE]
     meaning = f"they are in {units[0]}" if units else "steps of a grid, or another unit"
     evidence = f"distance explains {stated:.0%} of the variance of the signal strengths as stated, {share:.0%}"

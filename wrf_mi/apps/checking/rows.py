@@ -16,7 +16,7 @@ from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS, LEAST_ROWS, fitted_receivers
 from ...datasets.sentinels import suspicious_values
 from ...tasks import task_of
-from .units import Found, is_above_0_dbm
+from .units import NamedTexts, is_above_0_dbm
 
 FEWEST_STRENGTHS = 4
 """Least number of receivers that received a repeated row: strengths in whole dB of fewer receivers repeat by chance
@@ -33,7 +33,7 @@ APART = (
 """What a suspicious strength is, and the remedy."""
 
 
-def not_heard(record: Record) -> Found:
+def not_heard(record: Record) -> NamedTexts:
     """Numbers for "not heard" among signal strengths, and channels and spectra of zeros."""
     if record.task == "rssi":
         yield from _strengths(record)
@@ -49,7 +49,7 @@ def not_heard(record: Record) -> Found:
             yield "not-heard", f"{text}; zeros are learned as measured: remove the rows, or give NaN (wrf_mi.Record)"
 
 
-def _strengths(record: Record) -> Found:
+def _strengths(record: Record) -> NamedTexts:
     observed = list(map(_in_dbm, record.observation))
     received = np.array(list(map(len, observed)))
     by_receiver = list(map(suspicious_values, observed))
@@ -89,7 +89,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.3g} %" if share >= 0.995 else f"{100 * share:.2g} %"
 
 
-def few_rows(record: Record) -> Found:
+def few_rows(record: Record) -> NamedTexts:
     """Receivers that received too few training rows to be fitted, of the official split or of all rows."""
     strengths = task_of(record).in_decibel
     least = FEW_ROWS if strengths else LEAST_ROWS
@@ -112,7 +112,7 @@ def named_rows(rows: IntArray) -> str:
     return f"row{'s' if len(rows) > 1 else ''} {listed(str(row + 1) for row in rows)}"
 
 
-def repeated_rows(record: Record) -> Found:
+def repeated_rows(record: Record) -> NamedTexts:
     """Rows with position, conditions and observation of an earlier row, and test rows among the training rows."""
     received = _received_values(record) >= (FEWEST_STRENGTHS if record.task == "rssi" else 1)
     per_receiver = (record.observation, record.n_readings, record.std)
@@ -133,7 +133,7 @@ def repeated_rows(record: Record) -> Found:
         yield "repeated-rows", f"{what}: {named_rows(repeated)}; remove them, or give what was measured there"
 
 
-def constant_observations(record: Record) -> Found:
+def constant_observations(record: Record) -> NamedTexts:
     """Receivers whose observations are all the same, and spectra of a single grey value."""
     if len(record) < 2:
         return

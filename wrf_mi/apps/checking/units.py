@@ -12,7 +12,7 @@ from ...core import Record
 from ...core.files import listed
 from ..importing.places import LATITUDE, is_geographic
 
-Found = Iterator[tuple[str, str]]  # name and text of suspicions
+NamedTexts = Iterator[tuple[str, str]]  # names and texts of suspicions
 
 MILLIMETRES = 1e3  # degrees of a place have five decimals or more, metres of a survey three at most
 FINE_SHARE = 0.5  # least share of coordinates with a fraction of a millimetre
@@ -21,7 +21,7 @@ RESOLUTION_M = 1e-3  # resolution of single precision from which positions are s
 METRES_PER_DEGREE = 111e3
 
 
-def degrees(record: Record) -> Found:
+def degrees(record: Record) -> NamedTexts:
     """Positions of receivers and transmitters in longitude and latitude, in either order."""
     places = np.stack([receiver.position_m for receiver in record.receivers])[:, :2]
     xy = np.concatenate([places, record.tx_pos_m[:, :2]])
@@ -53,7 +53,7 @@ def far_from_origin(record: Record) -> str | None:
     return f"{text}: {what}; subtract a common origin from receivers, transmitters and scene"
 
 
-def strength_scale(record: Record) -> Found:
+def strength_scale(record: Record) -> NamedTexts:
     """Signal strengths of receivers that are nowhere below 0 dBm, 1 mW: a few metres from a strong transmitter."""
     if record.task != "rssi":
         return
