@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
 from ...core.files import listed, one_line, readable
+from ...core.memory import require_memory
 from ...datasets.folder_files import SINGLE_MAX
 from ...datasets.receivers_file import plain_id
 
@@ -28,7 +29,8 @@ SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas"}
 """In the order of trial: a table with a decimal comma has commas in every line, too."""
 SPACES = r"\s+"
 SAMPLE = 50  # lines from which separator and decimal mark are read
-MOST_FIELDS = 300_000_000  # largest number of rows times columns of all files: 2.4 GB of numbers in double precision
+TEXT_MEMORY, FIELD_MEMORY = 6, 16  # bytes of memory for each byte of a text file and its lines, and for each field
+THIN = "remove columns or thin its rows"
 EMPTY = ("-", "--", "?")  # fields that are empty beside those that pandas knows (NaN, NA, null, None)
 FRACTION = re.compile(r"[+-]?\d*\.\d+(?:[eE][+-]?\d+)?|[+-]?\d+\.")
 COMMA_FRACTION = re.compile(r"[+-]?\d+,\d+")
@@ -126,7 +128,8 @@ def read_table(path: str | Path, sheet: str = "") -> Table:
 
     Raises:
         InputError: missing or damaged file, another format, a workbook of several sheets without ``sheet``, rows with
-            more or fewer fields than the first, a column named twice, or more fields than `MOST_FIELDS`.
+            more or fewer fields than the first, a column named twice, or more fields than memory
+            holds.
     """
     path, pandas = Path(path), package("pandas")
     missing = DataFault(path, "missing; give a file that exists")
@@ -197,9 +200,7 @@ def _check_names(path: Path, names: list[str]) -> None:
 
 
 def _check_size(path: Path, rows: int, columns: int) -> None:
-    if rows * columns > MOST_FIELDS:
-        text = f"{rows} rows of {columns} columns are more than the {MOST_FIELDS} fields that fit into memory"
-        raise DataFault(path, f"{text}; remove columns or thin its rows")
+    require_memory(FIELD_MEMORY * rows * columns, f"{path}: {rows} rows of {columns} columns", THIN)
     if not rows:
         raise DataFault(path, "no rows; give one per measurement")
 
@@ -259,6 +260,7 @@ def _read_text(path: Path) -> Table:
 
 def _decoded(path: Path) -> tuple[str, str]:
     """Encoding and text of a file in UTF-8, UTF-16 with its mark, or else Windows' code page 1252."""
+    require_memory(TEXT_MEMORY * path.stat().st_size, f"{path}", THIN)
     content = path.read_bytes()
     for encoding in ["utf-16"] if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ["utf-8-sig", "cp1252"]:
         with suppress(UnicodeDecodeError):
