@@ -121,12 +121,11 @@ def test_bad_options_end_with_status_2(importing: list[object], tmp_path: Path, 
 
 @needs("wifi-office")
 def test_wifi_office_imports_by_one_command(tmp_path: Path, command: Command) -> None:
-    """Grid indices of 0.6 m, -200 dBm and 100 m of range where nothing was heard, access points at unknown places."""
+    """Grid indices of 0.6 m, -200 dBm where nothing was heard, access points at unknown places."""
     train, test = (DATA / "wifi-office" / f"database_office_{part}.csv" for part in ("train", "test"))
     folder, run = tmp_path / "office", tmp_path / "run"
     out = command.done(["data", "import", train, "--test", test, "--pitch", 0.6, "--out", folder])
     assert "-200 is not heard: 659 readings are empty fields" in out
-    assert "100000 is no rtt" in out
     assert "split: 81 training and 27 test rows" in out
     command.done(["train", folder, "--model", "idw", "--out", run])
     error_db = json.loads((run / "metrics.json").read_text())["abs_error_db"]["median"]
