@@ -91,6 +91,24 @@ def test_each_beacon_may_send_its_own_power(tmp_path: Path) -> None:
     assert len(imported(tmp_path, readings(TxPower=[-8, 0] * 10)).receivers) == 2
 
 
+def test_files_named_by_the_power_sent_are_not_pooled(tmp_path: Path) -> None:
+    files = [tmp_path / f"scan_{power}dBm.csv" for power in (-8, -4, 0)]
+    for file in files:
+        readings().to_csv(file, index=False)
+    error_line(
+        import_measurements, files, tmp_path / "data", r"files at -8, -4, 0 dBm sent, by their names, are not pooled"
+    )
+
+
+@pytest.mark.parametrize("offset_db", [0.0, 4.0])
+def test_a_constant_offset_between_files_is_said(offset_db: float, tmp_path: Path) -> None:
+    noise = np.random.default_rng(4).normal(0, 1, (2, 20))
+    for name, offset, part in zip("ab", (0.0, offset_db), noise, strict=True):
+        readings(rssi=readings().rssi + offset + part).to_csv(tmp_path / f"{name}.csv", index=False)
+    notes = import_measurements([tmp_path / "a.csv", tmp_path / "b.csv"], tmp_path / "data").notes
+    assert any("dB from those of the other files" in note for note in notes) is (offset_db > 0)
+
+
 @pytest.mark.parametrize(
     ("names", "heights_m"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ from .places import (
 from .readings import (
     Means,
     Readings,
+    file_offsets,
     further_columns,
     mean_strengths,
     read_readings,
@@ -52,6 +54,7 @@ MOST_CELLS = 50_000_000  # largest number of receivers times places: 2 GB while 
 TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
 RADIOS = frozenset({"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "umts", "tdscdma", "lte", "nr", "5g"})
 """Values of a column of kinds of radio, in small letters."""
+SENT_IN_NAME = re.compile(r"(?<![\d.])(-?\d+(?:\.\d+)?)[ _]?dbm", re.IGNORECASE)
 STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
 
 
@@ -142,6 +145,7 @@ class _Import:
         keys = {"z": xyz_m[:, 2], **conditions, "part": self.is_test}
         place = place_numbers(keys, xyz_m[:, :2], self.options.place_m)
         count = np.bincount(place)
+        self.notes += file_offsets(readings, place, self._file, [path.name for path, _ in self.table.files])
         first = np.unique(place, return_index=True)[1]
         ids, means = self._means(readings, place, len(count))
         position_m = np.column_stack([np.bincount(place, axis) / count for axis in xyz_m.T]).round(POSITION_DIGITS)
@@ -271,6 +275,10 @@ class _Import:
                 text = f"{one_line(name)} is {counts}: these are not pooled"
                 remedy = f"choose one by --where {shlex.quote(f'{name}={values.value_counts().index[0]}')}"
                 raise DataFault(self.table.files[0][0], f"{text}; {remedy}")
+        powers = {match[1] for path, _ in self.table.files if (match := SENT_IN_NAME.search(path.stem))}
+        if len(powers) > 1:
+            text = f"files at {', '.join(sorted(powers, key=float))} dBm sent, by their names, are not pooled"
+            raise InputError(f"{self.table.files[0][0].parent}: {text}; import each into a folder of its own")
 
     def _conditions(self, readings: Readings) -> dict[str, Any]:
         """Heading, carrier and run of each row where stated; rows that differ in them are not averaged."""

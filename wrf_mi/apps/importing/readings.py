@@ -21,6 +21,9 @@ from .forms import MAC, Columns
 POOLED_READINGS = 4.0
 """Weight, in readings, of all places' variance in that of a place, of which few readings tell little."""
 LEAST_STD_DB = 0.05  # noise of a mean of whole dB is not below this
+FEWEST_COMPARED, LEAST_OFFSET_DB, OFFSET_STANDARD_ERRORS = 10, 2.0, 4.0
+"""Places and receivers that files share, and the difference of their strengths, from which it is said: one in 16,000
+files differs by four standard errors by chance, and a quantisation to whole dB by less than 2 dB."""
 RESERVED = ("x", "y", "z", "heading", "frequency_hz", "run", "split")
 PREFIXES = ("rssi_", "count_", "std_")  # columns of the layout, which kept columns must not be taken for
 SEPARATOR = "|"
@@ -162,6 +165,36 @@ def mean_strengths(readings: Readings, place: IntArray, places: int, average: st
     return Means(dbm.reshape(shape), count.reshape(shape).astype(np.int64), std.reshape(shape))
 
 
+def file_offsets(readings: Readings, place: IntArray, file: IntArray, names: Sequence[str]) -> list[str]:
+    """Notes on files whose strengths differ from those of the others by a constant at the same places.
+
+    Args:
+        readings: all readings.
+        place: number of the place of each row of the table.
+        file: number of the file of each row.
+        names: names of the files.
+    """
+    cell, of_file, notes = readings.receiver * (place.max() + 1) + place[readings.row], file[readings.row], list[str]()
+    for number, name in enumerate(names) if len(names) > 1 else ():
+        in_file = of_file == number
+        shared = np.intersect1d(cell[in_file], cell[~in_file])
+        means = [
+            _means(readings.dbm[part], np.searchsorted(shared, cell[part]), len(shared))
+            for part in (in_file & np.isin(cell, shared), ~in_file & np.isin(cell, shared))
+        ]
+        if len(shared) < FEWEST_COMPARED:
+            continue
+        difference = means[0] - means[1]
+        offset = float(np.median(difference))
+        # Standard error of a median of Gaussian differences, by their median absolute deviation (Rousseeuw and Croux,
+        # J. Am. Stat. Assoc. 88, 1993).
+        error = 1.2533 * 1.4826 * float(np.median(np.abs(difference - offset))) / np.sqrt(len(difference))
+        if abs(offset) > max(LEAST_OFFSET_DB, OFFSET_STANDARD_ERRORS * error):
+            text = f"{name}: strengths are {offset:+.1f} dB from those of the other files at {len(shared)} equal places"
+            notes.append(f"{text}: another sent power or device, pooled here; import it into a folder of its own")
+    return notes
+
+
 def further_columns(table: Table, columns: Columns, place: IntArray) -> dict[str, NDArray[Any]]:
     """Kept columns [places] by name: means of numbers over the rows of a place, its different texts joined by a bar."""
     values: dict[str, NDArray[Any]] = {}
@@ -173,14 +206,19 @@ def further_columns(table: Table, columns: Columns, place: IntArray) -> dict[str
     return values
 
 
+def _means(values: FloatArray, place: IntArray, places: int | None = None) -> FloatArray:
+    """Means over the rows of each place, NaN without a number."""
+    known = ~np.isnan(values)
+    size = int(place.max()) + 1 if places is None else int(places)
+    with np.errstate(invalid="ignore"):
+        total = np.bincount(place[known], values[known], minlength=size)
+        return np.asarray(total / np.bincount(place[known], minlength=size))
+
+
 def _of_places(table: Table, name: str, place: IntArray) -> NDArray[Any]:
     """Means of numbers, NaN without any, or the different texts of each place in the order of its rows."""
     if table.is_numeric(name):
-        numbers = table.numbers(name)
-        known, places = ~np.isnan(numbers), int(place.max()) + 1
-        with np.errstate(invalid="ignore"):
-            total = np.bincount(place[known], numbers[known], minlength=places)
-            return np.asarray(total / np.bincount(place[known], minlength=places))
+        return _means(table.numbers(name), place)
     texts = table.frame[name].astype("object").set_axis(place).dropna().map(one_line)
     joined = texts.groupby(level=0).agg(lambda part: SEPARATOR.join(dict.fromkeys(part)))
     return np.asarray(joined.reindex(range(int(place.max()) + 1), fill_value=""), object)
