@@ -161,12 +161,38 @@ class Steps(FurtherStage):
 
 STAGE = Steps()
 """
+ROUGHNESS = """
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+
+from wrf_mi.gaussians import GaussianAttribute
+
+class Roughness(GaussianAttribute):
+    \"\"\"Loss of the coherent signal of a rough surface, exp(-g^2).\"\"\"
+
+    name, rate = "roughness", 1e-2
+
+    def start(self, initial, rng):
+        return np.full((1, initial.count), 0.1, np.float32)
+
+    def applied(self, gaussians, values):
+        loss = dr.tile(dr.exp(-dr.square(values[0])), gaussians.batch)
+        return replace(gaussians, signal=[part * loss for part in gaussians.signal])
+
+    def grown(self, values, source, divided):
+        return np.where(divided, 0.05, values[:, source]).astype(np.float32)
+
+ROUGHNESS = Roughness()
+"""
 SOURCES = {
     "nearest_of_others": NEAREST,
     "attenuators": ATTENUATORS,
     "delays_of_others": DELAYS,
     "losses_of_others": HUBER,
     "stages_of_others": STEPS,
+    "roughness_of_others": ROUGHNESS,
 }
 ENTRY_POINTS = """
 [wrf_mi.models]
@@ -183,6 +209,8 @@ delays = delays_of_others:LAYOUT
 huber = losses_of_others:huber
 [wrf_mi.stages]
 steps = stages_of_others:STAGE
+[wrf_mi.gaussian_attributes]
+roughness = roughness_of_others:ROUGHNESS
 """
 CALLS = """
 import contextlib, io, json, sys

@@ -28,6 +28,7 @@ from ..scene.materials import FILE as MATERIALS_FILE
 from ..scene.mesh.surfaces import KINDS, Kind
 from ..tasks import task_of
 from ..tasks.conditions import scene_carrier
+from ..tasks.scores import LEVEL
 from ..tracing import open_scene
 from ..tracing.paths.corrected_scene import check_materials, moved_search
 from ..tracing.paths.solve import Prepared
@@ -36,8 +37,6 @@ from .moves import Moves
 from .options import DEFAULTS, FRAME, GAIN, HIDDEN, PHASES, PLANES, STRENGTHS, CorrectionOptions, OnStage
 from .state import LEAST_PATHS, SceneEdit, ScenePosterior, State
 from .uncertain_phases import UncertainPhases
-
-LEVEL = 0.9  # level of the intervals for which errors of rows that a scene knows are enlarged
 
 
 @dataclass

@@ -25,13 +25,12 @@ from ..core.array_files import under
 from ..core.types import IntArray
 from ..datasets.observations import FEW_ROWS, rows_received
 from ..tasks import TASKS
-from .interpolation.kriging import Trend
+from .interpolation.path_loss import Trend, fit_path_loss
 from .model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, field_arrays, from_field_arrays
 
 FEW = "few/"  # prefix of the arrays of receivers with few rows
 BETWEEN_DB = 4.0  # standard deviation between receivers where fewer than two show it: antennas and their mounting
 WITHIN_DB = 6.0  # standard deviation within a receiver where no row shows it: shadowing and fading of buildings
-EXPONENT = 2.0  # exponent of free space, where all rows are at one distance
 
 
 def few_rows(record: Record, splits: Sequence[Split]) -> IntArray:
@@ -82,13 +81,7 @@ class SharedLaw:
             observed = observed + _of_carriers(record.carriers_hz[rows], carrier_hz)
         received = np.isfinite(observed)
         columns = np.stack([Trend(position_m)(record.tx_pos_m[rows]) for position_m in positions_m])
-        pairs = received & is_placed[:, None]
-        x, y = columns[pairs], observed[pairs]
-        law = np.array([0.0, -EXPONENT])
-        if len(y) > 1 and np.ptp(x[:, 1]) > 0:
-            law = np.linalg.lstsq(x, y, rcond=None)[0]
-        elif len(y):
-            law[0] = float(np.mean(y - law[1] * x[:, 1]))
+        law = fit_path_loss(columns[is_placed], observed[is_placed])
         counts = received.sum(axis=1)
         level = float(np.mean(observed[received]))
         expected = np.where(is_placed[:, None], columns @ law, level)

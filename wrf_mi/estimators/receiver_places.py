@@ -39,7 +39,7 @@ from ..core.antenna import AS_STATED
 from ..core.files import listed, readable, write_atomically
 from ..core.types import IntArray
 from ..tasks import task_of
-from ..tasks.scores import REAL_90
+from ..tasks.scores import LEVEL, REAL_90
 from ..training.session import OnProgress, quiet
 from .model import Model, Problem
 
@@ -61,7 +61,6 @@ MOST_PLACES, GROWTH = 100, 1.2  # places in the fit at most, for which rows are 
 CELLS = (24, 24, 2)  # cells along x, y and z, of equal prior probability, with which the search begins
 HALVED, MOST_HALVINGS = 48, 24  # cells that are halved together, those of most probability, and how often at most
 FINE, REST = 0.5, 0.05  # cells in standard deviations of the place, and the probability in coarser ones that is left
-COVERED = 0.9  # share of the probability within `REAL_90` standard deviations of the estimate
 ZOOMS = 8  # halvings of a cell around the mode
 MARGIN_M = 0.1  # least distance from floor and ceiling of a scene
 AWAY_M = np.arange(0.05, 2.0, 0.05)  # distances at which a place outside of solids is searched for
@@ -114,7 +113,7 @@ def place_of_receiver(
 
     away_m = np.abs(at_m - mode_m)
     order = np.argsort(away_m, axis=0)
-    last = np.argmax(np.cumsum(share[order], axis=0) > COVERED, axis=0)
+    last = np.argmax(np.cumsum(share[order], axis=0) > LEVEL, axis=0)
     return mode_m, away_m[order[last, np.arange(3)], np.arange(3)] / REAL_90
 
 

@@ -32,7 +32,7 @@ from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
 from ..core.registry import resolve
-from ..gaussians import Factorised, WrfGs, WrfGsPlus
+from ..gaussians import Factorised, WithAttributes, WrfGs, WrfGsPlus
 from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import TiledPlane
 from ..receivers.device_paths import TracedPaths, draws_on_device, expected_report, spread
@@ -46,7 +46,7 @@ from .evaluations import EVALUATIONS, Evaluation
 from .receivers import RECEIVERS, Form
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
-Field = WrfGs | WrfGsPlus | Factorised
+Field = WrfGs | WrfGsPlus | Factorised | WithAttributes
 LEVEL = "level"  # parameter [1, n_rx] of the learned side: logarithm of each receiver's unit of amplitude
 SHARE = 0.1  # initial learned amplitude relative to the amplitude of the paths
 MATCHING = 3  # passes of `Graph.match_gain`: in the first, magnitudes may be below the receiver's floor

@@ -23,8 +23,9 @@ SSIM_SAMPLE = WINDOW**2 / (WINDOW**2 - 1)  # Sample variance of a window over it
 RESAMPLES = 2000
 """Number of bootstrap resamples: ends of a 95 % interval are then exact to a few hundredths of its width."""
 BINS = 10  # Bins of predicted probabilities
+LEVEL = 0.9  # Probability of prediction intervals and regions
 REAL_90, COMPLEX_90 = 1.6449, 1.5174
-"""Standard deviations within which 90 % of a normal and of a circular complex normal variable lie."""
+"""Standard deviations within which a share `LEVEL` of a normal and of a circular complex normal variable lie."""
 MixtureScores = Callable[[FloatArray, IntArray], FloatArray]
 """From weights [n, k] of sum 1 and numbers [n] of observations to scores [n] of weighted means of k predictions."""
 

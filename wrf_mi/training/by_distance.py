@@ -21,7 +21,7 @@ from ..core import Prediction
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..tasks import Task
-from ..tasks.scores import COMPLEX_90, REAL_90
+from ..tasks.scores import COMPLEX_90, LEVEL, REAL_90
 from .selection import RowDistance, improves, last_gain
 
 LENGTHS = 7
@@ -34,7 +34,6 @@ FIRST, STEPS = 3, 12
 """Share of the best single prediction at the start of the forward selection, in steps, and largest number of steps."""
 DOUBT = 2.0  # standard errors of a difference that is clear: by chance five rows exceed one of them one time in five
 
-LEVEL = 0.9
 SIZES, DISTANCES = 8, 4  # largest numbers of groups by size and by distance
 GROUP_ROWS = 12
 """Least average number of rows in a group: intervals of smaller ones follow their rows and are too narrow elsewhere."""

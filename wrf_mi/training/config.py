@@ -198,6 +198,8 @@ class TrainConfig(LoopConfig):
             times as long.
         view: directions of an antenna, where observations are not spectra.
         traced: paths that are trained together with the Gaussians, where a scene is given.
+        attributes: further attributes of Gaussians that installed packages add (`wrf_mi.gaussians.attributes`), names
+            separated by commas.
     """
 
     steps: Annotated[int, NOT_NEGATIVE] = 0
@@ -214,6 +216,7 @@ class TrainConfig(LoopConfig):
     evaluation: EvaluationName = SPLATTED
     view: ViewConfig = field(default_factory=ViewConfig)
     traced: TracedConfig = field(default_factory=TracedConfig)
+    attributes: str = ""
 
     def resolved(self, tx_pos_m: ArrayLike) -> TrainConfig:
         """The settings with number of steps and scale for the training transmitters [n, 3] in metres."""

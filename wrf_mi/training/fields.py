@@ -12,6 +12,7 @@ from ..core import InputError, Receiver
 from ..core.memory import require_memory
 from ..datasets.observations import LARGEST, computable
 from ..gaussians import FIELDS, Encoding, random_gaussians
+from ..gaussians.attributes import with_attributes
 from ..graph.graph import Field
 from ..graph.receivers import Form
 from .config import PATHS_ALONE, NetworkConfig, TrainConfig
@@ -49,7 +50,9 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
     if n.terms and model != "factorised":
         raise InputError(f"setting network.terms: {model} has none; omit it")
     encoding = Encoding(e.position_octaves, e.position_scale_m, e.tx_octaves, e.tx_scale_m, features, carrier)
-    field: Field = FIELDS[model](encoding=encoding, components=components, **_sizes(model, n))
+    field: Field = with_attributes(
+        FIELDS[model](encoding=encoding, components=components, **_sizes(model, n)), config.attributes
+    )
     return field
 
 

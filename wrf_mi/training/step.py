@@ -156,6 +156,8 @@ class Steps:
         o, traced = self._plan.config.optimiser, self._plan.graph.traced
         rates = {name: getattr(o, name) for name in ("position", "rotation", "opacity", "signal")}
         rates |= {"log_scale": o.scale, LEVEL: o.level}
+        if (field := self._plan.graph.field) is not None:
+            rates |= {attribute.name: attribute.rate for attribute in field.attributes}
         # Parameters of networks have a dot in their names (`wrf_mi.gaussians.network.init_layer`).
         unknown = [name for name in names if "." not in name and name not in rates]
         if unknown:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..backend import init
 from ..core import Record, Split
 from ..gaussians import InitialGaussians
+from ..gaussians.attributes import grown_attributes
 from ..gaussians.initial import adapt, reset_opacity
 from ..graph.graph import Field, Graph
 from ..tasks import Loss
@@ -218,6 +219,7 @@ class Trainer(TrainingLoop):
         # A field that starts with more Gaussians than the limit keeps them, and does not grow.
         most = max(density.max_gaussians, self.config.initial.gaussians)
         change = adapt(params, gradient, distance, rng, density.growth_fraction, most)
+        change.parameters.update(grown_attributes(self.field.attributes, params, change.source))
         state.change_density(change)
         self.record_functions()
         rounds, every = sorted(self.schedule.density), density.reset_every

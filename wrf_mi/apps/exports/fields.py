@@ -97,6 +97,10 @@ def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, A
     with dr.suspend_grad():
         gaussians = field.predictor.gaussians(tx_pos_m, log_carrier)
     columns = splat_columns(gaussians)
+    assert field.field is not None
+    for attribute in field.field.attributes:
+        of_attribute = attribute.columns(field.params[attribute.name])
+        columns |= {name: values.astype(np.float32) for name, values in of_attribute.items()}
     where = " ".join(f"{x:.9g}" for x in tx_pos_m[0])
     comments = [f"Gaussians of a radio field ({run.config.model}) for the transmitter at {where} m; metres, z up"]
     comments.append(f"colour: magnitude of the signal, viridis over {RANGE_DB:g} dB below the strongest")

@@ -22,9 +22,10 @@ from ...models import Session
 from ...runs.folder import load_rows
 from ...runs.run import Run, open_run
 from ...tasks import task_of
+from ...tasks.scores import LEVEL
 from ...training.session import Interrupted, OnProgress, quiet
 from .grid import Candidates, candidates_of
-from .locate_calibration import LEVEL, Calibration, calibration_of, headings_of, predict_candidates, seconds_to_predict
+from .locate_calibration import Calibration, calibration_of, headings_of, predict_candidates, seconds_to_predict
 from .locate_likelihood import region_of
 
 MINUTES_FROM_S = 100.0  # duration from which it is stated in minutes

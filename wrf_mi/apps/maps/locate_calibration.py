@@ -34,6 +34,7 @@ from ...estimators.model import Inputs, slices
 from ...models import Fitted, Session
 from ...runs.folder import load_rows
 from ...runs.run import Run
+from ...tasks.scores import LEVEL
 from ...training.selection import hold_out
 from .grid import HEADINGS, Candidates
 from .locate_likelihood import Likelihood, Neighbours, Silence, choose_neighbours, region_of
@@ -44,7 +45,6 @@ DEGREES, SCALES, OFFSETS_DB = (4.0, 8.0, None), (0.35, 0.5, 0.7, 0.85, 1.0, 1.2,
 """Forms of the likelihood to choose from."""
 WIDE = 0.95  # probability of the quantile by which the widths of distributions are compared
 MOST_ROWS = 300  # most held-out rows that are located
-LEVEL = 0.9  # probability of a region by default, and of those whose held-out coverage is stated
 TOGETHER = 512  # candidates that are predicted together
 TIMED = 64  # most candidates whose predictions are timed at once, before all are predicted
 FOLDS = 3  # hold-outs with other seeds: one alone has few positions, near each other

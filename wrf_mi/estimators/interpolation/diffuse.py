@@ -20,7 +20,8 @@ from ...core.angles import FloatArray
 from ...core.array_files import keyed, under
 from ..model import Arrays, field_arrays, from_field_arrays
 from .by_receiver import ReceiverRows, Single, observed_rows
-from .kriging import NEAREST_M, GenericKriging, UncertainKriged, asks_generic, kriged
+from .kriging import GenericKriging, UncertainKriged, asks_generic, kriged
+from .path_loss import NEAREST_M
 
 Complex = NDArray[np.complexfloating[Any, Any]]
 NEIGHBOURS = 32

@@ -25,8 +25,8 @@ from ...tasks import task_of
 from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
+from .path_loss import Trend
 
-NEAREST_M = 0.01  # least distance of two antennas in a law: below 1 cm none is a point
 CONSTANT, LOG_DISTANCE = "constant", "log-distance"
 LENGTH_M = (0.01, 100.0)  # or half of the rows' extent
 HEADING_LENGTH = (0.1, 100.0)
@@ -36,25 +36,7 @@ variance."""
 LIKELIHOOD_EVALUATIONS = 200  # Nelder-Mead on three logarithms settles to 0.01 in 60 to 150
 
 
-@dataclass(frozen=True)
-class Trend:
-    """Columns of a trend: one unknown mean, or the log-distance law a + b 10 log10(d).
-
-    Source: Rappaport, "Wireless Communications" (2002), section 4.9.
-    """
-
-    receiver_m: FloatArray | None = None  # position [3] from which d is the distance, metres; None: one unknown mean
-
-    def __call__(self, positions_m: FloatArray) -> FloatArray:
-        """Columns [n, p] at positions [n, 3]."""
-        mean = np.ones(len(positions_m))
-        if self.receiver_m is None:
-            return mean[:, None]
-        # The logarithm must not diverge on a transmitter at the receiver.
-        distance = np.maximum(np.linalg.norm(positions_m - self.receiver_m, axis=1), NEAREST_M)
-        return np.stack([mean, 10 * np.log10(distance)], axis=1)
-
-
+CONSTANT = Trend()  # one unknown mean
 SCALE = "scale"  # key of the arrays that kriging without standard deviations has not
 STORED = ("lengths", "positions_m", "coefficients", "weights", "like")  # attributes of `Kriged` as they are
 
@@ -182,7 +164,7 @@ class Kriging(CovarianceSettings):
         seed: seed of the rows of the likelihood.
     """
 
-    trend: Trend = Trend()
+    trend: Trend = CONSTANT
     trend_fit: Literal["gls", "ols"] = "gls"
     seed: int = 0
 

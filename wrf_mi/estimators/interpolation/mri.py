@@ -23,7 +23,7 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows
-from .kriging import Trend
+from .path_loss import Trend, fit_path_loss, shows_exponent
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,10 @@ def _shared_law(record: Record, rows: IntArray) -> FloatArray:
 
 
 def _law(columns: FloatArray, observed: NDArray[Any]) -> FloatArray:
-    received = ~np.isnan(observed)
-    columns, observed = columns[received], observed[received].astype(float)
-    if len(observed) < 2 or not np.ptp(columns[:, 1]) > 0:
-        raise InputError(f"mri: {len(observed)} rows at one distance; an exponent shows at two or more")
-    return np.asarray(np.linalg.lstsq(columns, observed, rcond=None)[0])
+    if not shows_exponent(columns, observed):
+        count = np.count_nonzero(np.isfinite(observed))
+        raise InputError(f"mri: {count} rows at one distance; an exponent shows at two or more")
+    return fit_path_loss(columns, observed)
 
 
 class Mri(ByReceiverModel):
@@ -92,13 +91,10 @@ class Mri(ByReceiverModel):
         columns = Trend(receiver_m)(rows.tx_pos_m)
         if rows.problem.settings.shared or np.isnan(observed).all():  # a receiver that is held out has no rows
             return PathLoss(receiver_m, _shared_law(record, train))
-        received = ~np.isnan(observed)
         # Where all positions coincide, the shared law has no slope either, and `_law` says so.
-        if np.ptp(rows.tx_pos_m, axis=0).any() and not np.ptp(columns[received, 1]) > 0:
+        if np.ptp(rows.tx_pos_m, axis=0).any() and not shows_exponent(columns, observed):
             # Rows at a single distance state a level but no exponent, which is that of all receivers.
-            _, slope = _shared_law(record, train)
-            level = float(np.mean(observed[received] - slope * columns[received, 1]))
-            return PathLoss(receiver_m, np.array([level, slope]))
+            return PathLoss(receiver_m, fit_path_loss(columns, observed, -_shared_law(record, train)[1]))
         return PathLoss(receiver_m, _law(columns, observed))
 
     def load_single(self, receiver: Receiver, arrays: Arrays) -> PathLoss:

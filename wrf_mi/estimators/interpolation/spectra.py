@@ -36,7 +36,7 @@ from ...datasets.observations import rows_received
 from ...parallel.threads import one_blas_thread
 from ...receivers.array import Lags, array_response
 from ...receivers.retrieve import retrieve_signals, unscale
-from ...tasks.scores import REAL_90
+from ...tasks.scores import LEVEL, REAL_90
 from ...training.session import OnProgress
 from ..model import Arrays, Problem, field_arrays, from_field_arrays
 from .by_receiver import ReceiverRows, Single, observed_rows
@@ -49,7 +49,6 @@ logger = logging.getLogger(__name__)
 GAPS = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Radii in wavelengths around a held-out row within which no row is used while the weights are fitted."""
 HELD_OUT = 80  # held-out training rows at most
-INTERVAL = 0.9  # share of errors that calibrated intervals cover
 UNSCALED_PER_CHUNK = 128  # spectra whose element signals are retrieved together
 CHUNK = 16  # transmitters predicted together, which bounds the memory of images with draws
 # Covariances between rows over all elements, 2000 rows of 16: their factors and inverses are in memory together, 2 GB.
@@ -324,7 +323,7 @@ def _fit_weights(
         assert std is not None
         ratios.append((np.abs(truth - mean) / np.maximum(std, 1e-6))[:, ::5, ::5].ravel())
         on_progress(0.5 + len(ratios) / (2 * len(predictions)))
-    kriged.spread = float(np.quantile(np.concatenate(ratios), INTERVAL) / REAL_90)
+    kriged.spread = float(np.quantile(np.concatenate(ratios), LEVEL) / REAL_90)
 
 
 class SpectrumKriging(GenericKriging):

@@ -17,15 +17,15 @@ from scipy.spatial import cKDTree
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ...tasks.scores import REAL_90
+from ...tasks.scores import LEVEL, REAL_90
+from .path_loss import FREE_SPACE, NEAREST_M
 from .pooled_process import PooledProcess, ReceiverObservations, of_each
-from .strength_terms import NEAREST_M, PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
+from .strength_terms import PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
 from .strength_trees import Forest
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced
 
-FREE_SPACE = 2.0  # exponent of the distance in free space
 FOLDS = 7
 STRETCH = (4, 150)
 """Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
@@ -41,7 +41,6 @@ DEVIATION_STOPS = 200  # the first of these where deviations alone are wanted
 SEARCH_STEP, MOST_STEPS, SEARCH_ROWS = 2.0, 4, 400
 """Factor of a step of the search, most steps of one parameter in one direction, and most rows."""
 LEAST_GAIN_DB = 0.005  # least reduction of the held-out error by which the search changes a parameter
-COVERED = 0.9  # share of residuals that calibrated intervals cover
 
 
 @dataclass(frozen=True)
@@ -408,7 +407,7 @@ def widening(residual_db: FloatArray, std_db: FloatArray) -> FloatArray:
 
     def quantile(values: FloatArray, prior: float) -> float:
         weight = len(values) / (len(values) + TRUST / 5)
-        return float(np.quantile(values, COVERED) ** weight * prior ** (1 - weight)) if len(values) else prior
+        return float(np.quantile(values, LEVEL) ** weight * prior ** (1 - weight)) if len(values) else prior
 
     pooled = quantile(score[known], 1.0)
     return np.array([quantile(row[which], pooled) for row, which in zip(score, known, strict=True)])

@@ -23,8 +23,8 @@ from scipy.spatial.distance import cdist
 from ...core.angles import FloatArray
 from ...core.settings import Finite, Positive
 from ...core.types import IntArray
+from .path_loss import NEAREST_M
 
-NEAREST_M = 0.05  # least distance between antennas in the law of distance
 HARMONICS = 3
 """Harmonics of the transmitter's pattern over psi; more changed the held-out error of flat-ble by under 0.005 dB."""
 RX_HARMONICS = 2
