@@ -128,7 +128,7 @@ def test_copies_of_rows(name):
     found = suspected(replace(observed, tx_pos_m=record.tx_pos_m[rows], tx_heading_rad=heading, uplink=up))
     assert found
     assert set(found) <= {"repeated-rows", "train-test"}
-    if record.task != "rssi":
+    if record.task.name != "rssi":
         assert "rows 6, 10;" in suspected(observed)["repeated-observations"]
 
 

@@ -43,7 +43,7 @@ def full_record() -> Record:
 def test_npz_holds_a_record_without_loss(record: Record, tmp_path: Path) -> None:
     file = write_record_file(tmp_path / "one.npz", record)
     assert_same(load(file), record)
-    assert stated_task(file) == record.task
+    assert stated_task(file) == record.task.name
     # Exported again, from the folder that holds it, too.
     export(tmp_path, "npz", tmp_path / "two" / "again.npz")
     assert_same(load(tmp_path / "two"), record)

@@ -114,7 +114,7 @@ def request(model: str, texts: list[str]) -> RunRequest:
 
 def quick_settings(model: str, record: Record) -> dict[str, str]:
     """Quick settings by name, but for those that have no effect on the data."""
-    texts = (*QUICK.get(model, ()), *(QUICK_SPECTRA if (model, record.task) == ("kriging", "spectrum") else ()))
+    texts = (*QUICK.get(model, ()), *(QUICK_SPECTRA if (model, record.task.name) == ("kriging", "spectrum") else ()))
     settings = dict(text.split("=") for text in texts)
     while refused := refused_setting(model, record, settings):
         del settings[refused]

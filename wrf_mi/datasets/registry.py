@@ -198,5 +198,5 @@ def stated_task(name_or_folder: str | Path) -> str | None:
     path = Path(name_or_folder)
     if is_data(path):
         layout = layout_of(path)
-        return layout.task or layout.read(path, None).task
+        return layout.task or layout.read(path, None).task.name
     return next((dataset.task for dataset in KNOWN if dataset.name == str(name_or_folder)), None)

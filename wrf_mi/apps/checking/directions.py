@@ -52,7 +52,7 @@ REMEDY = "write images as docs/data.md states, row 0 at elevation 0, column 0 at
 
 def spectrum_axes(record: Record) -> Found:
     """Image rows, columns, orientation or plan in another reading than the stated one."""
-    if record.task != "spectrum":
+    if record.task.name != "spectrum":
         return
     height, width = record.observation.shape[2:]
     if height > width:

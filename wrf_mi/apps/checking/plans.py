@@ -9,7 +9,6 @@ import numpy as np
 
 from ...core import Prediction, Record
 from ...core.angles import FloatArray
-from ...tasks import task_of
 from .units import Found, distances_m
 
 FEWEST_ROWS = 30
@@ -96,7 +95,7 @@ def _formula(axis: str, row: FloatArray, offset_m: float) -> str:
 
 def distance_law(record: Record) -> Found:
     """The plan in which signal strengths follow a distance law, if they do not in the stated plan."""
-    if record.task not in ("rssi", "csi") or not record.has_positions or len(record) < FEWEST_ROWS:
+    if record.task.name not in ("rssi", "csi") or not record.has_positions or len(record) < FEWEST_ROWS:
         return
     if not all(np.isfinite(receiver.position_m).all() for receiver in record.receivers):
         return
@@ -122,7 +121,7 @@ def unlike_units(record: Record) -> Found:
     surveyed = np.isfinite(places).all(axis=1)
     # With a single receiver a factor moves the rows as another place of it would.
     enough = surveyed.sum() >= 2 and len(record) >= FEWEST_ROWS
-    if record.task not in ("rssi", "csi") or not record.has_positions or not enough:
+    if record.task.name not in ("rssi", "csi") or not record.has_positions or not enough:
         return
     rows = np.linspace(0, len(record) - 1, min(len(record), MOST_ROWS)).astype(int)
     levels, places = levels_db(record)[surveyed][:, rows], places[surveyed]
@@ -150,7 +149,7 @@ def _distances_m(at_m: FloatArray, places_m: FloatArray) -> FloatArray:
 
 def levels_db(record: Record) -> FloatArray:
     """Received power [n_rx, n] in dB, NaN where nothing was received."""
-    task = task_of(record)
+    task = record.task
     return np.stack([task.level(Prediction(observed)).mean for observed in record.observation]).astype(float)
 
 

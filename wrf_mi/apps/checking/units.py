@@ -106,7 +106,7 @@ def position_unit(record: Record) -> Found:
     middle = float(np.median(distance[known]))
     evidence = f"the median distance from transmitter to receiver is {middle:.4g} m"
     hz = record.carriers_hz if record.carriers_hz is not None else record.frequencies_hz
-    if record.task == "rssi" and hz is not None:
+    if record.task.name == "rssi" and hz is not None:
         loss_db = 20 * np.log10(4 * np.pi * distance * np.broadcast_to(hz, len(record)) / speed_of_light)
         received = known & np.isfinite(record.observation)
         radiated = np.percentile((record.observation + loss_db)[received], STRONGEST) if received.any() else 0.0
@@ -172,7 +172,7 @@ def far_from_origin(record: Record) -> str | None:
 
 def strength_scale(record: Record) -> Found:
     """Powers on a linear scale, or decibels without their sign, in the training rows, the test rows or both."""
-    if record.task != "rssi":
+    if record.task.name != "rssi":
         return
     parts = {"training rows": np.arange(len(record)), "test rows": np.zeros(0, np.int64)}
     if record.official is not None:
@@ -209,7 +209,7 @@ def _scale(observed: NDArray[Any]) -> str:
 
 def channel_phase(record: Record) -> Found:
     """Channels that hold magnitudes or decibels in place of complex coefficients."""
-    if record.task != "csi":
+    if record.task.name != "csi":
         return
     parts = {"channel": record.observation, "uplink": record.uplink}
     for name, values in parts.items():
