@@ -25,11 +25,11 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     entries, and ``builtin`` has the entries of this package by name, or their addresses ``module:attribute``.
     """
 
-    def __init__(self, what: str, group: str, builtin: Mapping[str, Entry | str] = {}) -> None:
+    def __init__(self, what: str, group: str, builtin: Mapping[str, Entry | str] | None = None) -> None:
         self._what, self._known = what, dict[str, Entry | str]()
         self._others = {point.name: point for point in entry_points(group=group)}
         self._twice, self._modules = set[str](), dict[str, str]()
-        self.add_builtin(builtin)
+        self.add_builtin(builtin or {})
 
     def add_builtin(self, entries: Mapping[str, Entry | str]) -> None:
         """Add entries of this package, where the registry lies in a package below theirs."""

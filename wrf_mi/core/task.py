@@ -96,7 +96,7 @@ class Task(ABC):
     trusts_stated_std: ClassVar[bool] = False
     #: settings of the training of Gaussians that differ from the defaults, as ``--set`` takes them
     settings: ClassVar[tuple[str, ...]] = ()
-    #: the same beside the paths of a scene
+    #: settings of the training of Gaussians beside the paths of a scene that differ from the defaults
     settings_with_scene: ClassVar[tuple[str, ...]] = ()
     #: settings of the training of paths alone that differ from the defaults of such a training
     settings_of_paths: ClassVar[tuple[str, ...]] = ()
@@ -132,7 +132,7 @@ class Task(ABC):
             return prediction
         raise InputError(f"task {self.name}: defines no level of an observation, so there is nothing to map")
 
-    def image_size(self, shape: tuple[int, ...]) -> tuple[int, ...]:
+    def image_size(self, shape: tuple[int, ...]) -> tuple[int, int] | tuple[()]:
         """Height and width of an observation of a shape that is an image over directions; () of other tasks."""
         return ()
 

@@ -263,7 +263,7 @@ class Record:
 
 
 # After the class, as a value in its body would be a default of the argument.
-Record.task = _TaskName()  # type: ignore[misc, assignment]
+Record.task = _TaskName()  # type: ignore[assignment]
 
 
 @dataclass(frozen=True)

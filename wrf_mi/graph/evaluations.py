@@ -1,7 +1,7 @@
 """Evaluation of the Gaussians of a graph on a receiver's directions, by name.
 
 ``splatted`` projects Gaussians to the plane of directions. ``traced`` follows rays through them with the Mitsuba plugin
-`wrf_traced`: the package of the plugins adds it by an entry point, as other packages may add theirs.
+`wrf_traced`: the package of the plugins adds it by an entry point.
 """
 
 from __future__ import annotations

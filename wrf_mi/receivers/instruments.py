@@ -14,6 +14,8 @@ from ..core.carriers import by_carrier
 from ..core.types import FloatArray, IntArray
 from .registry import RECEIVERS, Form, ReceiverModel
 
+SIZE = (90, 360)  # elevations and azimuths of a spectrum where none are stated: one each degree
+
 
 @dataclass(frozen=True)
 class Instrument:
@@ -39,7 +41,7 @@ class Instrument:
     receivers: tuple[Receiver, ...]
     frequencies_hz: FloatArray
     tx_antenna: Antenna = ANTENNA
-    size: tuple[int, int] = (90, 360)
+    size: tuple[int, int] = SIZE
     phase_error: float = 0.0
 
     @property

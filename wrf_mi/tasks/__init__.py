@@ -7,7 +7,7 @@ import numpy as np
 from ..core import InputError, Record, Task
 from ..core.angles import FloatArray
 from ..core.task import CARRIER, LAW, LOSSES, TASKS, UPLINK, Loss
-from ..receivers.instruments import Instrument
+from ..receivers.instruments import SIZE, Instrument
 from .csi import Csi
 from .rssi import Rssi
 from .spectrum import Spectrum
@@ -33,9 +33,8 @@ def instrument_of(record: Record) -> Instrument:
     if not task.receiver_with_scene:
         raise InputError(f"{record.name}: no receiver model reports {task.name} from paths; choose another model")
     frequencies_hz, record = _carrier_hz(record, task.carrier_stated_in), task.with_arrays(record)
-    size = task.image_size(record.observation.shape)
-    known = {"size": size} if size else {}
-    return Instrument(task.receiver_with_scene, record.receivers, frequencies_hz, record.tx_antenna, **known)
+    size = task.image_size(record.observation.shape) or SIZE
+    return Instrument(task.receiver_with_scene, record.receivers, frequencies_hz, record.tx_antenna, size)
 
 
 def _carrier_hz(record: Record, stated_in: str) -> FloatArray:

@@ -80,9 +80,9 @@ class Spectrum(Task):
         scores = [on_device(to_float(prediction[k]), to_float(truth[k]), len(truth[k]), *shape).numpy() for k in parts]
         return np.concatenate([np.zeros(0), *scores])
 
-    def image_size(self, shape: tuple[int, ...]) -> tuple[int, ...]:
+    def image_size(self, shape: tuple[int, ...]) -> tuple[int, int]:
         """Height and width of a spectrum."""
-        return tuple(map(int, shape[-2:]))
+        return int(shape[-2]), int(shape[-1])
 
     def limited(self, values: NDArray[Any], most: bool = True) -> NDArray[Any]:
         """Greys in 0..1."""

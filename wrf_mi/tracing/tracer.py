@@ -37,7 +37,7 @@ class RayTracer:
 
     Args:
         scene: see `wrf_mi.tracing.open_scene`.
-        instrument: receivers and their reports, see `wrf_mi.tasks.Task.instrument`.
+        instrument: receivers and their reports, see `wrf_mi.tasks.instrument_of`.
         options: kinds of path, depth, rays.
         material: radio material of a bare mesh.
 
