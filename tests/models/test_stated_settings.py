@@ -184,7 +184,7 @@ def read_settings(monkeypatch: pytest.MonkeyPatch) -> set[tuple[type, str]]:
 
 
 def cases(models: Any, records: Any) -> list[Any]:
-    tasks = {name: RECORDS[name]().task for name in records}
+    tasks = {name: RECORDS[name]().task.name for name in records}
     return [
         pytest.param(model, name, id=f"{model}-{name}")
         for model in models
