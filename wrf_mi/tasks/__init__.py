@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..core import InputError, Record, Task
+from ..core import InputError, Record
+from ..core import Task as Task
 from ..core.angles import FloatArray
 from ..core.task import CARRIER, LAW, LOSSES, TASKS, UPLINK, Loss
 from ..receivers.instruments import SIZE, Instrument
@@ -63,7 +64,6 @@ __all__ = [
     "TASKS",
     "UPLINK",
     "Loss",
-    "Task",
     "instrument_of",
     "known_loss",
     "require",
