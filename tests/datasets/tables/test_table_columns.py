@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from changed_folders import refusal
 
-from wrf_mi.apps.importing.columns import Columns, find_columns, parsed_columns, unit_of
 from wrf_mi.apps.importing.files import read_table
+from wrf_mi.apps.importing.forms import Columns, find_columns, parsed_columns, unit_of
 
 pytest.importorskip("pandas")
 
@@ -53,11 +53,10 @@ def test_tables_with_a_column_per_receiver(header: str, tmp_path: Path) -> None:
     assert "id" not in columns.of
 
 
-def test_ranges_belong_to_receivers_and_other_columns_are_kept(tmp_path: Path) -> None:
+def test_further_quantities_of_receivers_are_kept(tmp_path: Path) -> None:
     header = next(iter(WIDE))
     columns = columns_of(tmp_path, header, WIDE[header][0])
-    assert columns.others == {"AP1 RTT(mm)": ("rtt", "AP1"), "AP2 RTT(mm)": ("rtt", "AP2")}
-    assert columns.kept == ["LOS APs"]
+    assert columns.kept == ["AP1 RTT(mm)", "AP2 RTT(mm)", "LOS APs"]
 
 
 def test_stated_columns_and_patterns_replace_guesses(tmp_path: Path) -> None:

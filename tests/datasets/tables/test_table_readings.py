@@ -1,16 +1,9 @@
-"""Means of readings and their noise, numbers for "not heard", and networks of one radio."""
+"""Means of readings and their noise, and numbers for "not heard"."""
 
 import numpy as np
 import pytest
 
-from wrf_mi.apps.importing.readings import (
-    Readings,
-    mean_strengths,
-    merged,
-    normal_id,
-    virtual_networks,
-    without_not_heard,
-)
+from wrf_mi.apps.importing.readings import Readings, mean_strengths, normal_id, without_not_heard
 
 NOISE_DB = 4.0
 RATIO = 0.03
@@ -84,21 +77,6 @@ def test_other_numbers_that_pile_up_are_kept() -> None:
     assert without_not_heard(both, None)[2] == []
     for _ in range(20):
         assert without_not_heard(readings(np.round(rng.normal(-70, 9, (200, 4))), 4), None)[2] == []
-
-
-def test_networks_of_one_radio_are_found_and_merged() -> None:
-    rng = np.random.default_rng(5)
-    radio = rng.normal(-60, 10, 40)
-    other = radio - 8  # the other band of the same device
-    rows = [radio, radio + rng.normal(0, 1, 40), other, rng.normal(-60, 10, 40), radio + rng.normal(0, 1, 40)]
-    # Last digit, its other band, a neighbour of similar address, and a local address.
-    last = ["00:aa:bb:cc:dd:e0", "00:aa:bb:cc:dd:e1", "00:aa:bb:cc:dd:e8", "00:aa:bb:cc:dd:ef", "06:aa:bb:cc:dd:e0"]
-    groups = virtual_networks(last, np.stack(rows))
-    assert groups == [[0, 1, 4]]
-    one = merged(Readings(tuple(last), np.arange(5), np.arange(5), np.arange(5.0)), groups)
-    assert one.ids == (last[0], last[2], last[3])
-    np.testing.assert_array_equal(one.receiver, [0, 0, 1, 2, 0])
-    assert virtual_networks(["kitchen", "hall"], np.stack([radio, radio])) == []
 
 
 def test_ids_are_those_that_the_layout_reads() -> None:
