@@ -51,9 +51,8 @@ MODEL = NearestModel()
 '''
 CABLE_DB = 17.0
 ATTENUATORS = '''
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from wrf_mi.graph.receivers import RECEIVERS
 from wrf_mi.receivers.receiver_models import PowerReceiver
 from wrf_mi_bench.bench import Check
 
@@ -63,16 +62,14 @@ CABLE_DB = 17.0
 class Attenuated(PowerReceiver):
     """A power meter behind an attenuator."""
 
+    name = "attenuated"
+
     def __call__(self, traced, learned):
         return super().__call__(traced, learned) - CABLE_DB
-
-def make(form, receiver):
-    return Attenuated(*form.size, (0.0,), interference=False)
 
 def measure():
     return {"rows": [{"what": "attenuation", "value": f"{CABLE_DB} dB", "asked": "17 dB"}]}
 
-ATTENUATED = replace(RECEIVERS["power"], name="attenuated", make=make)
 CHECK = Check("attenuator", "attenuators:measure")
 '''
 DELAYS = """
@@ -80,9 +77,9 @@ import csv
 
 import numpy as np
 
-from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.core import Receiver, Record
 from wrf_mi.datasets.layouts import Layout
-from wrf_mi.tasks.task import Task
+from wrf_mi.tasks import Task
 
 class DelaySpread(Task):
     name, block, label, higher_is_better = "delay-spread", "abs_error_ns", "absolute error (ns)", False
@@ -91,9 +88,6 @@ class DelaySpread(Task):
 
     def score(self, prediction, truth):
         return np.abs(np.asarray(prediction, float) - np.asarray(truth, float))
-
-    def instrument(self, record):
-        raise InputError(f"{record.name}: nothing traces delay spreads")
 
 TASK = DelaySpread()
 
@@ -108,6 +102,55 @@ def read(path, name):
 
 LAYOUT = Layout("delays", TASK.name, read, files=("delays.csv",))
 """
+FIELD_STRENGTHS = '''
+import csv
+from dataclasses import dataclass
+
+import numpy as np
+
+from wrf_mi.core import Receiver, Record
+from wrf_mi.datasets.layouts import Layout
+from wrf_mi.receivers.receiver_models import PowerReceiver
+from wrf_mi.tasks import Task
+
+FACTOR_DB = 60.0
+
+class FieldStrength(Task):
+    name, block, label, higher_is_better = "field-strength", "abs_error_db", "absolute error (dB)", False
+    axes, has_offsets, loss_unit = 0, True, 10.0
+    heading, quantity = "field strength", "field strength (dBuV/m)"
+    receiver = receiver_with_scene = "field-meter"
+
+    def score(self, prediction, truth):
+        return np.abs(np.asarray(prediction, float) - np.asarray(truth, float))
+
+@dataclass(frozen=True)
+class FieldMeter(PowerReceiver):
+    """An antenna with a factor from its power to the strength of the field."""
+
+    name, tasks = "field-meter", ("field-strength",)
+    sums = None  # a correction differentiates the call
+
+    def __call__(self, traced, learned):
+        return super().__call__(traced, learned) + FACTOR_DB
+
+    def observed(self, paths, receiver):
+        return super().observed(paths, receiver) + FACTOR_DB
+
+TASK = FieldStrength()
+
+def read(path, name):
+    with (path / "fields.csv").open() as file:
+        table = np.array([[float(value) for value in row] for row in list(csv.reader(file))[1:]])
+    rows = np.arange(len(table))
+    receiver = Receiver("meter", np.array([0.0, 0, 2]), np.array([0.0, 0, 0, 1]))
+    values, hz = table[None, :, 3].astype(np.float32), np.array([2.4e9])
+    official = rows[rows % 4 > 0], rows[rows % 4 == 0]
+    about = {"frequencies_hz": hz, "official": official, "source": str(path)}
+    return Record(name or path.name, TASK, table[:, :3], (receiver,), values, **about)
+
+LAYOUT = Layout("fields", TASK.name, read, files=("fields.csv",))
+'''
 HUBER = """
 import drjit as dr
 
@@ -147,7 +190,7 @@ class Steps(FurtherStage):
     name = "steps"
 
     def options(self, problem, split):
-        if problem.record.task != "rssi":
+        if problem.record.task.name != "rssi":
             return []
         return [Option("as predicted", lambda state, split, session: state), Option("in steps", self._fit)]
 
@@ -190,6 +233,7 @@ SOURCES = {
     "nearest_of_others": NEAREST,
     "attenuators": ATTENUATORS,
     "delays_of_others": DELAYS,
+    "fields_of_others": FIELD_STRENGTHS,
     "losses_of_others": HUBER,
     "stages_of_others": STEPS,
     "roughness_of_others": ROUGHNESS,
@@ -198,13 +242,16 @@ ENTRY_POINTS = """
 [wrf_mi.models]
 nearest = nearest_of_others:MODEL
 [wrf_mi.receivers]
-attenuated = attenuators:ATTENUATED
+attenuated = attenuators:Attenuated
+field-meter = fields_of_others:FieldMeter
 [wrf_mi.benchmarks]
 attenuator = attenuators:CHECK
 [wrf_mi.tasks]
 delay-spread = delays_of_others:TASK
+field-strength = fields_of_others:TASK
 [wrf_mi.layouts]
 delays = delays_of_others:LAYOUT
+fields = fields_of_others:LAYOUT
 [wrf_mi.losses]
 huber = losses_of_others:huber
 [wrf_mi.stages]

@@ -31,7 +31,7 @@ _HOME = {
     "Model": "models",
     "Move": "scene.edit",
     "Receiver": "core",
-    "Record": "core",
+    "Record": "datasets:Record",  # with the tasks that it names
     "Run": "runs.api",
     "Scene": "runs.scenes",
     "Split": "core",

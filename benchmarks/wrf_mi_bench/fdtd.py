@@ -27,13 +27,14 @@ from wrf_mi.correction.state import ScenePosterior, material_places
 from wrf_mi.correction.uncertain_phases import UncertainPhases
 from wrf_mi.datasets.registry import data_home
 from wrf_mi.receivers.channel import rssi_dbm
-from wrf_mi.receivers.instruments import ChannelInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import Materials
 from wrf_mi.scene.mesh.files import mesh_parts
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.stages.correct import correct_scene
+from wrf_mi.tasks import CSI
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.options import TraceOptions
 from wrf_mi.tracing.paths.solve import Prepared
@@ -131,7 +132,7 @@ def toy_record(channels: Complex, frequencies_hz: FloatArray) -> tuple[Record, S
     noisy = truth + deviation * (rng.normal(size=truth.shape) + 1j * rng.normal(size=truth.shape))
     record = Record(
         NAME,
-        "csi",
+        CSI,
         np.repeat(positions, READINGS, axis=0),
         (station,),
         noisy[None].astype(np.complex64),
@@ -158,7 +159,7 @@ def scene_of(model: Path, folder: Path, constants: Mapping[str, float]) -> Path:
 
 def traced(scene: Path, record: Record, options: TraceOptions = OPTIONS) -> tuple[Complex, FloatArray]:
     """Channels [3, n] that ray tracing gives for the receivers, and sums of path powers [3], dB."""
-    tracer = RayTracer(scene, ChannelInstrument(record.receivers, WIDE_HZ), options)
+    tracer = RayTracer(scene, Instrument("csi", record.receivers, WIDE_HZ), options)
     paths = tracer.trace(record.tx_pos_m[::READINGS])
     return np.asarray(tracer.observe(paths), complex)[0], rssi_dbm(paths.paths)[0]
 

@@ -22,12 +22,12 @@ from wrf_mi_scenes.random_rooms import GAP_M, RandomRoom, random_room
 import wrf_mi
 from wrf_mi.core import Record
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.receivers.instruments import SpectrumInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.runs.run import Run
 from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.scene.edit import Move, edit_scene, parts_within
 from wrf_mi.synthetic.searches import free_positions
-from wrf_mi.tasks import TASKS, instrument_of
+from wrf_mi.tasks import SPECTRUM, TASKS, instrument_of
 from wrf_mi.tasks.scores import bootstrap
 from wrf_mi.tracing.sionna.scenes import open_scene
 from wrf_mi.tracing.tracer import RayTracer
@@ -101,7 +101,7 @@ def furnished(seed: int, folder: Path) -> Room:
     scene, apart = open_scene(both, CARRIER_HZ), (np.array(room.station_m), FROM_STATION_M)
     positions_m = free_positions(scene, bounds, POOL + TEST, CLEAR_M, rng, seed, apart)
     carriers_hz = np.array([CARRIER_HZ])
-    instrument = SpectrumInstrument((array_at(channels.receivers[0], CARRIER_HZ),), carriers_hz, size=SIZE)
+    instrument = Instrument("array", (array_at(channels.receivers[0], CARRIER_HZ),), carriers_hz, size=SIZE)
 
     def record(scene: Path, train_m: FloatArray) -> Record:
         places_m = np.concatenate([train_m, positions_m[-TEST:]])
@@ -109,7 +109,7 @@ def furnished(seed: int, folder: Path) -> Room:
         rows, count = np.arange(len(places_m)), len(train_m)
         split = rows[:count], rows[count:]
         return Record(
-            scene.name, "spectrum", places_m, instrument.receivers, spectra, official=split, frequencies_hz=carriers_hz
+            scene.name, SPECTRUM, places_m, instrument.receivers, spectra, official=split, frequencies_hz=carriers_hz
         )
 
     before = record(true, channels.tx_pos_m[:BEFORE])

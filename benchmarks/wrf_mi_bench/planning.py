@@ -29,7 +29,7 @@ from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.scene.make import make_scene
 from wrf_mi.stages.strengths import SMOOTH_M, SPACING_M, TRACE
 from wrf_mi.synthetic.stored import SCAN
-from wrf_mi.tasks import task_of
+from wrf_mi.tasks import RSSI
 from wrf_mi.tasks.scores import bootstrap
 from wrf_mi.tracing.power_map import trace_map
 from wrf_mi.tracing.sionna.scenes import open_scene
@@ -62,7 +62,7 @@ class Place:
     def score(self, rows: IntArray) -> float:
         """Mean over test rows and receivers of a model that is fitted to rows."""
         truth = self.record.observation[:, self.test]
-        return float(np.nanmean(task_of(self.record).of_rows(self.fit(rows), truth)))
+        return float(np.nanmean(self.record.task.of_rows(self.fit(rows), truth)))
 
 
 def _drawn(record: Record, in_scene: bool) -> tuple[Record, IntArray, IntArray]:
@@ -117,7 +117,7 @@ def _room(seed: int, folder: Path) -> Place:
     power_mw = np.square(np.abs(record.observation)).mean(axis=-1)  # of 80 MHz, for 0 dBm sent
     assert record.frequencies_hz is not None
     carrier_hz = record.frequencies_hz.mean(keepdims=True)
-    strengths = replace(record, task="rssi", truth=None, observation=10 * np.log10(power_mw), frequencies_hz=carrier_hz)
+    strengths = replace(record, task=RSSI, truth=None, observation=10 * np.log10(power_mw), frequencies_hz=carrier_hz)
     return _strengths(strengths, scan)
 
 
@@ -166,7 +166,7 @@ def measure(name: str) -> dict[str, Any]:
     for rule in RULES:
         errors[rule] = [scores_of(place, rule, start) for start in STARTS]
         say("plan", f"{name}, {rule}: " + ", ".join(f"{score:.3g}" for score in np.mean(errors[rule], axis=0)))
-    return {"errors": errors, "higher_is_better": task_of(place.record).higher_is_better}
+    return {"errors": errors, "higher_is_better": place.record.task.higher_is_better}
 
 
 def row_of(name: str, part: Mapping[str, Any]) -> dict[str, Any]:

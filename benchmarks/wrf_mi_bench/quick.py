@@ -143,7 +143,9 @@ def _alone() -> tuple[Call, Call]:
     """
     receivers, carrier = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),), np.array([FREQUENCY_HZ])
     known, split = record(20, receivers=receivers, frequencies_hz=carrier), make_splits(record(20), "random")[0]
-    config = with_settings(calibration_config(["gain", "materials"], images=True), ["steps=100000", *ONLY_STEPS])
+    config = with_settings(
+        calibration_config(["gain", "materials"], known.task.settings_of_paths), ["steps=100000", *ONLY_STEPS]
+    )
     trainer = Trainer(known, split, config, scene=open_scene("laboratory", FREQUENCY_HZ))
     graph, targets, batch = trainer.graph, trainer.plan.targets, trainer.schedule.rows[0]
     side = graph.trace(known.tx_pos_m, 0)[0]

@@ -18,11 +18,12 @@ from wrf_mi.core import Receiver, Record
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.array_files import write_arrays
-from wrf_mi.receivers.instruments import ChannelInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.scan import simulate_scan
 from wrf_mi.synthetic.floor_channels import with_noise
 from wrf_mi.synthetic.searches import free_positions
+from wrf_mi.tasks import CSI
 from wrf_mi.tracing.options import TraceOptions
 from wrf_mi.tracing.sionna.scenes import open_scene
 from wrf_mi.tracing.tracer import RayTracer
@@ -74,14 +75,14 @@ def random_room_record(
     positions = free_positions(scene, bounds, count, CLEAR_M, rng, seed, (station, FROM_STATION_M))
     record = Record(
         f"random-room-{seed}",
-        "csi",
+        CSI,
         positions,
         (Receiver("access-point", station, np.array(UPRIGHT)),),
         np.zeros((1, count, len(subcarriers_hz)), np.complex64),
         official=(np.arange(survey.train), np.arange(survey.train, count)),
         frequencies_hz=subcarriers_hz,
     )
-    channel = RayTracer(true.parent, ChannelInstrument(record.receivers, subcarriers_hz), OPTIONS)(positions)[0]
+    channel = RayTracer(true.parent, Instrument("csi", record.receivers, subcarriers_hz), OPTIONS)(positions)[0]
     noisy = with_noise(channel[:, None], SNR_DB, np.random.default_rng([seed, 2]))[:, 0]
     poses = free_positions(scene, bounds, POSES, SCANNER_CLEAR_M, rng, seed)
     scan = write_arrays(folder / "scan.npz", {"points": _scan(true, poses, seed, survey).astype(np.float32)})

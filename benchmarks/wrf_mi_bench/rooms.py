@@ -24,10 +24,10 @@ from wrf_mi.core import Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.correction import write_page
 from wrf_mi.datasets import make_splits
-from wrf_mi.receivers.instruments import SpectrumInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.stages.correct import correct_scene
-from wrf_mi.tasks import TASKS, instrument_of, task_of
+from wrf_mi.tasks import TASKS, instrument_of
 from wrf_mi.tracing import TraceResult
 from wrf_mi.tracing.options import TraceOptions
 from wrf_mi.tracing.sionna.path_solver import sionna_diffraction
@@ -50,7 +50,7 @@ ASKED_DB = 3.0  # least median gain of the corrected scene
 
 def clipped_cea_db(prediction: NDArray[Any], truth: NDArray[Any], record: Record) -> float:
     """Mean over rows of the CEA of channels [n, subcarriers], limited to `LIMITS_DB`."""
-    return float(np.clip(task_of(record).score(prediction, truth), *LIMITS_DB).mean())
+    return float(np.clip(record.task.score(prediction, truth), *LIMITS_DB).mean())
 
 
 def disagreement(truth: TraceResult, scan: TraceResult) -> dict[str, float]:
@@ -143,7 +143,7 @@ def measure_phase_errors(seed: int, folder: Path) -> list[list[float]]:
     record, true, scan = random_room_record(seed, folder, PHASE_SURVEY)
     means = []
     for hz in CARRIERS_HZ:
-        instrument = SpectrumInstrument((array_at(record.receivers[0], hz),), np.array([hz]), size=SIZE)
+        instrument = Instrument("array", (array_at(record.receivers[0], hz),), np.array([hz]), size=SIZE)
         tracer = RayTracer(true, instrument, TRUTH)
         with sionna_diffraction():
             truth = tracer.observe(tracer.trace(record.tx_pos_m))[0]

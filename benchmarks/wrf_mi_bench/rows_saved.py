@@ -14,8 +14,7 @@ import numpy as np
 
 from wrf_mi.runs.api import train
 from wrf_mi.synthetic.furnished_room import NAME as ROOM
-from wrf_mi.tasks import TASKS
-from wrf_mi.tasks.task import Task
+from wrf_mi.tasks import TASKS, Task
 
 from .bench import FLAT
 from .comparison import Row, data_folder, kept, line

@@ -19,6 +19,7 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians import FIELDS, Encoding, random_gaussians
 from wrf_mi.gaussians.network import Weights
+from wrf_mi.tasks import SPECTRUM
 from wrf_mi.tasks.losses import ssim as similarity
 from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.config import TrainConfig
@@ -205,7 +206,7 @@ def fits(count: int) -> list[Row]:
     rng = np.random.default_rng(0)
     record = Record(
         "noise",
-        "spectrum",
+        SPECTRUM,
         rng.uniform(-1, 1, (12, 3)),
         (replace(fields.RECEIVER, position_m=np.zeros(3)),),
         rng.uniform(0, 1, (1, 12, *fields.SMALL)).astype(np.float32),

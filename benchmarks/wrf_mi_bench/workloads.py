@@ -13,8 +13,9 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import random_gaussians
 from wrf_mi.gaussians.blend import splat
 from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.receivers.instruments import SpectrumInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
+from wrf_mi.tasks import SPECTRUM
 from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi.training.step import device_pose
@@ -68,11 +69,11 @@ def parameters(model: Any, count: int, size: float) -> dict[str, NDArray[np.floa
 def tracer(options: TraceOptions) -> RayTracer:
     """Ray tracer of the laboratory for spectra of a 4 x 4 array."""
     receivers = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),)
-    instrument = SpectrumInstrument(receivers, np.array([FREQUENCY_HZ]), size=(HEIGHT, WIDTH))
+    instrument = Instrument("array", receivers, np.array([FREQUENCY_HZ]), size=(HEIGHT, WIDTH))
     return RayTracer("laboratory", instrument, options)
 
 
 def record(rows: int, **more: Any) -> Record:
     observation = np.random.default_rng(0).random((1, rows, HEIGHT, WIDTH)).astype(np.float32)
     facts = {"receivers": (RECEIVER,)} | more
-    return Record("random", "spectrum", transmitter_path(rows), observation=observation, **facts)
+    return Record("random", SPECTRUM, transmitter_path(rows), observation=observation, **facts)

@@ -65,7 +65,7 @@ def test_models_of_one_carrier_refuse_several(name: str, flat: Record, one_gatew
     several = one_gateway.at_carriers(np.arange(len(one_gateway)) % 2 + 1.0)
     for record in (flat, several):
         model = MODELS[name]
-        if model.serves(record.task) and model.uplink != "required":
+        if model.serves(record.task.name) and model.uplink != "required":
             message = rf"rows at 2 carriers, .* Hz; {re.escape(name)} serves one carrier"
             refusal(train, record, name, message, out=tmp_path / "run", seed=1)
             assert not (tmp_path / "run").exists()
@@ -200,7 +200,8 @@ def test_reflections_equal_a_trace_at_the_carrier(make: Callable[[Record], Recor
     for carrier in (LOW, HIGH):
         alone = RayTracer(room, instrument_of(record.at_carrier(carrier)), options)(tx)
         own = carriers == carrier
-        np.testing.assert_allclose(found[:, own], alone[:, own], atol=GREY if record.task == "spectrum" else FLOAT32_DB)
+        tolerance = GREY if record.task.name == "spectrum" else FLOAT32_DB
+        np.testing.assert_allclose(found[:, own], alone[:, own], atol=tolerance)
         assert not np.allclose(found[:, ~own], alone[:, ~own], atol=0.05)
 
 

@@ -24,14 +24,14 @@ from wrf_mi.correction.misfit import Misfit
 from wrf_mi.correction.options import PARTS
 from wrf_mi.correction.page import _facts, _picture
 from wrf_mi.datasets import make_splits
-from wrf_mi.receivers.instruments import PowerInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.scene.correction_data import read_correction_data
 from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.folder import read_scene_folder
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.stages.correct import _held_out_ratio, correct_scene
 from wrf_mi.synthetic import load_record
-from wrf_mi.tasks import instrument_of, task_of
+from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT
 from wrf_mi.tracing.paths.solve import Prepared
@@ -221,7 +221,7 @@ def test_corrected_scene_is_a_folder_that_a_plain_trace_opens(corrected):
     test, score = record.official[1], {}
     for name in ("stated", "corrected"):
         tracer = RayTracer(folder / name, instrument_of(record), TraceOptions(transmission=True, depth=3))
-        score[name] = np.median(task_of(record).score(tracer(record.tx_pos_m[test])[0], record.observation[0, test]))
+        score[name] = np.median(record.task.score(tracer(record.tx_pos_m[test])[0], record.observation[0, test]))
     assert score["corrected"] > score["stated"] + 20
     assert len(rt.load_scene(str(folder / "corrected" / "scene.xml"), merge_shapes=False).objects) == 7
     assert {"correction.md", "correction.json", "correction.png"} <= contents(folder / "corrected")
@@ -296,7 +296,7 @@ def test_new_receivers_decide_where_receivers_are_held_out(powers, tmp_path):
     places = [[5.0, 3.5, 2.0], [1.0, 4.0, 2.2], [5.2, 1.0, 1.8], [3.0, 2.5, 2.4], [1.0, 1.0, 2.0], [2.0, 3.9, 1.5]]
     places.append([4.5, 0.6, 2.3])
     receivers = tuple(replace(record.receivers[0], name=f"rx{k}", position_m=np.array(p)) for k, p in enumerate(places))
-    tracer = RayTracer(true, PowerInstrument(receivers, np.array([CARRIER_HZ])), TraceOptions(depth=2, rays=4096))
+    tracer = RayTracer(true, Instrument("power", receivers, np.array([CARRIER_HZ])), TraceOptions(depth=2, rays=4096))
     record = replace(record, receivers=receivers, observation=(tracer(record.tx_pos_m) - 40).astype(np.float32))
     split = make_splits(record, "receiver:0")[0]
     found = correct_scene(scene, record, split, replace(default_options(record), rays=4096, depth=2))

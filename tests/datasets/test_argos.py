@@ -95,7 +95,7 @@ def assert_found(record: Any, symbols: int, frames: Any = slice(None)) -> None:
 
 def test_a_known_channel_is_found_in_the_layout_of_argos(tmp_path: Path) -> None:
     record = load(argos(tmp_path / "trace.hdf5"))
-    assert (record.name, record.task, len(record)) == ("trace", "csi", FRAMES * USERS)
+    assert (record.name, record.task.name, len(record)) == ("trace", "csi", FRAMES * USERS)
     assert record.observation.shape == (1, FRAMES * USERS, ANTENNAS, 26)
     assert record.observation.dtype == np.complex64
     assert np.isnan(record.tx_pos_m).all()

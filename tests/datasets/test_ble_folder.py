@@ -43,7 +43,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_reads_a_folder(folder: Path):
     record = read_ble_folder(folder, "made-up")
-    assert (record.name, record.task, record.source) == ("made-up", "rssi", str(folder))
+    assert (record.name, record.task.name, record.source) == ("made-up", "rssi", str(folder))
     assert [r.name for r in record.receivers] == ["anchor3", "anchor1"]
     np.testing.assert_array_equal(record.receivers[0].position_m, [1.5, 2, 2.5])
     np.testing.assert_array_equal(record.receivers[0].to_world, np.eye(3))
@@ -53,7 +53,7 @@ def test_reads_a_folder(folder: Path):
     np.testing.assert_array_equal(record.tx_heading_rad, [3.1, -40.5, 0, 0, 0.5])
     assert [part.tolist() for part in record.official] == [[0, 1, 2, 3], [4]]
     np.testing.assert_array_equal(record.frequencies_hz, [2.44e9])
-    assert load(folder).task == "rssi"
+    assert load(folder).task.name == "rssi"
     refusal(read_ble_folder, folder / "nothing", r"not a folder; give one that holds receivers\.csv")
     # Rows that no anchor received are in no split.
     (split,) = make_splits(record, "official")

@@ -79,7 +79,7 @@ def test_channels_of_stations_and_sets_of_users_equal_those_of_the_package(tmp_p
 def test_record_has_users_base_station_and_subcarriers(tmp_path: Path) -> None:
     folder = scenario(tmp_path, users=(11,))
     record = load(folder)
-    assert (record.name, record.task, record.source) == ("street", "csi", str(folder))
+    assert (record.name, record.task.name, record.source) == ("street", "csi", str(folder))
     assert record.observation.shape == (1, 11, 1)
     assert record.observation.dtype == np.complex64
     assert np.isnan(record.observation[0, 0]).all()

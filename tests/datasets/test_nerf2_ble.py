@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_reads_a_folder(folder: Path) -> None:
     record = load(folder)
-    assert (record.task, record.source) == ("rssi", str(folder))
+    assert (record.task.name, record.source) == ("rssi", str(folder))
     assert [one.name for one in record.receivers] == ["gateway1", "gateway2"]
     np.testing.assert_array_equal(record.receivers[1].position_m, [4, 5, 6])
     np.testing.assert_array_equal(record.receivers[1].to_world, np.eye(3))

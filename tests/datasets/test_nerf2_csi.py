@@ -40,7 +40,7 @@ def folder(tmp_path: Path) -> Path:
 def test_reads_a_folder(folder: Path) -> None:
     record = load(folder)
     expected = channels().astype(np.complex64)
-    assert (record.task, record.source, len(record)) == ("csi", str(folder), SAMPLES)
+    assert (record.task.name, record.source, len(record)) == ("csi", str(folder), SAMPLES)
     np.testing.assert_array_equal(record.uplink, expected[..., :HALF])
     np.testing.assert_array_equal(record.observation, expected[None, ..., HALF:])
     assert record.observation.dtype == np.complex64

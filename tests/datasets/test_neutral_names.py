@@ -36,7 +36,7 @@ def test_neutral_and_historic_names_give_equal_records(tmp_path: Path):
     neutral = read_ble_folder(folder_of(tmp_path / "a", receivers=RECEIVERS, train=ROWS, test=ROWS))
     historic = {"anchors": RECEIVERS, "calibration_df": ROWS, "test_robot_df": ROWS}
     assert_same(read_ble_folder(folder_of(tmp_path / "b", **historic)), neutral, "name")
-    assert load(tmp_path / "a").task == "rssi"
+    assert load(tmp_path / "a").task.name == "rssi"
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ def test_the_moving_receiver_is_the_records_transmitter(tmp_path: Path):
     arrays = room(11)
     np.savez(tmp_path / "hall.npz", **arrays)
     record = read_newrf(tmp_path / "hall.npz")
-    assert (record.name, record.task) == ("hall", "csi")
+    assert (record.name, record.task.name) == ("hall", "csi")
     np.testing.assert_array_equal(record.tx_pos_m, arrays["rx_pos"])
     (receiver,) = record.receivers
     np.testing.assert_array_equal(receiver.position_m, [1, 2, 3])

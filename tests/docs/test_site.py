@@ -13,7 +13,7 @@ from documents import CHECKOUT, DOCS, blocks
 import wrf_mi
 from wrf_mi import models
 from wrf_mi.apps.checking.scene_findings import KINDS
-from wrf_mi.graph import receivers
+from wrf_mi.receivers import registry as receivers
 
 WORKFLOWS = sorted((CHECKOUT / ".github" / "workflows").glob("*.yml"))
 PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+")
@@ -67,12 +67,12 @@ def test_examples_of_how_to_pages_run(tmp_path, monkeypatch):
         assert wrf_mi.check_data("office").suspicions == ()
         assert wrf_mi.open_run("run").predict([[2.0, 3.0, 1.2]], "kitchen").mean.shape == (1,)
         assert run.metrics["abs_error_db"]["median"] < 5
-        kind = receivers.receiver_kind("power-pixel", "spectrum")
+        kind = receivers.receiver_model("power-pixel", "spectrum")
         form = receivers.Form("power-pixel", (4, 8))
-        assert kind.make(form, run.record.receivers[0]).how == "power"
+        assert kind.of(form, run.record.receivers[0]).how == "power"
         assert names["main"]()["rows"]
     finally:
-        for registry, known in ((models.MODELS, before[0]), (receivers._RECEIVERS, before[1])):
+        for registry, known in ((models.MODELS, before[0]), (receivers.RECEIVERS, before[1])):
             for name in set(registry) - known:
                 del registry._known[name]
 

@@ -85,7 +85,7 @@ def test_scenario_of_deepmimo_is_a_data_set(run: Path, tmp_path: Path) -> None:
     export(run, "deepmimo", tmp_path / "scenario", ExportOptions(replace=True))
     (tmp_path / "scenario" / "channel_params.yml").write_text("base_stations: all\n")
     record = load(tmp_path / "scenario")
-    assert (record.task, len(record), len(record.receivers)) == ("csi", 30, 2)
+    assert (record.task.name, len(record), len(record.receivers)) == ("csi", 30, 2)
 
 
 def test_damaged_tables_are_refused(run: Path, tmp_path: Path, capsys: Any) -> None:

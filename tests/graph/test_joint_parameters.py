@@ -17,7 +17,7 @@ from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import with_settings
 from wrf_mi.receivers.receiver_models import PowerReceiver
-from wrf_mi.tasks import instrument_of, task_of
+from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.sionna.materials import BELOW_1_GHZ
@@ -261,15 +261,15 @@ def thirds(record):
 
 
 def trained(record, scene, *settings):
-    own = {"spectrum": SPECTRA, "csi": CHANNELS}.get(record.task, ())
-    config = with_settings(default_config(record.task), [*SETTINGS, *own, *settings])
+    own = {"spectrum": SPECTRA, "csi": CHANNELS}.get(record.task.name, ())
+    config = with_settings(default_config(record.task.name), [*SETTINGS, *own, *settings])
     opened = None if scene is None else open_scene(scene, FREQUENCY_HZ)
     return fit_curriculum(FitPlan(record, thirds(record), config, scene=opened))
 
 
 def score(record, trainer):
     """Median score on the test rows, the higher the better."""
-    rows, task = thirds(record).test, task_of(record)
+    rows, task = thirds(record).test, record.task
     found = np.stack([trainer.predictor()(record.tx_pos_m[rows], r) for r in range(2)])
     value = float(np.median(task.of_rows(found, record.observation[:, rows])))
     return value if task.higher_is_better else -value

@@ -17,15 +17,14 @@ from wrf_mi_plugins.ray_response import ray_footprints
 from wrf_mi.backend.device import on_device, to_tensor
 from wrf_mi.core import InputError, Record, pixel_directions
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.core.registry import resolve
 from wrf_mi.core.settings import with_settings
 from wrf_mi.gaussians import Encoding, WrfGs, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.footprint import depth_order
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.evaluations import EVALUATIONS
 from wrf_mi.graph.graph import Batch, Graph
-from wrf_mi.graph.receivers import Form
 from wrf_mi.graph.settings import TracedConfig
+from wrf_mi.receivers.registry import Form
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.tasks.scores import ssim
 from wrf_mi.tracing.paths.instrument_parameters import pose_names, receiver_pose
@@ -141,7 +140,7 @@ def test_traced_pose_gradient_matches_splatting_for_small_gaussians():
     weights = np.random.default_rng(3).uniform(0.5, 1.5, 3 * FINE[0] * FINE[1])
 
     def greys(name):
-        evaluate = resolve(EVALUATIONS[name])(None, TracedConfig())
+        evaluate = EVALUATIONS[name](None, TracedConfig())
 
         def of(params):
             re, im = evaluate(gaussians, receiver_pose(RECEIVERS[0], params, mi.Float), plane, False, params)

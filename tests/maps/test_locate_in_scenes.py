@@ -20,7 +20,7 @@ from wrf_mi.apps.maps.locate_calibration import FILE, FOLDER, predict_candidates
 from wrf_mi.core import Prediction, Record
 from wrf_mi.datasets import write_ble_folder
 from wrf_mi.models import Inputs
-from wrf_mi.receivers.instruments import PowerInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.run import Run
 from wrf_mi.scene.folder import write_scene
@@ -58,7 +58,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     receivers = tuple(
         receiver(at, f"anchor{number}") for number, at in enumerate(((0.4, 0.6, 2.2), (5.6, 1.0, 2.4), (2.9, 4.6, 2.0)))
     )
-    traced = np.asarray(RayTracer(scene, PowerInstrument(receivers, HZ), PLAIN)(tx_pos_m), float)
+    traced = np.asarray(RayTracer(scene, Instrument("power", receivers, HZ), PLAIN)(tx_pos_m), float)
     observed = traced + rng.normal(0, NOISE_DB, traced.shape)
     known = {"frequencies_hz": HZ, "official": (np.arange(TRAINED), np.arange(TRAINED, ROWS))}
     record = Record("room", "rssi", tx_pos_m, receivers, observed.astype(np.float32), **known)

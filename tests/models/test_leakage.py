@@ -49,7 +49,7 @@ def fitted_arrays(name: str, record: Record, split: Split, folder: Path) -> Arra
     if MODELS[name].scene == "required":
         scene = str(folder / "room.ply")
         trimesh.creation.box((20, 20, 10)).export(scene)
-    entry = MODELS[name].serving(record.task, scene is not None)
+    entry = MODELS[name].serving(record.task.name, scene is not None)
     given = {"model": name, "seed": 0, "deterministic": True}
     settings = default_settings(entry, SETTINGS.get(name, ()), given)
     problem = Problem(record, settings, 0, scene, None if scene is None else "concrete")

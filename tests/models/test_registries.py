@@ -22,8 +22,8 @@ from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.registry import Registry
 from wrf_mi.datasets import load
 from wrf_mi.datasets.ble_folder import write_ble_folder
-from wrf_mi.graph import receivers
-from wrf_mi.graph.receivers import RECEIVERS
+from wrf_mi.receivers import registry as receivers
+from wrf_mi.receivers.registry import RECEIVERS
 from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
 from wrf_mi.runs.compare import compare
 from wrf_mi.stages.further import FURTHER_STAGES
@@ -31,6 +31,7 @@ from wrf_mi.tasks import LOSSES
 
 SETTINGS = ("steps=60", "batch=8", "validate_every=20", "checkpoint_every=20", "initial.gaussians=6")
 SETTINGS += ("network.layers=2", "network.width=8", "view.height=4", "view.columns=8", "deterministic=true")
+FIELD_DB = 50.0  # field strength at one metre
 SERVED = {"trees": "rssi", "wrf-gs": "spectrum, rssi and csi", "factorised": "spectrum, rssi and csi"}
 """Tasks of models that do not serve a task of others."""
 
@@ -54,7 +55,7 @@ def nearest() -> Iterator[None]:
 
 @pytest.fixture
 def attenuated() -> Iterator[None]:
-    yield from registered("attenuators", ATTENUATORS, "ATTENUATED", receivers, receivers._RECEIVERS)
+    yield from registered("attenuators", ATTENUATORS, "Attenuated", receivers, receivers.RECEIVERS)
 
 
 def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, flat_folder, tmp_path, capsys) -> None:
@@ -194,6 +195,10 @@ def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[
     table = np.column_stack([places, delay_ns])
     np.savetxt(data / "delays.csv", table, "%.4f", ",", header="x,y,z,delay_ns", comments="")
     (folder / "tx.csv").write_text("x,y,z\n1,2,1\n3,1,2\n")
+    fields = folder / "fields"
+    fields.mkdir()
+    table[:, 3] = FIELD_DB - 20 * np.log10(np.linalg.norm(places - [0, 0, 2], axis=1))
+    np.savetxt(fields / "fields.csv", table, "%.4f", ",", header="x,y,z,field_db", comments="")
     words = [word for setting in SETTINGS for word in ("--set", setting)]
     asked = ["--model", "wrf-gs+", "--receiver-model", "attenuated", "--json", *words, "--out", folder / "attenuated"]
     nearest = ["--model", "nearest", "--set", "neighbours=1", "--json", "--out", folder / "nearest"]
@@ -206,6 +211,7 @@ def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[
             "nearest": ["train", flat_folder, *nearest],
             "receiver": ["train", flat_folder, "--model", "wrf-gs+", *asked],
             "loss": ["train", flat_folder, "--model", "wrf-gs+", *by_loss],
+            "field": ["train", fields, "--model", "wrf-gs+", "--json", *words, "--out", folder / "field"],
             "stage": ["train", write_ble_folder(folder / "steps", in_steps()), "--out", folder / "stage", "--json"],
         },
     )
@@ -216,10 +222,12 @@ def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[
         "nearest/metrics.json",
         "nearest/predictions.npz",
         "idw/metrics.json",
+        "field/model.npz",
+        "field/metrics.json",
     ):
         (folder / name).unlink()  # as of runs that were stopped
     calls = {"benchmark": ["bench", "attenuator", "--out", folder / "results", "--runs", folder / "benchmarks"]}
-    for run, of in (("nearest", "nearest"), ("idw", "kriging"), ("stage", "stage")):
+    for run, of in (("nearest", "nearest"), ("idw", "kriging"), ("stage", "stage"), ("field", "field")):
         calls |= {
             f"{run} resumed": ["train", "--resume", folder / run, "--json"],
             f"{run} scored": ["evaluate", folder / run, "--json"],
@@ -263,6 +271,17 @@ def test_commands_find_the_stage_of_an_installed_package(outcome: Any) -> None:
     assert errors[0] == errors[1] == errors[2]
     with np.load(folder / "stage.npz") as predicted:
         np.testing.assert_array_equal(predicted["prediction"] % 4, 0)
+
+
+def test_commands_train_gaussians_on_the_task_and_receiver_of_an_installed_package(outcome: Any) -> None:
+    folder, results = outcome
+    asked = [f"field{how}" for how in ("", " resumed", " scored", " predicted", " compared")]
+    assert [results[name][0] for name in asked] == [0] * 5, results
+    errors = [json.loads(results[name][1])["abs_error_db"] for name in asked[:3]]
+    assert errors[0] == errors[1] == errors[2]
+    with np.load(folder / "field.npz") as predicted:
+        # Of the power of the Gaussians, which is far below, and the meter's factor.
+        assert predicted["prediction"] == pytest.approx(FIELD_DB, abs=30)
 
 
 def test_commands_find_the_task_and_the_layout_of_an_installed_package(outcome: Any) -> None:

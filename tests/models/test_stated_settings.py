@@ -114,7 +114,7 @@ def request(model: str, texts: list[str]) -> RunRequest:
 
 def quick_settings(model: str, record: Record) -> dict[str, str]:
     """Quick settings by name, but for those that have no effect on the data."""
-    texts = (*QUICK.get(model, ()), *(QUICK_SPECTRA if (model, record.task) == ("kriging", "spectrum") else ()))
+    texts = (*QUICK.get(model, ()), *(QUICK_SPECTRA if (model, record.task.name) == ("kriging", "spectrum") else ()))
     settings = dict(text.split("=") for text in texts)
     while refused := refused_setting(model, record, settings):
         del settings[refused]
@@ -184,7 +184,7 @@ def read_settings(monkeypatch: pytest.MonkeyPatch) -> set[tuple[type, str]]:
 
 
 def cases(models: Any, records: Any) -> list[Any]:
-    tasks = {name: RECORDS[name]().task for name in records}
+    tasks = {name: RECORDS[name]().task.name for name in records}
     return [
         pytest.param(model, name, id=f"{model}-{name}")
         for model in models

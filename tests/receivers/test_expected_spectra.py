@@ -9,15 +9,15 @@ from random_paths import paths_of
 from wrf_mi.core import Paths, Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.paths import ARRAYS
-from wrf_mi.receivers.instruments import SpectrumInstrument
+from wrf_mi.receivers.instruments import Instrument
 
 CARRIER_HZ, SIZE = 2.4e9, (12, 36)
 RX = Receiver("rx", np.zeros(3), np.array([0.0, 0, 0, 1]), array_m=planar_array(4, 4, 0.06))
 EXPECTATION = 0.03  # mean difference of 16 draws from 1,024; greys of 0..1
 
 
-def instrument(phase_error: float) -> SpectrumInstrument:
-    return SpectrumInstrument((RX,), np.array([CARRIER_HZ]), size=SIZE, phase_error=phase_error)
+def instrument(phase_error: float) -> Instrument:
+    return Instrument("array", (RX,), np.array([CARRIER_HZ]), size=SIZE, phase_error=phase_error)
 
 
 def made_paths(seed: int, n_tx: int = 5, each: int = 6) -> Paths:

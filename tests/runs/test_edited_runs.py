@@ -20,7 +20,7 @@ from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import write_spectrum_folder
 from wrf_mi.receivers.device_paths import TracedPaths
-from wrf_mi.receivers.instruments import Instrument, PowerInstrument, SpectrumInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.scene.edit import Move, edit_scene
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import Materials
@@ -68,7 +68,7 @@ def measured(scene: Path, instrument: Instrument, task: str) -> tuple[Record, Sp
 
 @pytest.fixture(scope="module")
 def spectra(scene: Path) -> tuple[Record, Split]:
-    record, split = measured(scene, SpectrumInstrument((ARRAY,), HZ, size=(12, 24)), "spectrum")
+    record, split = measured(scene, Instrument("array", (ARRAY,), HZ, size=(12, 24)), "spectrum")
     return replace(record, observation=record.observation.astype(np.float32)), split
 
 
@@ -86,7 +86,7 @@ def test_predictions_in_a_copy_of_the_scene_are_equal_and_in_an_edited_one_are_n
 
 
 def test_strengths_keep_what_was_measured_beyond_the_traced_power(scene: Path, tmp_path: Path) -> None:
-    record, split = measured(scene, PowerInstrument((replace(ARRAY, array_m=None),), HZ), "rssi")
+    record, split = measured(scene, Instrument("power", (replace(ARRAY, array_m=None),), HZ), "rssi")
     # Six decibels more than traced, which the traced scene cannot know, are known in the edited one.
     record = replace(record, observation=record.observation + 6)
     run = wrf_mi.train(record, "hybrid", scene, split=split, settings=("stages=mean",))

@@ -65,7 +65,7 @@ class Off:
 
     def __call__(self, rows: np.ndarray, receiver: int) -> np.ndarray:
         observed = self.truth.observation[receiver, rows]
-        if self.truth.task == "csi":
+        if self.truth.task.name == "csi":
             return observed * (1 + 0.1j)
         return np.where(np.isnan(observed), -30.0, observed + 1 + receiver)
 

@@ -23,7 +23,7 @@ from wrf_mi.datasets import load, load_split, make_splits, save_split, write_spe
 from wrf_mi.runs.api import Interrupted, Run, evaluate_run, open_run, resume, train
 from wrf_mi.runs.folder import FORMAT
 from wrf_mi.tasks.scores import ssim
-from wrf_mi.tasks.task import Spectrum
+from wrf_mi.tasks.spectrum import Spectrum
 from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.checkpoint import read_checkpoint
 from wrf_mi.training.config import TrainConfig

@@ -16,7 +16,7 @@ from wrf_mi_scenes.random_rooms import random_room
 from wrf_mi.core import InputError, Receiver
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.antenna import UPRIGHT
-from wrf_mi.receivers.instruments import ChannelInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.scene.edit import Move, box_of, edit_scene, parts_within, read_surfaces
 from wrf_mi.scene.folder import read_scene_folder, write_scene
 from wrf_mi.scene.hidden import boxes, with_hidden_faces
@@ -63,7 +63,7 @@ def test_moved_part_gives_the_channels_of_the_room_measured_anew(scene, tmp_path
     true = room_folder(tmp_path / "true", moved)
     edited = edit_scene(scene, tmp_path / "edited", [Move((CABINET,), SHIFT_M, TURN_DEG)])
     receiver = Receiver("station", np.array(random_room(103).station_m), np.array(UPRIGHT))
-    instrument = ChannelInstrument((receiver,), np.array([2.44e9]))
+    instrument = Instrument("csi", (receiver,), np.array([2.44e9]))
     options = TraceOptions(transmission=True, depth=2, rays=1 << 14)
     positions = np.array([[1.1, 0.5, 0.9], [2.9, 3.0, 1.1], [5.0, 1.5, 0.7], [0.4, 1.8, 1.3]])
     before, after, new = (RayTracer(folder, instrument, options)(positions) for folder in (scene, edited, true))

@@ -53,7 +53,7 @@ def test_data_are_stored_and_reproducible(record: Record, tmp_path: Path) -> Non
 
 def test_record_has_the_stated_shapes_and_splits(record: Record) -> None:
     rows = len(PLACES["flat"]().routes) * SMALL.places
-    assert (record.name, record.task, len(record)) == ("traced-csi-flat", "csi", rows)
+    assert (record.name, record.task.name, len(record)) == ("traced-csi-flat", "csi", rows)
     assert record.observation.shape == record.truth.shape == (1, *record.uplink.shape) == (1, rows, 6, 26)
     assert record.has_positions
     assert np.abs(record.truth).max(axis=(0, 2, 3)).min() > 0

@@ -50,7 +50,7 @@ def traced(scene_folder: Path) -> TraceResult:
 
 
 def test_record_has_the_stated_rows_and_receivers(record: Record) -> None:
-    assert (record.name, record.task) == ("traced-floor-receivers", "rssi")
+    assert (record.name, record.task.name) == ("traced-floor-receivers", "rssi")
     assert record.observation.shape == (6, 12)
     assert [receiver.name for receiver in record.receivers] == [f"anchor{k}" for k in range(1, 7)]
     np.testing.assert_array_equal(record.frequencies_hz, [CARRIER_HZ])
@@ -121,7 +121,7 @@ def test_specular_paths_are_those_of_a_search_without_scattering(traced: TraceRe
 
 def test_channels_have_the_same_paths(traced: TraceResult, tmp_path: Path) -> None:
     record = traced_floor_channels(tmp_path, SMALL)
-    assert (record.name, record.task) == ("traced-floor-receivers-csi", "csi")
+    assert (record.name, record.task.name) == ("traced-floor-receivers-csi", "csi")
     assert record.observation.shape == (6, 12, 16)
     np.testing.assert_allclose(record.frequencies_hz, CARRIER_HZ + np.arange(16) * 1.25e6)
     np.testing.assert_allclose(record.tx_pos_m, traced.tx_pos_m, rtol=1e-6)

@@ -119,7 +119,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_rows_are_positions_times_carriers(record: Record) -> None:
-    assert (record.name, record.task) == ("traced-room-bands", "spectrum")
+    assert (record.name, record.task.name) == ("traced-room-bands", "spectrum")
     assert record.observation.shape == (2, 12, 9, 36)
     assert record.observation.min(axis=(2, 3)).max() == 0
     assert record.observation.max(axis=(2, 3)).min() == 1

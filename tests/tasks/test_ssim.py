@@ -14,7 +14,7 @@ from wrf_mi.backend.device import on_device, to_float
 from wrf_mi.core import InputError
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.losses import spectrum_loss, ssim
-from wrf_mi.tasks.task import SCORED_TOGETHER
+from wrf_mi.tasks.spectrum import SCORED_TOGETHER
 
 Float64 = dr.float64_array_t(mi.Float)
 

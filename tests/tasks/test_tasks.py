@@ -1,5 +1,7 @@
 """Tasks and layouts: their registry, and what is refused."""
 
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.datasets import layouts
-from wrf_mi.tasks import TASKS, instrument_of, require, task_of
+from wrf_mi.tasks import TASKS, instrument_of, require
 
 
 def record(task: str, shape: tuple[int, ...]) -> Record:
@@ -20,7 +22,7 @@ def test_tasks_have_their_names_and_unknown_tasks_and_instruments_without_arrays
     assert set(TASKS) >= {"spectrum", "rssi", "csi"}
     assert len({task.block for task in TASKS.values()}) == len(TASKS)
     with pytest.raises(InputError, match="made: task 'sound'; known are spectrum, rssi, csi"):
-        task_of(record("sound", (1, 2)))
+        assert record("sound", (1, 2)).task
     with pytest.raises(InputError, match="made: holds rssi; spectra are needed"):
         require(record("rssi", (1, 2)), "spectrum", why="spectra are needed")
     with pytest.raises(InputError, match="antenna array unknown"):
@@ -28,6 +30,14 @@ def test_tasks_have_their_names_and_unknown_tasks_and_instruments_without_arrays
     with pytest.raises(InputError, match="antennas' positions unknown"):
         instrument_of(record("csi", (1, 2, 4, 3)))
     assert instrument_of(record("spectrum", (1, 2, 8, 8)).with_array(np.zeros((4, 3)))).carrier_hz == 1
+
+
+def test_record_has_the_registered_task_of_its_name() -> None:
+    strengths = record("rssi", (1, 2))
+    assert strengths.task is TASKS["rssi"]
+    for same in (pickle.loads(pickle.dumps(strengths)), replace(strengths, name="other")):
+        assert same.task is TASKS["rssi"]
+    assert replace(strengths, task=TASKS["csi"]).task is TASKS["csi"]
 
 
 def test_layout_is_recognised_by_files(tmp_path: Path) -> None:

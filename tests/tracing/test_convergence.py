@@ -14,7 +14,7 @@ from traced_rooms import FREQUENCY_HZ, PARTITION, inside, receiver, room
 from wrf_mi.core import InputError, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receivers import rssi_dbm
-from wrf_mi.receivers.instruments import SpectrumInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.runs.api import train
 from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.tracing.convergence import choose_options, remainder
@@ -93,7 +93,7 @@ def test_run_states_its_convergence(shoebox_xml, tmp_path):
 def test_error_of_spectra_is_within_the_target(shoebox):
     """Waves interfere at an array: spectra are judged beside power, also at a position outside the sample."""
     array_m, tx, target_db = planar_array(4, 4, 0.5 * speed_of_light / FREQUENCY_HZ), inside(3), 4.0
-    instrument = SpectrumInstrument((replace(RX, array_m=array_m),), np.array([FREQUENCY_HZ]), size=(18, 36))
+    instrument = Instrument("array", (replace(RX, array_m=array_m),), np.array([FREQUENCY_HZ]), size=(18, 36))
     by_power = choose_options(shoebox, tx[:2], RX, target_db, PLAIN, kinds=())
     choice = choose_options(shoebox, tx[:2], RX, target_db, PLAIN, kinds=(), spectra=instrument.observe)
     assert (by_power.judged_by, by_power.spectrum_error) == (("power",), None)

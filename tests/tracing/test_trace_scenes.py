@@ -18,7 +18,7 @@ from wrf_mi.core import InputError
 from wrf_mi.correction import default_options
 from wrf_mi.correction.page import write_page
 from wrf_mi.datasets.splits import make_splits
-from wrf_mi.receivers.instruments import PowerInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.scene.coordinates import Y_UP
 from wrf_mi.scene.edit import Move, edit_scene
 from wrf_mi.scene.folder import write_scene
@@ -165,7 +165,7 @@ def test_number_of_rays_for_an_antenna_behind_its_wall_converges_before_it(tmp_p
     write_xml(tmp_path, SHOEBOX)
     tx, options = np.array([[1.0, 2, 1], [3.0, 4, 2]]), TraceOptions(depth=2, rays="auto")
     carrier_hz = np.array([FREQUENCY_HZ])
-    before, behind = (PowerInstrument((receiver([x, 2.5, 1.3]),), carrier_hz) for x in (1e-4, -2e-3))
+    before, behind = (Instrument("power", (receiver([x, 2.5, 1.3]),), carrier_hz) for x in (1e-4, -2e-3))
     wanted, found = (RayTracer(tmp_path / "scene.xml", side, options).rays(tx) for side in (before, behind))
     assert found == wanted
 

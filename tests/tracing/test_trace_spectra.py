@@ -16,7 +16,7 @@ from wrf_mi.core import Antenna, InputError, Receiver, azimuth_elevation, rotati
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import make_splits, registry
 from wrf_mi.receivers import antenna_csi
-from wrf_mi.receivers.instruments import SpectrumInstrument
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.synthetic import laboratory_record, load_record, stored
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tracing import TraceOptions, open_scene, set_frequency, trace_paths
@@ -77,7 +77,7 @@ def test_signals_and_spectra_in_free_space(turn_deg):
     elements = receiver.position_m + ARRAY_M @ receiver.to_world.T
     expected = spherical(np.linalg.norm(positions[:, None] - elements, axis=-1))
     np.testing.assert_allclose(antenna_csi(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0, ..., 0], expected, rtol=SINGLE)
-    instrument = SpectrumInstrument((replace(receiver, array_m=ARRAY_M),), np.array([FREQUENCY_HZ]))
+    instrument = Instrument("array", (replace(receiver, array_m=ARRAY_M),), np.array([FREQUENCY_HZ]))
     spectrum = instrument.observe(paths)[0]
     assert (spectrum.dtype, spectrum.shape) == (np.float32, (2, 90, 360))
     for image in spectrum:

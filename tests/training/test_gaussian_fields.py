@@ -72,7 +72,7 @@ def halves(record, validation=6):
 
 
 def config(record, *settings):
-    return with_settings(default_config(record.task), [*SMALL, *settings])
+    return with_settings(default_config(record.task.name), [*SMALL, *settings])
 
 
 def fitted(record, split, *settings):

@@ -12,9 +12,9 @@ import wrf_mi
 from wrf_mi.core import Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.graph.graph import Graph
-from wrf_mi.graph.receivers import Form
 from wrf_mi.graph.settings import TracedConfig
-from wrf_mi.receivers.instruments import PowerInstrument, SpectrumInstrument
+from wrf_mi.receivers.instruments import Instrument
+from wrf_mi.receivers.registry import Form
 from wrf_mi.tasks.conditions import scene_carrier
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.tracer import RayTracer
@@ -47,7 +47,7 @@ def second():
 
 def spectra(xml, count=12):
     """Spectra of each transmitter at each carrier, traced."""
-    tracer = RayTracer(xml, SpectrumInstrument((array(),), np.array([CARRIERS_HZ[0]]), size=SIZE), OPTIONS)
+    tracer = RayTracer(xml, Instrument("array", (array(),), np.array([CARRIERS_HZ[0]]), size=SIZE), OPTIONS)
     carriers = np.repeat(CARRIERS_HZ, count)
     traced = tracer.trace(np.tile(transmitters(count), (len(CARRIERS_HZ), 1)), carriers_hz=carriers)
     observed = tracer.observe(traced).astype(np.float32)
@@ -82,7 +82,7 @@ def test_ports_report_what_a_graph_of_each_carrier_reports(model, tolerance, xml
 @pytest.mark.parametrize("count", [1, 5])
 def test_spectra_of_uncertain_phases_are_the_expectation_of_the_tracer(count, xml):
     """Of several transmitters, and of one, whose report is recorded; both differ from those of certain phases."""
-    instrument = SpectrumInstrument((array(),), np.array([CARRIERS_HZ[1]]), size=SIZE, phase_error=1.0)
+    instrument = Instrument("array", (array(),), np.array([CARRIERS_HZ[1]]), size=SIZE, phase_error=1.0)
     tracer, graph = RayTracer(xml, instrument, OPTIONS), graph_of(xml, MIDDLE)
     expected = tracer.observe(tracer.trace(transmitters(count)))[0]
     certain, found = (Predictor(graph, {}, phase_error=sd)(transmitters(count), 0) for sd in (0.0, 1.0))
@@ -120,7 +120,7 @@ def test_paths_are_searched_once_for_all_carriers(xml, searches):
     split = Split("own", 0, np.r_[0:8, 12:18, 23:28], np.array([8, 18, 28]), np.array([9, 19, 29]))
     trained = np.unique(record.tx_pos_m[split.all_train], axis=0)
     settings = "traced.rays=4096", "traced.depth=2", "traced.reflections=2", "steps=20"
-    config = with_settings(calibration_config(["gain"], images=True), settings)
+    config = with_settings(calibration_config(["gain"], record.task.settings_of_paths), settings)
     scene = open_scene(xml, scene_carrier(record, split.all_train))
     searches.clear()
     trainer = Trainer(record, split, config, scene=scene)
@@ -135,7 +135,7 @@ def test_paths_are_searched_once_for_all_carriers(xml, searches):
 
 def test_strengths_at_ports_are_those_of_the_tracer(xml):
     rows = np.array([*CARRIERS_HZ, BETWEEN_HZ]).repeat(3)
-    tracer = RayTracer(xml, PowerInstrument((array(),), np.array([CARRIERS_HZ[0]])), OPTIONS)
+    tracer = RayTracer(xml, Instrument("power", (array(),), np.array([CARRIERS_HZ[0]])), OPTIONS)
     expected = tracer.observe(tracer.trace(transmitters(12), carriers_hz=rows))[0]
     found = Predictor(graph_of(xml, replace(PORTS, receiver="power")), {})(transmitters(12), 0, carriers_hz=rows)
     np.testing.assert_allclose(found, expected, atol=STRENGTH_DB)
@@ -205,7 +205,7 @@ def test_phases_are_uncertain_where_walls_are_off(off_m, certain, xml, tmp_path)
     moved = {n: (kind, mesh.copy().apply_translation([off_m, -off_m, off_m])) for n, (kind, mesh) in parts.items()}
     split = Split("own", 0, *np.split(np.arange(60), [50, 55]))
     settings = "traced.rays=4096", "traced.depth=2", "traced.reflections=2", "steps=40", "validate_every=10"
-    config = with_settings(calibration_config(["gain", "surface"], images=True), settings)
+    config = with_settings(calibration_config(["gain", "surface"], record.task.settings_of_paths), settings)
     trainer = Trainer(record, split, config, scene=open_scene(write_xml(tmp_path, moved), CARRIERS_HZ[2]))
     trainer.run(lambda progress: None, lambda: None, lambda: False)
     assert (trainer.state.phase_error == 0) == certain

@@ -4,8 +4,10 @@ from .angles import azimuth_elevation, pixel_directions, rotation_matrix, unit_v
 from .antenna import Antenna, AntennaOptions
 from .errors import BackendError, DataFault, InputError
 from .paths import Paths, load_paths, save_paths
+from .prediction import Prediction
 from .receivers import receiver_arrays, stored_receivers
-from .types import Prediction, Receiver, Record, Split
+from .task import Task
+from .types import Receiver, Record, Split
 
 __all__ = [
     "Antenna",
@@ -18,6 +20,7 @@ __all__ = [
     "Receiver",
     "Record",
     "Split",
+    "Task",
     "azimuth_elevation",
     "load_paths",
     "pixel_directions",

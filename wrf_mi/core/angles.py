@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 UNIT_QUATERNION_TOLERANCE = 1e-3
 """Largest accepted deviation of a quaternion's norm from one: files carry five or more digits."""

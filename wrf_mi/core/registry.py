@@ -25,11 +25,18 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     entries, and ``builtin`` has the entries of this package by name, or their addresses ``module:attribute``.
     """
 
-    def __init__(self, what: str, group: str, builtin: Mapping[str, Entry | str]) -> None:
-        self._what, self._known = what, dict(builtin)
+    def __init__(self, what: str, group: str, builtin: Mapping[str, Entry | str] | None = None) -> None:
+        self._what, self._known = what, dict[str, Entry | str]()
         self._others = {point.name: point for point in entry_points(group=group)}
-        self._twice = self._known.keys() & self._others.keys()
-        self._modules = {name: entry.partition(":")[0] for name, entry in builtin.items() if isinstance(entry, str)}
+        self._twice, self._modules = set[str](), dict[str, str]()
+        self.add_builtin(builtin or {})
+
+    def add_builtin(self, entries: Mapping[str, Entry | str]) -> None:
+        """Add entries of this package, where the registry lies in a package below theirs."""
+        self._known |= entries
+        self._twice |= entries.keys() & self._others.keys()
+        addresses = {name: entry for name, entry in entries.items() if isinstance(entry, str)}
+        self._modules |= {name: address.partition(":")[0] for name, address in addresses.items()}
 
     def add(self, name: str, entry: Entry) -> None:
         """Add an entry for this process; `InputError`: the name is taken."""

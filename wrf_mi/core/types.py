@@ -10,50 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .angles import FloatArray as FloatArray
+from .angles import IntArray as IntArray
 from .angles import rotation_matrix
 from .antenna import ANTENNA, Antenna, AntennaOptions
-from .registry import resolve
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Predictions for m transmitters at one receiver.
-
-    Attributes:
-        mean: [m, *shape of an observation], as in `wrf_mi.core.Record`: grey in 0..1, dBm, or complex coefficients.
-        std: standard deviation of a reading (a single observation, its noise included) minus mean, real, of the mean's
-            shape and unit; for a complex coefficient sqrt(E |h - mean|^2). None: the model states none.
-        reception: probability that the receiver receives anything [m], of signal strengths; mean and std are those of
-            what is received. None: the model states none.
-        std_mean: standard deviation of the mean: of what is observed without noise (of signal strengths the local mean
-            power) minus mean, otherwise as ``std``. None: the model cannot tell it from ``std``.
-
-    Raises:
-        ValueError: shapes that differ.
-    """
-
-    mean: NDArray[Any]
-    std: FloatArray | None = None
-    reception: FloatArray | None = None
-    std_mean: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("std", "std_mean"):
-            stated = getattr(self, name)
-            if stated is not None and np.shape(self.mean) != np.shape(stated):
-                raise ValueError(
-                    f"Prediction: mean {np.shape(self.mean)} and {name} {np.shape(stated)} differ in shape"
-                )
-
-    @property
-    def stated_std(self) -> FloatArray:
-        """The standard deviation of a model that states one; `ValueError`: the model states none."""
-        if self.std is None:
-            raise ValueError("Prediction: the model states no standard deviation")
-        return self.std
-
-
-IntArray = NDArray[np.int64]
+from .task import CONVERSIONS, Task, task_named
 
 
 @dataclass(frozen=True)
@@ -118,16 +78,30 @@ class Receiver:
         return rotation_matrix(self.orientation_xyzw)
 
 
+class _TaskName:
+    """Attribute of a record that is set to a task or its name and read as the task."""
+
+    # The record keeps the name: a pickled record is read in a process where packages register their tasks anew.
+
+    def __get__(self, record: Record | None, owner: type[Record] | None = None) -> Task:
+        if record is None:
+            raise AttributeError("task")  # what a data class has no default for
+        return task_named(vars(record)["task"], record.source or record.name)
+
+    def __set__(self, record: Record, task: Task | str) -> None:
+        vars(record)["task"] = task if isinstance(task, str) else task.name
+
+
 @dataclass(frozen=True)
 class Record:
     """A set of measurements: transmitter positions, receivers and what each receiver observed.
 
     Attributes:
         name: name of the data set.
-        task: kind of ``observation``. ``"spectrum"``: grey values [n_rx, n, height, width] in 0..1, float32.
-            ``"rssi"``: received power [n_rx, n] in dBm, float32, NaN where nothing was received.
-            ``"csi"``: channel coefficients [n_rx, n, subcarriers] of receivers with one antenna or
-            [n_rx, n, antennas, subcarriers], complex64.
+        task: kind of ``observation`` (`wrf_mi.core.Task`), stated by its name or as an object. ``"spectrum"``: grey
+            values [n_rx, n, height, width] in 0..1, float32. ``"rssi"``: received power [n_rx, n] in dBm, float32, NaN
+            where nothing was received. ``"csi"``: channel coefficients [n_rx, n, subcarriers] of receivers with one
+            antenna or [n_rx, n, antennas, subcarriers], complex64. `InputError` where it is read: an unknown task.
         tx_pos_m: positions of the moving end [n, 3], world frame, metres; by reciprocity it is the transmitter. NaN
             where unknown.
         receivers: the ``n_rx`` static receivers.
@@ -163,7 +137,7 @@ class Record:
     """
 
     name: str
-    task: str
+    task: Task
     tx_pos_m: FloatArray
     receivers: tuple[Receiver, ...]
     observation: NDArray[np.float32] | NDArray[np.complex64]
@@ -280,12 +254,16 @@ class Record:
         ``observation`` has the dimensions ``row``, ``receiver`` and ``elevation`` and ``azimuth``, ``subcarrier``, or
         ``antenna`` and ``subcarrier``. `InputError`: xarray is not installed.
         """
-        return resolve("wrf_mi.datasets.labelled:dataset_of")(self)
+        return CONVERSIONS["xarray"](self)
 
     @property
     def has_positions(self) -> bool:
         """Whether every row's position is known."""
         return bool(np.isfinite(self.tx_pos_m).all())
+
+
+# After the class, as a value in its body would be a default of the argument.
+Record.task = _TaskName()  # type: ignore[assignment]
 
 
 @dataclass(frozen=True)

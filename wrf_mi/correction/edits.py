@@ -26,7 +26,6 @@ from ..scene.folder import read_scene_folder
 from ..scene.hidden import Boxes, with_hidden_faces
 from ..scene.materials import FILE as MATERIALS_FILE
 from ..scene.mesh.surfaces import KINDS, Kind
-from ..tasks import task_of
 from ..tasks.conditions import scene_carrier
 from ..tasks.scores import LEVEL
 from ..tracing import open_scene
@@ -79,7 +78,7 @@ class Correction:
 
 def default_options(record: Record, n_train: int | float | None = None) -> CorrectionOptions:
     """Options for a record where none are given; all rows are compared if their number ``n_train`` is stated."""
-    options = STRENGTHS if task_of(record).in_decibel else DEFAULTS
+    options = DEFAULTS if record.task.tells_phases else STRENGTHS
     return options if n_train is None else replace(options, rows=max(1, len(record) * len(record.receivers)))
 
 
@@ -117,21 +116,21 @@ def checked(record: Record, split: Split, options: CorrectionOptions | None) -> 
     """The rows and receivers that may be used, and options that suit the task; an `InputError` where there are none."""
     record = record.seen(split)
     lacking = [receiver.name for receiver in record.receivers if not np.isfinite(receiver.position_m).all()]
-    if lacking and task_of(record).in_decibel:
+    if lacking and record.task.shares_law:
         text = f"position of receiver {listed(lacking)} unknown; give x, y, z"
         raise InputError(f"{record.source or record.name}: {text}, or wrf-mi train --scene, which estimates them")
     numbers, left_out = fitted_receivers(record, [split])
     warn_of_left_out(record, left_out)
     record, split = record.at_receivers(numbers), split.at_receivers(numbers)
-    task = task_of(record)
+    task = record.task
     if not task.receiver_with_scene:
         raise InputError(f"{record.name}: no receiver model reports {task.name} from paths")
-    check_observations(record, split, complete=task.image)
+    check_observations(record, split, complete=task.complete)
     options = options or default_options(record)
-    if task.in_decibel and GAIN not in options.parts:
+    if task.has_offsets and GAIN not in options.parts:
         options = replace(options, parts=(*options.parts, GAIN))
     # An image of each receiver and row has some hundred values: as many images as one receiver's rows tell as much.
-    most = max(1, options.rows // (len(record.receivers) if task.image else 1))
+    most = max(1, options.rows // (len(record.receivers) if task.image_size(record.observation.shape) else 1))
     # Seeds of other purposes differ by their second number, so that subsets are independent.
     rows = np.random.default_rng([split.seed, 7]).permutation(split.all_train)[:most]
     split = replace(split, train=np.intersect1d(split.train, rows), validation=np.intersect1d(split.validation, rows))

@@ -22,9 +22,8 @@ from ..backend.device import Recorded, to_tensor, to_uint
 from ..core import Record
 from ..core.carriers import rows_by_carrier
 from ..core.types import FloatArray, IntArray
-from ..graph.receivers import RECEIVERS, Form
 from ..receivers import minmax_scale
-from ..tasks import task_of
+from ..receivers.registry import RECEIVERS, Form
 from ..tasks.conditions import placed_receivers
 from ..tracing.paths.corrected_scene import MovedSearch
 from ..tracing.paths.instrument_parameters import instrument_parameters
@@ -112,7 +111,7 @@ class Misfit:
         searched: MovedSearch | None = None,
         surfaces: tuple[IntArray, IntArray] | None = None,
     ) -> None:
-        self.record, self.rows, self._task = record, rows, task_of(record)
+        self.record, self.rows, self._task = record, rows, record.task
         self._traced = replace(options.traced, tx_antenna=record.tx_antenna)
         self.tables = prepared.tables(self._traced.materials)  # materials and planes of the scene
         placed = placed_receivers(record, by_uplink=False)
@@ -121,8 +120,8 @@ class Misfit:
         known = np.isfinite(record.observation[:, rows]).reshape(len(placed), -1).any(axis=1)
         numbers = np.flatnonzero(known) if known.any() else np.arange(len(placed))
         self.receivers = [placed[number] for number in numbers]
-        shape, is_image = record.observation.shape[2:], self._task.image
-        self._strides = [_stride(n, most) for n, most in zip(shape, LATTICE, strict=True)] if is_image else []
+        self._size = self._task.image_size(record.observation.shape[2:])
+        self._strides = [_stride(n, most) for n, most in zip(self._size, LATTICE, strict=False)]  # none of no image
         self.ports = self._traced_ports(numbers, prepared, searched)  # receiver by receiver, at each carrier
         # Numbers of the scene's planes and of its surfaces whose parameters are entries of the vector, in their order.
         self.planes, self.slabs = np.arange(len(prepared.surfaces.normal)), np.arange(len(self.tables.slabs.names))
@@ -158,20 +157,18 @@ class Misfit:
     def _traced_ports(self, numbers: IntArray, prepared: Prepared, searched: MovedSearch | None) -> list[_Port]:
         """Ports of the receivers, which have these numbers in the record."""
         record, rows, task = self.record, self.rows, self._task
-        shape = tuple(map(int, record.observation.shape[2:]))
-        complete = (shape[0], shape[1]) if task.image else (1, 1)
-        size = tuple(n // stride for n, stride in zip(complete, self._strides or (1, 1), strict=True))
-        floor_db = float(np.nanmin(record.observation[:, rows])) if task.in_decibel else np.nan
-        outputs, receiver_name = shape if task.is_complex else (), task.receiver_with_scene
-        form = Form(receiver_name, (size[0], size[1]), record.frequencies_hz, outputs, floor_db=floor_db)
+        height, width = self._size or (1, 1)
+        size = tuple(n // stride for n, stride in zip((height, width), self._strides or (1, 1), strict=True))
+        floor_db, outputs = task.floor_db(record.observation[:, rows]), task.outputs(record.observation.shape[2:])
+        form = Form(task.receiver_with_scene, (size[0], size[1]), record.frequencies_hz, outputs, floor_db=floor_db)
         heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
-        ports, make = list[_Port](), RECEIVERS[form.receiver].make
+        ports, make = list[_Port](), RECEIVERS[form.receiver].of
         for number, receiver in zip(numbers, self.receivers, strict=True):
             of_receiver = record.tx_pos_m[rows], receiver, self._traced, prepared, heading, carriers
             sides = traced_fields(*of_receiver, searched=searched)
             for side, (carrier_hz, which) in zip(sides, rows_by_carrier(carriers, len(rows)), strict=True):
                 at = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
-                models = make(at, receiver), make(replace(at, size=complete), receiver)
+                models = make(at, receiver), make(replace(at, size=(height, width)), receiver)
                 ports.append(_Port(side, *models, number * len(rows) + which))
         return ports
 
@@ -199,7 +196,7 @@ class Misfit:
         """Observations and their units [n_rx * rows], in which residuals are."""
         stored = self.record.observation[:, self.rows]
         count = stored.shape[0] * stored.shape[1]
-        if self._task.image:
+        if self._strides:
             # A model's coarse image has its extremes on the lattice, not between, so the observed one is scaled there.
             coarse = minmax_scale(stored[:, :, :: self._strides[0], :: self._strides[1]].astype(float))
             return coarse.reshape(count, -1), np.ones(count)

@@ -29,7 +29,6 @@ from ..core.files import atomic_folder, listed, write_atomically, write_figure
 from ..scene.correction_data import FILE
 from ..scene.correction_data import KEY as DATA
 from ..scene.mesh.surfaces import Kind
-from ..tasks import task_of
 from ..tracing.paths.corrected_scene import moved_triangles, write_corrected_scene
 from ..tracing.paths.scene_parameters import QUANTITIES, SHIFT, SURFACE, TILT, name_of
 from .edits import Correction
@@ -74,7 +73,7 @@ def write_scene(state: State, kinds: Mapping[str, Kind], folder: Path) -> None:
 
 
 def _facts(correction: Correction) -> dict[str, Any]:
-    misfit, task = correction.misfit, task_of(correction.misfit.record)
+    misfit, task = correction.misfit, correction.misfit.record.task
     changed = np.isin(np.arange(len(correction.vector)), correction.state.free)
     values, sd_before = misfit.named(correction.vector), correction.state.posterior.prior_deviation
     parameters = {
@@ -196,7 +195,7 @@ def _table(header: str, kinds: str, rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def _scores_text(correction: Correction, facts: dict[str, Any]) -> list[str]:
-    task, receivers = task_of(correction.misfit.record), listed(facts["held_out_receivers"])
+    task, receivers = correction.misfit.record.task, listed(facts["held_out_receivers"])
     place = f"at the receivers {receivers}, which were held out" if receivers else "that were held out in clusters"
     scores = [
         (stage, *(f"{score[kind]:.{task.digits}f}" for kind in ("median", "mean")))
@@ -342,6 +341,6 @@ def _plot_scores(axes: Any, correction: Correction) -> None:
         share = np.arange(1, len(values) + 1) / max(len(values), 1)
         style = "-" if stage == correction.kept else "--"
         axes.step(values, share, style, where="post", label=f"{_stage(stage)}{' (kept)' if style == '-' else ''}")
-    axes.set(xlabel=task_of(correction.misfit.record).label, ylabel="share of the held-out rows", ylim=(0, 1))
+    axes.set(xlabel=correction.misfit.record.task.label, ylabel="share of the held-out rows", ylim=(0, 1))
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)

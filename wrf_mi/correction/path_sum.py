@@ -24,9 +24,8 @@ from scipy.sparse import csr_array
 
 from ..core.types import FloatArray, IntArray
 from ..parallel.threads import on_threads, processors
-from ..receivers.receiver_models import ArrayReceiver, PowerReceiver, Slopes
-from ..receivers.receiver_models import ComplexArray as Complex
-from ..tasks import task_of
+from ..receivers.registry import ComplexArray as Complex
+from ..receivers.registry import Slopes, Sums
 from ..tracing.paths.scene_parameters import PREFIX, SHIFT, TILT
 from .least_squares import Derivatives, Jacobian, Residuals
 from .path_lengths import lengths_and_slopes
@@ -66,14 +65,18 @@ def _follows(name: str, moving: bool) -> bool:
 
 
 def _serves_reports(misfit: Misfit, carriers: int) -> bool:
-    task, models = task_of(misfit.record), [port.model for port in misfit.ports]
-    if task.in_decibel:
-        return all(isinstance(model, PowerReceiver) and not model.interference for model in models)
-    if not task.image:
-        return all((task.is_complex, misfit.record.observation.ndim == 3, SHIFT in misfit.parts, carriers == 1))
-    # Element signals of all paths, of arrays of one size.
-    sizes = [len(m.elements_m) if isinstance(m, ArrayReceiver) and m.instrument_scale else 0 for m in models]
-    return 0 not in sizes and len({*sizes}) == 1 and max(sizes) * len(misfit.paths.row) <= MOST_WAVES
+    sums = sums_of(misfit)
+    if sums == "elements":
+        # Element signals of all paths, of arrays of one size.
+        sizes = {len(port.model.elements_m) for port in misfit.ports}
+        return 0 not in sizes and len(sizes) == 1 and max(sizes) * len(misfit.paths.row) <= MOST_WAVES
+    return sums == "powers" or (sums == "fields" and SHIFT in misfit.parts and carriers == 1)
+
+
+def sums_of(misfit: Misfit) -> Sums | None:
+    """What all receivers report sums of (`wrf_mi.receivers.registry.ReceiverModel.sums`); None: they differ."""
+    kinds = {port.model.sums for port in misfit.ports}
+    return kinds.pop() if len(kinds) == 1 else None
 
 
 class PathSum:
@@ -82,7 +85,7 @@ class PathSum:
     def __init__(self, misfit: Misfit, vector: FloatArray) -> None:
         self.misfit, self.at, self._start = misfit, np.array(vector, float), np.array(vector, float)
         self._paths, self._plane_places = misfit.paths, misfit.plane_entries
-        self._coherent = not task_of(misfit.record).in_decibel
+        self._coherent = sums_of(misfit) != "powers"
         material = [np.arange(part.start, part.stop) for name, part in misfit.parts.items() if name.startswith(PREFIX)]
         self._material = np.array(material, np.int64).reshape(len(material), len(misfit.slabs))
         gains = [(port.side.gain_name, port.places) for port in misfit.ports]
@@ -118,7 +121,7 @@ class PathSum:
         gains = {port.side.gain_name for port in misfit.ports}
         carriers = len(misfit.ports) // len(misfit.receivers)
         # Receivers of one name share parameters: their sums would not be told apart.
-        apart, moving = len(gains) * carriers >= len(misfit.ports), not task_of(misfit.record).in_decibel
+        apart, moving = len(gains) * carriers >= len(misfit.ports), sums_of(misfit) != "powers"
         follows = all(_follows(name, moving) for name in misfit.parts)
         return apart and follows and _serves_reports(misfit, carriers)
 
@@ -373,7 +376,7 @@ class PathSum:
 
 def _unit_waves(misfit: Misfit, vector: FloatArray, length_m: FloatArray) -> tuple[FloatArray, Complex]:
     """Wavenumbers [paths or 1, frequencies or 1] and waves [paths, frequencies or elements] for gains of one."""
-    if task_of(misfit.record).image:
+    if sums_of(misfit) == "elements":
         hz = np.array([port.side.frequency_hz for port in misfit.ports])
         return (2 * np.pi * hz / speed_of_light)[misfit.paths.side, None], misfit.unit_signals(vector)
     assert misfit.record.frequencies_hz is not None

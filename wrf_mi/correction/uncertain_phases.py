@@ -29,13 +29,12 @@ from scipy.constants import speed_of_light
 from scipy.sparse import csr_array
 
 from ..core.types import FloatArray, IntArray
-from ..tasks import task_of
-from ..tracing.paths.scene_parameters import PREFIX, SHIFT
+from ..tracing.paths.scene_parameters import PREFIX
 from .least_squares import CONVERGED, FIRST_DAMPING, FREEDOM, HARDER, LEAST_DAMPING, TRIALS
 from .moves import SWEEPS, SurfaceChoice, material_choices
 from .options import FRAME_SD
 from .path_lengths import lengths_and_slopes
-from .path_sum import STEP, PathSum
+from .path_sum import STEP, PathSum, sums_of
 from .state import State
 
 if TYPE_CHECKING:
@@ -114,7 +113,7 @@ class UncertainPhases:
     @staticmethod
     def serves(misfit: Misfit) -> bool:
         """Whether a misfit is of channels by materials and planes."""
-        return task_of(misfit.record).is_complex and SHIFT in misfit.parts and PathSum.serves(misfit)
+        return sums_of(misfit) == "fields" and PathSum.serves(misfit)
 
     def scores(self, vector: FloatArray) -> FloatArray:
         """Log-likelihoods of all rows [n_rx * rows], without a constant; NaN without observation or path."""

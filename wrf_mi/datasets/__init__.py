@@ -6,6 +6,12 @@ from typing import TYPE_CHECKING
 
 import lazy_loader
 
+from ..core import Record as Record
+from ..core.task import CONVERSIONS
+from ..tasks import TASKS as TASKS  # registered by this import: records name them
+
+CONVERSIONS.add_builtin({"xarray": f"{__name__}.labelled:dataset_of"})
+
 if TYPE_CHECKING:
     from .argos import read_argos
     from .ble_folder import read_ble_folder, write_ble_folder

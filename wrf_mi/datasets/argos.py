@@ -26,6 +26,7 @@ from ..core.antenna import UPRIGHT
 from ..core.array_files import MOST_DEFLATED
 from ..core.files import one_line
 from ..core.memory import require_memory
+from ..tasks import CSI
 from .faults import attempt
 from .folder_files import shown, single_file
 
@@ -102,7 +103,7 @@ def read_argos(
     uplink_hz, downlink_hz = _frequencies_hz(attributes)
     return Record(
         name=name or file.stem,
-        task="csi",
+        task=CSI,
         tx_pos_m=np.full((len(channel), 3), np.nan),
         receivers=(Receiver("base-station", np.full(3, np.nan), np.array(UPRIGHT)),),
         observation=channel[None, :, :, HALF:],

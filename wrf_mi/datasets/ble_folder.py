@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import tasks
 from ..core import DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY
@@ -90,7 +91,7 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     record = files.folder_record(
         folder,
         name,
-        "rssi",
+        tasks.RSSI,
         tx_pos_m=np.column_stack([plane.value, height]),
         receivers=tuple(receiver_of(*fields) for fields in zip(*columns, strict=True)),
         observation=observation,
@@ -196,7 +197,7 @@ def _carriers_hz(record: Record) -> FloatArray | None:
 def _writable(path: str | Path, record: Record) -> list[str]:
     """The receivers' ids of a record, checked to fit the layout."""
     text = f"{path}: {record.name} cannot be written in the layout of {RECEIVERS[0]}"
-    if record.task != "rssi":
+    if record.task is not tasks.RSSI:
         raise InputError(f"{text}: it needs signal strengths")
     files.refuse_unstated(path, record, "truth", "uplink")
     if record.official is not None:

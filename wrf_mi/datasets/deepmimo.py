@@ -35,6 +35,7 @@ from ..core.files import readable, text_lines
 from ..core.settings import CheckedSettings, Positive, settings_from
 from ..core.yaml_files import read_yaml
 from ..receivers import array_response, csi
+from ..tasks import CSI
 from .folder_files import data_folder, fits_single, numbers_of, read_official, shown
 from .read_mat import FAULT, mat_arrays
 
@@ -190,7 +191,7 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
         array_m, observation = None, observation[:, :, 0]
     return Record(
         name=name or folder.resolve().name,
-        task="csi",
+        task=CSI,
         tx_pos_m=users,
         receivers=tuple(
             Receiver(f"bs{number}", position, orientation, bs_antenna, array_m)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Antenna, DataFault, InputError, Record
+from ..core import Antenna, DataFault, InputError, Record, Task
 from ..core.angles import UNIT_QUATERNION_TOLERANCE, FloatArray
 from ..core.antenna import ANTENNA, pattern_path
 from ..core.carriers import FREQUENCY
@@ -41,7 +41,7 @@ def data_folder(path: str | Path, content: str) -> Path:
     return folder
 
 
-def folder_record(folder: Path, name: str | None, task: str, **parts: Any) -> Record:
+def folder_record(folder: Path, name: str | None, task: Task, **parts: Any) -> Record:
     """The record of a folder from its attributes, values or attempted parts, once all of these have been read.
 
     Raises:

@@ -1,6 +1,6 @@
 """Records and predictions as `xarray.Dataset` with named dimensions, and records from such data.
 
-Dimensions of an observation are ``row``, ``receiver`` and those of `OBSERVED`; variables have the names of
+Dimensions of an observation are ``row``, ``receiver`` and `wrf_mi.core.Task.dimensions`; variables have the names of
 `wrf_mi.datasets.record_file`, coordinates are ``receiver`` (names), ``axis`` (x, y, z) and, of spectra, ``elevation``
 and ``azimuth`` in degrees in the frame of the array.
 """
@@ -15,17 +15,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Prediction, Receiver, Record, receiver_arrays
+from ..core import InputError, Prediction, Receiver, Record, Task, receiver_arrays
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA, UPRIGHT
+from ..core.task import TASKS, task_named
 from .record_file import record_arrays, record_from_arrays
 
 if TYPE_CHECKING:
     import xarray
 
 PAIR = ("row", "receiver")
-OBSERVED = {0: (), 1: ("subcarrier",), 2: ("antenna", "subcarrier")}
-"""Further dimensions of an observation by their number; of a spectrum (``elevation``, ``azimuth``)."""
 OF_RECEIVERS = ("observation", "truth", "std", "n_readings")  # arrays whose first axes are receiver and row
 ROW, FIXED = ("row",), ("receiver",)
 DIMENSIONS: dict[str, tuple[str, ...]] = {
@@ -73,27 +72,25 @@ def of_receivers(values: Any, receivers: Sequence[Receiver]) -> Any:
     return ordered(values.sel(receiver=names), "receiver", "row")
 
 
-def _observed(task: str, ndim: int) -> tuple[str, ...]:
-    return ("elevation", "azimuth") if task == "spectrum" else OBSERVED.get(ndim - 2, ())
+def _observed(task: Task, ndim: int) -> tuple[str, ...]:
+    return task.dimensions.get(ndim - len(PAIR), ())
 
 
-def _labels(names: Sequence[str], task: str, shape: tuple[int, ...]) -> dict[str, Any]:
+def _labels(names: Sequence[str], task: Task, shape: tuple[int, ...]) -> dict[str, Any]:
     """Coordinates of observations [n_rx, rows, ...]."""
     labels: dict[str, Any] = {"receiver": list(names), "axis": list("xyz")}
-    if task == "spectrum":
-        for name, count, span in zip(("elevation", "azimuth"), shape[2:], (90, 360), strict=True):
-            labels[name] = name, np.arange(count) * span / count, {"units": "degree"}
+    for name, count, span in zip(task.dimensions[2], task.image_size(shape), (90, 360), strict=False):
+        labels[name] = name, np.arange(count) * span / count, {"units": "degree"}
     return labels
 
 
-def _variable(name: str, values: NDArray[Any], task: str) -> tuple[tuple[str, ...], NDArray[Any], dict[str, str]]:
+def _variable(name: str, values: NDArray[Any], task: Task) -> tuple[tuple[str, ...], NDArray[Any], dict[str, str]]:
     units = next((unit for end, unit in UNITS.items() if name.endswith(end)), None)
     if name in (*OF_RECEIVERS, "prediction", "std_mean"):
-        level = {"rssi": "dB" if name.startswith("std") else "dBm"}.get(task)
-        unit = None if name == "n_readings" else level
+        unit = "" if name == "n_readings" else task.units[name.startswith("std")]
         return (*PAIR, *_observed(task, values.ndim)), values.swapaxes(0, 1), {"units": unit} if unit else {}
     if name == "frequencies_hz":
-        dims: tuple[str, ...] = ("subcarrier",) if task == "csi" else ("carrier",)
+        dims: tuple[str, ...] = (task.frequency_dimension,)
     else:
         dims = DIMENSIONS[name]
     return dims, values, {"units": units} if units else {}
@@ -105,7 +102,7 @@ def dataset_of(record: Record) -> xarray.Dataset:
     names = arrays.pop("receiver_name").tolist()
     variables = {name: _variable(name, np.asarray(values), record.task) for name, values in arrays.items()}
     labels = _labels(names, record.task, record.observation.shape)
-    return xarray_package().Dataset(variables, labels, {"name": record.name, "task": record.task})
+    return xarray_package().Dataset(variables, labels, {"name": record.name, "task": record.task.name})
 
 
 def record_of(data: Any) -> Record:
@@ -126,7 +123,7 @@ def record_of(data: Any) -> Record:
             raise InputError(f"xarray data: no variable {name}; see wrf_mi.datasets.labelled for names and dimensions")
     observation = dataset["observation"]
     kind = "csi" if observation.dtype.kind == "c" else "rssi" if observation.ndim == 2 else "spectrum"
-    task = str(dataset.attrs.get("task", kind))
+    task = task_named(str(dataset.attrs.get("task", kind)), "xarray data")
     if "tx_pos_m" not in dataset:
         rows = [dataset[axis].to_numpy() for axis in "xyz"]
         dataset = dataset.assign(tx_pos_m=(("row", "axis"), np.stack(rows, axis=-1)))
@@ -142,7 +139,7 @@ def record_of(data: Any) -> Record:
     labels = dataset["receiver"].values if "receiver" in dataset.coords else range(dataset.sizes["receiver"])
     unknown = [Receiver(str(name), np.full(3, np.nan), np.array(UPRIGHT)) for name in labels]
     arrays = {**receiver_arrays(unknown), "tx_antenna": np.array(astuple(ANTENNA)), **arrays}
-    return record_from_arrays(arrays, str(dataset.attrs.get("name", "xarray")), task)
+    return record_from_arrays(arrays, str(dataset.attrs.get("name", "xarray")), task.name)
 
 
 @dataclass(frozen=True)
@@ -170,9 +167,10 @@ class LabelledPrediction(Prediction):
         stated = {
             name: values[None] if self.of_one else values for name, values in arrays.items() if values is not None
         }
-        variables: dict[str, Any] = {name: _variable(name, values, self.task) for name, values in stated.items()}
+        task = TASKS[self.task]
+        variables: dict[str, Any] = {name: _variable(name, values, task) for name, values in stated.items()}
         if self.reception is not None:
             variables["reception"] = PAIR, (self.reception[None] if self.of_one else self.reception).T
-        variables["tx_pos_m"] = _variable("tx_pos_m", self.tx_pos_m, self.task)
-        labels = _labels(self.receiver_names, self.task, stated["prediction"].shape)
+        variables["tx_pos_m"] = _variable("tx_pos_m", self.tx_pos_m, task)
+        labels = _labels(self.receiver_names, task, stated["prediction"].shape)
         return xarray_package().Dataset(variables, labels, {"task": self.task})

@@ -18,6 +18,7 @@ from ..core import DataFault, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.yaml_files import read_yaml
+from ..tasks import RSSI
 from . import folder_files as files
 from .faults import attempt, recoverable, refuse
 
@@ -53,7 +54,7 @@ def read_nerf2_ble(path: str | Path, name: str | None = None) -> Record:
     return files.folder_record(
         folder,
         name,
-        "rssi",
+        RSSI,
         tx_pos_m=positions,
         receivers=receivers,
         observation=power,

@@ -22,6 +22,7 @@ from ..core.antenna import UPRIGHT
 from ..core.array_files import stored_array
 from ..core.files import atomic_folder, readable
 from ..core.yaml_files import read_yaml
+from ..tasks import CSI
 from . import folder_files as files
 from .faults import attempt, recoverable, refuse, stop_at_faults
 
@@ -69,7 +70,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
     return files.folder_record(
         folder,
         name,
-        "csi",
+        CSI,
         tx_pos_m=np.full((n.value, 3), np.nan) if stated is None else stated.value.positions_m,
         receivers=(receiver.value,),
         observation=channel.value[None, :, :, half:],

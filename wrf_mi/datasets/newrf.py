@@ -26,6 +26,7 @@ from ..core.antenna import UPRIGHT
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import one_line, readable
 from ..parallel import run_module
+from ..tasks import CSI
 from .faults import refuse, stop_at_faults
 from .folder_files import single_file
 
@@ -64,7 +65,7 @@ def read_newrf(path: str | Path, name: str | None = None) -> Record:
     stop_at_faults()
     return Record(
         name=name or file.stem,
-        task="csi",
+        task=CSI,
         tx_pos_m=arrays["rx_pos"].astype(float),
         receivers=(Receiver("access-point", arrays["tx_pos"].astype(float), np.array(UPRIGHT)),),
         observation=arrays["csi"].astype(np.complex64)[None, :, None],

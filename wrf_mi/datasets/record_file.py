@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..core import Antenna, DataFault, Record, receiver_arrays, stored_receivers
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import readable
+from ..core.task import task_named
 from .folder_files import single_file
 
 VERSION, FORMAT = "record_format", 1
@@ -47,7 +48,7 @@ def record_from_arrays(arrays: Mapping[str, NDArray[Any]], name: str, task: str,
     optional: dict[str, Any] = {key: arrays[key] for key in OPTIONAL if key in arrays}
     return Record(
         name=name,
-        task=task,
+        task=task_named(task, source or name),
         tx_pos_m=arrays["tx_pos_m"],
         receivers=stored_receivers(arrays),
         observation=arrays["observation"],
@@ -60,7 +61,7 @@ def record_from_arrays(arrays: Mapping[str, NDArray[Any]], name: str, task: str,
 
 def write_record_file(path: str | Path, record: Record) -> Path:
     """Write a record to an ``.npz`` file atomically; `read_record_file` gives an equal record."""
-    arrays = {VERSION: FORMAT, "name": record.name, "task": record.task, **record_arrays(record)}
+    arrays = {VERSION: FORMAT, "name": record.name, "task": record.task.name, **record_arrays(record)}
     return write_arrays(Path(path), arrays, compressed=True)
 
 

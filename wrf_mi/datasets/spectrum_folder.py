@@ -25,6 +25,7 @@ from ..core.memory import require_memory
 from ..core.pictures import PICTURE_ERRORS, open_picture
 from ..core.types import IntArray
 from ..core.yaml_files import read_yaml
+from ..tasks import SPECTRUM
 from . import folder_files as files
 from .faults import attempt, recoverable, refuse, stop_at_faults
 
@@ -67,7 +68,7 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     return files.folder_record(
         folder,
         name,
-        "spectrum",
+        SPECTRUM,
         tx_pos_m=table.value.positions_m,
         receivers=receivers,
         observation=observation,

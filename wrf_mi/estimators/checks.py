@@ -14,7 +14,6 @@ from ..core.carriers import carriers_text
 from ..core.files import listed
 from ..core.settings import flat
 from ..datasets.observations import count_not_finite, place_of
-from ..tasks import task_of
 from .model import Inputs, Problem
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 
 def check_record(method: Model, record: Record, others: Iterable[Model] = ()) -> None:
     """Refuse a record that a model does not serve, naming ``others`` that do; or as `check_parts`."""
-    place, task = place_of(record), record.task
+    place, task = place_of(record), record.task.name
     if not method.serves(task):
         served = " and ".join(", ".join(method.tasks or ["nothing"]).rsplit(", ", 1))
         named = _names([other for other in others if other.serves(task)], ": {}")
@@ -64,17 +63,17 @@ def check_held_receivers(record: Record, split: Split, method: Model, others: It
         numbers = listed(map(str, split.held_receivers))
         text = f"split {split.name} holds out receivers {numbers} of {len(record.receivers)}"
         raise InputError(f"{place_of(record)}: {text}; leave some to train on")
-    if not task_of(record).in_decibel:
+    if not record.task.shares_law:
         text = f"holds {record.task}; split {split.name} serves signal strengths"
         raise InputError(f"{place_of(record)}: {text}, so choose another split")
     if not (method.new_receivers or len(split.left)):
-        able = [other.name for other in others if other.new_receivers and other.serves(record.task)]
+        able = [other.name for other in others if other.new_receivers and other.serves(record.task.name)]
         text = f"{method.name} predicts for the receivers it is trained on; choose {' or '.join(able)}"
         raise InputError(f"split {split.name}: {text}, or leave them rows, as receiver+20 does")
 
 
 def _check_receiver_carriers(record: Record, carriers_hz: FloatArray) -> None:
-    if record.carriers_hz is not None or not task_of(record).in_decibel:
+    if record.carriers_hz is not None or not record.task.has_readings:
         text = "receivers' frequency_hz belongs to signal strengths without carriers_hz"
         raise InputError(f"{place_of(record)}: {text}; state the carriers of receivers or of rows")
     if not (carriers_hz > 0).all():
@@ -84,7 +83,7 @@ def _check_receiver_carriers(record: Record, carriers_hz: FloatArray) -> None:
 
 def check_parts(record: Record) -> None:
     """Refuse a record whose parts do not fit together; raises InputError."""
-    task_of(record).check(record)
+    record.task.check(record)
     _check_noise(record)
     if record.runs is not None and record.runs.shape != (len(record),):
         raise InputError(f"{place_of(record)}: runs {list(record.runs.shape)}; give one for each of {len(record)} rows")
@@ -93,7 +92,7 @@ def check_parts(record: Record) -> None:
     carriers, place = record.carriers_hz, place_of(record)
     if carriers is None:
         return
-    if record.frequencies_hz is not None or task_of(record).is_complex:
+    if record.frequencies_hz is not None or not record.task.several_carriers:
         text = "carriers_hz belongs to spectra and signal strengths without frequencies_hz"
         raise InputError(f"{place}: {text}; set one of the two to None, or make a record for each carrier")
     if carriers.shape != (len(record),) or not (np.isfinite(carriers) & (carriers > 0)).all():
@@ -105,7 +104,7 @@ def _check_noise(record: Record) -> None:
     for name, values in stated.items():
         if values is None:
             continue
-        if not task_of(record).in_decibel:
+        if not record.task.has_readings:
             text = f"{name} belongs to signal strengths, not to {record.task}"
             raise InputError(f"{place_of(record)}: {text}; set Record.{name} to None")
         if values.shape != record.observation.shape:

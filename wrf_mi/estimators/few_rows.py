@@ -252,4 +252,4 @@ class WithFewRows(Model):
 
 def with_few_rows(model: Model, task: str) -> Model:
     """The model, for signal strengths with `WithFewRows`; other tasks have no law of distance."""
-    return WithFewRows(model) if TASKS[task].in_decibel else model
+    return WithFewRows(model) if TASKS[task].shares_law else model

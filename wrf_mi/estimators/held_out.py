@@ -15,7 +15,6 @@ from ..core.array_files import keyed, stored_arrays, under, write_arrays
 from ..core.types import IntArray
 from ..datasets.observations import fitted_receivers
 from ..scene.correction_data import read_correction_data
-from ..tasks import task_of
 from ..training.selection import HeldOut, hold_out
 from .model import Arrays, Fitted, HeldOutPrediction, Model, Problem, Session, inputs_of
 from .receiver_places import placed_problem
@@ -94,8 +93,7 @@ def with_error_ratio(mean: NDArray[Any], problem: Problem, held_out: HeldOut) ->
     observed, known = held_out.observed(record), data.knows(record.name, held_out.row)
     # The scene was corrected by these rows, too: their errors are smaller than those of rows to be predicted.
     enlarged = observed + data.error_ratio * (mean - observed)
-    if task_of(record).image:
-        enlarged = np.maximum(enlarged, 0)
+    enlarged = record.task.limited(enlarged, most=False)
     return np.where(known.reshape(-1, *[1] * (mean.ndim - 1)), enlarged, mean)
 
 

@@ -30,11 +30,11 @@ from ..core.files import readable, write_atomically
 from ..core.settings import settings_from, with_settings
 from ..core.types import IntArray
 from ..datasets.observations import place_of
-from ..graph.receivers import GAPS
 from ..parallel import row_parts
 from ..receivers.instruments import Instrument
+from ..receivers.registry import GAPS
 from ..receivers.spreads import PathStatistics
-from ..tasks import instrument_of, task_of
+from ..tasks import instrument_of
 from ..tracing import TraceOptions, TraceResult, load_trace, save_trace
 from ..tracing.convergence import CHOSEN_KINDS, choose_options
 from ..tracing.options import without_effect
@@ -187,7 +187,9 @@ def _graph_problem(problem: Problem) -> Problem:
         *([] if options.rays == "auto" else [f"traced.rays={options.rays}"]),
         *settings.chosen(),
     ]
-    config = with_settings(calibration_config(settings.calibration.split(","), task_of(problem.record).image), stated)
+    config = with_settings(
+        calibration_config(settings.calibration.split(","), problem.record.task.settings_of_paths), stated
+    )
     return replace(problem, settings=config.resolved(problem.record.tx_pos_m[:1]))
 
 
@@ -285,7 +287,7 @@ class RayTracing(Model):
         facts = {"rays": traced.rays, "paths": len(traced.paths), "trace_seconds": seconds}
         facts |= {LOST: traced.lost} if traced.lost else {}
         arrays = {name: np.asarray(value) for name, value in facts.items()}
-        if task_of(record).in_decibel:
+        if record.task.has_offsets:
             known = split.all_train
             reported = tracer.observe(traced)[:, known]
             if not settings.transmission:
@@ -330,7 +332,7 @@ class RayTracing(Model):
         """Settings of paths that are not traced, of convergence without a target, and of a trace beside calibration."""
         s, record = problem.settings, problem.record
         unused = without_effect(s.options)
-        if not task_of(record).image:
+        if not record.task.averages_phases:
             unused["phase_error"] = f"spectra alone are expectations, and {record.name} holds {record.task}"
         # The seed is also that of the split, which draws rows unless all official ones are used.
         if record.official is None or any(set(split.all_train) != set(record.official[0]) for split in splits):
@@ -361,7 +363,7 @@ class RayTracing(Model):
                 settings.target_error_db,
                 settings.options,
                 kinds=settings.target_kinds.split(","),
-                spectra=instrument.observe if task_of(record).image else None,
+                spectra=instrument.observe if record.task.image else None,
                 tx_antenna=record.tx_antenna,
             )
             write_atomically(path, json.dumps(choice.plain(), indent=1) + "\n")

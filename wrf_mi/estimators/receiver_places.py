@@ -38,7 +38,6 @@ from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
 from ..core.files import listed, readable, write_atomically
 from ..core.types import IntArray
-from ..tasks import task_of
 from ..tasks.scores import LEVEL, REAL_90
 from ..training.session import OnProgress, quiet
 from .model import Model, Problem
@@ -214,7 +213,7 @@ class _Likelihood:
 
 def _lacking(record: Record) -> list[int]:
     """Numbers of the receivers of signal strengths whose places are to be estimated."""
-    return [k for k, each in enumerate(record.receivers) if not each.is_surveyed] if task_of(record).in_decibel else []
+    return [k for k, each in enumerate(record.receivers) if not each.is_surveyed] if record.task.shares_law else []
 
 
 def placed(
@@ -333,7 +332,7 @@ def check_placeable(problem: Problem, splits: Sequence[Split]) -> None:
         InputError: naming them.
     """
     record = problem.record
-    for split in splits if problem.scene is not None and task_of(record).in_decibel else ():
+    for split in splits if problem.scene is not None and record.task.shares_law else ():
         received = np.isfinite(record.seen(split).observation[:, split.all_train])
         lacking = [k for k, receiver in enumerate(record.receivers) if not (receiver.is_surveyed or received[k].any())]
         if lacking:

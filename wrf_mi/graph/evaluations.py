@@ -1,7 +1,7 @@
 """Evaluation of the Gaussians of a graph on a receiver's directions, by name.
 
 ``splatted`` projects Gaussians to the plane of directions. ``traced`` follows rays through them with the Mitsuba plugin
-`wrf_traced`; the plugins import this package, so they are imported on request.
+`wrf_traced`: the package of the plugins adds it by an entry point.
 """
 
 from __future__ import annotations
@@ -12,16 +12,12 @@ from typing import Any
 import drjit as dr
 
 from ..backend.vectors import Complex, Pose
+from ..core import InputError
+from ..core.registry import Registry
 from ..gaussians import Gaussians
 from ..gaussians.blend import splat
 from ..gaussians.tiles import TiledPlane
-from .settings import SPLATTED, TRACED, TracedConfig
-
-EVALUATIONS: Mapping[str, str] = {
-    SPLATTED: "wrf_mi.graph.evaluations:Evaluation",
-    TRACED: "wrf_mi_plugins.evaluation:Traced",
-}
-"""Addresses of `Evaluation` and its subclasses."""
+from .settings import SPLATTED, TracedConfig
 
 
 class Evaluation:
@@ -47,6 +43,17 @@ class Evaluation:
 
     def release(self) -> None:
         """Drop the references that the last call kept for its reverse pass."""
+
+
+EVALUATIONS: Registry[type[Evaluation]] = Registry("evaluation", "wrf_mi.evaluations", {SPLATTED: Evaluation})
+"""`Evaluation` and its subclasses by name."""
+
+
+def evaluation_named(name: str) -> type[Evaluation]:
+    """The evaluation of a name (InputError: no installed package has it)."""
+    if name not in EVALUATIONS:
+        raise InputError(f"evaluation {name!r}: no installed package adds it; install wrf_mi again")
+    return EVALUATIONS[name]
 
 
 def learned_field(gaussians: Gaussians, pose: Pose, plane: TiledPlane, sphere: bool = False) -> Complex:

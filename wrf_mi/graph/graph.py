@@ -31,19 +31,18 @@ from ..backend.vectors import Complex, Pose
 from ..core import Antenna, InputError, Receiver
 from ..core.angles import FloatArray
 from ..core.antenna import ANTENNA
-from ..core.registry import resolve
 from ..gaussians import Factorised, WithAttributes, WrfGs, WrfGsPlus
 from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import TiledPlane
 from ..receivers.device_paths import TracedPaths, draws_on_device, expected_report, spread
+from ..receivers.registry import RECEIVERS, Form
 from ..tracing.options import FACTOR
 from ..tracing.paths.instrument_parameters import receiver_pose
 from ..tracing.paths.solve import Prepared
 from ..tracing.paths.surface_gaussians import Interactions, SurfaceGaussians
 from ..tracing.paths.traced_field import TracedField, TracedOptions, traced_fields
 from ..tracing.tracer import check_polarization
-from .evaluations import EVALUATIONS, Evaluation
-from .receivers import RECEIVERS, Form
+from .evaluations import Evaluation, evaluation_named
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
 Field = WrfGs | WrfGsPlus | Factorised | WithAttributes
@@ -106,7 +105,7 @@ class Graph:
         self.field, self.receivers, self.scene, self.traced = field, tuple(receivers), scene, traced
         self.tx_antenna = tx_antenna
         self.surface: SurfaceGaussians | None = None  # on the scene's surfaces, changing its paths (`cover`)
-        self.evaluation: Evaluation = resolve(EVALUATIONS[evaluation])(scene, traced)
+        self.evaluation: Evaluation = evaluation_named(evaluation)(scene, traced)
         self._stated_hz = form.carrier_hz
         self._take(form)
 
@@ -129,7 +128,7 @@ class Graph:
         """Take a form, with the receiver model of each port, receiver by receiver."""
         forms = form.of_ports
         self.form, self.carriers = form, len(forms)
-        self.models = tuple(self.kind.make(of_port, receiver) for receiver in self.receivers for of_port in forms)
+        self.models = tuple(self.kind.of(of_port, receiver) for receiver in self.receivers for of_port in forms)
 
     def log_carrier(self, number: int) -> float | None:
         """Logarithm of a port's carrier over the middle one of training; None: rows have a single carrier."""
@@ -270,11 +269,11 @@ class Graph:
         report one of both sides alone, without an instrument's scaling of each report, so that the two compare (the
         unit of the Gaussians is that beside the paths). With ``phase_error``, the standard deviation in rad of the
         phase that each reflection of a path adds, the report is the expectation
-        (`wrf_mi.receivers.instruments.SpectrumInstrument`).
+        (`wrf_mi.receivers.instruments.Instrument`).
         """
         model: Any = self.models[number]
         if alone is not None:
-            model = getattr(model, "unscaled", model)
+            model = model.unscaled
 
         def report(params: Mapping[str, Any], batch: Batch) -> Any:
             if not surface:
@@ -316,7 +315,7 @@ class Graph:
         ``observed`` [n, *shape of a report] are of the transmitters of ``side``, NaN where nothing was received.
         """
         model = self.models[number]
-        unscaled: Any = getattr(model, "unscaled", model)
+        unscaled = model.unscaled
         known = np.flatnonzero(np.isfinite(observed).reshape(len(observed), -1).all(axis=1))
         # Images of thousands of rows would take gigabytes, for a start that training changes anyway.
         rows = known[:: -(-len(known) // MATCHED)] if len(known) else known

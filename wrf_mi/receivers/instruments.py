@@ -1,14 +1,9 @@
-"""Instruments of a record: several receivers and their reports of traced paths, in float64.
-
-How a receiver reports is stated once, by its receiver model (`wrf_mi.receivers.receiver_models`), which is imported
-when paths are observed: a command that only reads data does without Dr.Jit.
-"""
+"""Instruments of a record: several receivers and their reports of traced paths, in float64."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,33 +12,49 @@ from ..core import Antenna, Paths, Receiver
 from ..core.antenna import ANTENNA
 from ..core.carriers import by_carrier
 from ..core.types import FloatArray, IntArray
+from .registry import RECEIVERS, Form, ReceiverModel
 
-if TYPE_CHECKING:
-    from .receiver_models import ArrayReceiver, CsiReceiver
+SIZE = (90, 360)  # elevations and azimuths of a spectrum where none are stated: one each degree
 
 
 @dataclass(frozen=True)
-class Instrument(ABC):
+class Instrument:
     """Receivers and their reports of traced paths.
 
+    Reports of the receiver models of this package, each [n_rx, n_tx, ...]: ``array`` Bartlett spectra [height, width],
+    scaled by minimum and maximum as instruments do; ``power`` received power in dBm for 0 dBm sent, NaN where no path
+    arrives; ``csi`` channel coefficients [k], or [m, k] of receivers with m antennas.
+
+    With a phase error a spectrum is the mean over draws of the paths' phases, its expectation: a spectrum of wrong
+    phases has maxima and zeros at wrong places. Draws of a path are the same in every call.
+
     Attributes:
+        kind: name of the receiver model (`wrf_mi.receivers.registry.RECEIVERS`), such as ``"array"``.
         receivers: the ``n_rx`` receivers.
         frequencies_hz: carrier frequency [1] or those of the subcarriers [k].
         tx_antenna: antenna of the transmitters.
+        size: height and width of a spectrum.
+        phase_error: standard deviation of the phase that each interaction but transmission adds, rad, independently.
     """
 
+    kind: str
     receivers: tuple[Receiver, ...]
     frequencies_hz: FloatArray
     tx_antenna: Antenna = ANTENNA
+    size: tuple[int, int] = SIZE
+    phase_error: float = 0.0
 
     @property
     def carrier_hz(self) -> float:
         """Frequency at which paths are traced: the mean of the subcarriers."""
         return float(np.mean(self.frequencies_hz))
 
-    @abstractmethod
-    def model(self, receiver: Receiver) -> ArrayReceiver | CsiReceiver:
+    def model(self, receiver: Receiver) -> ReceiverModel:
         """Receiver model of one of the receivers."""
+        antennas = () if receiver.array_m is None else (len(receiver.array_m),)
+        outputs = (*antennas, len(self.frequencies_hz))
+        form = Form(self.kind, self.size, np.asarray(self.frequencies_hz, float), outputs)
+        return RECEIVERS[self.kind].of(form, receiver).with_phase_error(self.phase_error)
 
     def observe(self, paths: Paths) -> NDArray[Any]:
         """Observations [n_rx, n_tx, ...] of traced paths, as in a record of the task."""
@@ -67,48 +78,3 @@ class Instrument(ABC):
             return replace(self, frequencies_hz=np.array([carrier_hz])).observe(of_rows)
 
         return by_carrier(carriers_hz, at_carrier, axis=1)
-
-
-@dataclass(frozen=True)
-class PowerInstrument(Instrument):
-    """Received power in dBm for 0 dBm sent, [n_rx, n_tx], NaN where no path arrives: powers of paths are added."""
-
-    def model(self, receiver: Receiver) -> CsiReceiver:
-        """A single antenna that adds the powers of paths."""
-        from .receiver_models import PowerReceiver
-
-        return PowerReceiver(1, 1, (self.carrier_hz,), interference=False)
-
-
-@dataclass(frozen=True)
-class ChannelInstrument(Instrument):
-    """Channel coefficients, [n_rx, n_tx, k], or [n_rx, n_tx, m, k] of receivers with m antennas: fields are added."""
-
-    def model(self, receiver: Receiver) -> CsiReceiver:
-        """One or several antennas that report channel coefficients."""
-        from .receiver_models import CsiReceiver
-
-        return CsiReceiver(1, 1, tuple(map(float, self.frequencies_hz)), receiver.array_m)
-
-
-@dataclass(frozen=True)
-class SpectrumInstrument(Instrument):
-    """Bartlett spectra [n_rx, n_tx, height, width], each scaled by its minimum and maximum as instruments do.
-
-    With a phase error a spectrum is the mean over draws of the paths' phases, its expectation: a spectrum of wrong
-    phases has maxima and zeros at wrong places. Draws of a path are the same in every call.
-
-    Attributes:
-        size: height and width of a spectrum.
-        phase_error: standard deviation of the phase that each interaction but transmission adds, rad, independently.
-    """
-
-    size: tuple[int, int] = (90, 360)
-    phase_error: float = 0.0
-
-    def model(self, receiver: Receiver) -> ArrayReceiver:
-        """An array that reports scaled spectra."""
-        from .receiver_models import ArrayReceiver
-
-        assert receiver.array_m is not None, "see the task's instrument"
-        return ArrayReceiver(*self.size, receiver.array_m, self.carrier_hz, "coherent", True, self.phase_error)

@@ -23,7 +23,7 @@ solid angle of a pixel. A model reports in three ways:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -42,11 +42,10 @@ from ..core.types import IntArray
 from .array import bartlett_spectrum, steering_matrix
 from .channel import antenna_csi, csi, rssi_dbm, with_phase_errors
 from .device_paths import ComplexMatrix, Ports, TracedPaths, direction_weights, path_sum, weighted
+from .registry import PIXEL, ComplexArray, Form, ReceiverModel, Slopes, Sums
 from .reports import LEAST_POWER, SILENCE, SQUARED_MAGNITUDE_EPS, arrives, minmax_scale, scaled, strength_db
 
 How = Literal["coherent", "power"]
-ComplexArray = NDArray[np.complex128]
-Slopes = Callable[[ComplexArray, IntArray], FloatArray]  # of reports, by changes [k, values] of rows ``which``
 CHUNK_SIZE = 64  # transmitters observed together: float64 spectra of all would take several times the result
 
 
@@ -75,8 +74,12 @@ def _float_type(learned: Complex | None) -> Any:
     return mi.Float if learned is None else type(learned[0])
 
 
+def _elements(receiver: Receiver, count: int = 0) -> FloatArray:
+    return np.zeros((count, 3)) if receiver.array_m is None else np.asarray(receiver.array_m, float)
+
+
 @dataclass(frozen=True)
-class PixelReceiver:
+class PixelReceiver(ReceiverModel):
     """The papers' receiver: magnitude of the field at each direction of the upper hemisphere.
 
     Attributes:
@@ -93,7 +96,13 @@ class PixelReceiver:
     frequency_hz: float
     how: How = "coherent"
 
+    name, tasks = PIXEL, ("spectrum",)
     sphere, components = False, 1
+
+    @classmethod
+    def of(cls, form: Form, receiver: Receiver) -> PixelReceiver:
+        """Model of a receiver whose observations have a form."""
+        return cls(*form.size, _elements(receiver), form.carrier_hz)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -142,6 +151,17 @@ class ArrayReceiver(PixelReceiver):
     instrument_scale: bool = False
     phase_error: float = 0.0
 
+    name, needs_array, needs_carrier = "array", True, True
+
+    @classmethod
+    def of(cls, form: Form, receiver: Receiver) -> ArrayReceiver:
+        """Model of a receiver whose observations have a form."""
+        return cls(*form.size, _elements(receiver), form.carrier_hz, instrument_scale=True)
+
+    def with_phase_error(self, phase_error: float) -> ArrayReceiver:
+        """The receiver whose observed spectra are expectations."""
+        return replace(self, phase_error=phase_error)
+
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
         """Spectra [batch * height * width] of the two sides; either may be None."""
         sides: list[Complex | None] = [None if traced is None else self.elements(traced, _float_type(learned)), None]
@@ -167,6 +187,11 @@ class ArrayReceiver(PixelReceiver):
                 spectra = bartlett_spectrum(signals[rows], self.elements_m, self.frequency_hz, self.height, self.width)
                 images[rows] += minmax_scale(spectra) / len(draws)
         return images
+
+    @property
+    def sums(self) -> Sums | None:
+        """Fields at the elements; without scaling `signal_report` is not defined."""
+        return "elements" if self.instrument_scale else None
 
     @cached_property
     def signal_key(self) -> tuple[bytes, float]:
@@ -226,7 +251,7 @@ def _scaled_rows(spectrum: NDArray[np.float32]) -> tuple[NDArray[np.float32], In
 
 
 @dataclass(frozen=True)
-class CsiReceiver:
+class CsiReceiver(ReceiverModel):
     """One or several antennas that report their complex channel on each subcarrier.
 
     The learned field covers the full sphere. Without a basis it and the paths' gains are equal at all antennas and on
@@ -247,7 +272,18 @@ class CsiReceiver:
     elements_m: FloatArray | None = field(default=None, repr=False)
     basis: NDArray[np.complex128] | None = field(default=None, repr=False)
 
-    sphere = True
+    name, tasks = "csi", ("csi",)
+    levels, complex_valued = True, True
+
+    @classmethod
+    def of(cls, form: Form, receiver: Receiver) -> CsiReceiver:
+        """Model of a receiver whose observations have a form."""
+        # Without frequencies no path is evaluated. Narrow channels may state their carrier alone.
+        known = 0.0 if form.frequencies_hz is None else form.frequencies_hz
+        tones = tuple(map(float, np.broadcast_to(known, form.outputs[-1:])))
+        # With features (uplink) each antenna has a condition, so the model has one antenna.
+        several = len(form.outputs) > 1 and not form.features
+        return cls(*form.size, tones, _elements(receiver, form.outputs[0]) if several else None, form.basis)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -306,6 +342,11 @@ class CsiReceiver:
         return np.asarray(antenna_csi(paths, receiver, self.elements_m, self.frequencies_hz)[0])
 
     @property
+    def sums(self) -> Sums | None:
+        """Fields at one antenna; not defined of several."""
+        return "fields" if self.elements_m is None else None
+
+    @property
     def signal_key(self) -> object:
         """Equal for receivers whose `signal_report` is the same function."""
         return CsiReceiver
@@ -341,6 +382,15 @@ class PowerReceiver(CsiReceiver):
     interference: bool = True
     floor: float = LEAST_POWER
 
+    name, tasks, complex_valued = "power", ("rssi",), False
+
+    @classmethod
+    def of(cls, form: Form, receiver: Receiver) -> PowerReceiver:
+        """Model of a receiver whose observations have a form: powers of paths are added."""
+        frequencies_hz = (0.0 if form.frequencies_hz is None else form.carrier_hz,)
+        floor = LEAST_POWER if np.isnan(form.floor_db) else 10 ** (form.floor_db / 10)
+        return cls(*form.size, frequencies_hz, interference=False, floor=floor)
+
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of a report."""
@@ -360,6 +410,11 @@ class PowerReceiver(CsiReceiver):
     def observed(self, paths: Paths, receiver: Receiver) -> NDArray[Any]:
         """Sums of the powers of paths to a receiver [n_tx], dB, NaN where no path arrives."""
         return np.asarray(rssi_dbm(paths)[0])
+
+    @property
+    def sums(self) -> Sums | None:
+        """Powers; not defined with interference."""
+        return None if self.interference else "powers"
 
     @property
     def signal_key(self) -> object:

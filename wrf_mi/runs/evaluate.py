@@ -137,7 +137,7 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         arrays[NOISE_FREE] = np.ones(len(rows), bool)
     if stated[0].reception is not None:
         arrays |= reception_arrays(record, split, truth, dict(zip(scored, stated, strict=True)))
-    metrics = score(arrays, record.task) | {
+    metrics = score(arrays, record.task.name) | {
         NOT_SCORED: broken,
         **_few_rows(record, split),
         "n_train": len(split.all_train),
@@ -160,7 +160,7 @@ def _truth(record: Record, split: Split) -> tuple[NDArray[Any], int, list[int]]:
 
 def _few_rows(record: Record, split: Split) -> dict[str, dict[str, int]]:
     """Block of the receivers of signal strengths with fewer than `FEW_ROWS` training rows that a split trains."""
-    if not TASKS[record.task].in_decibel:
+    if not record.task.shares_law:
         return {}
     counts = rows_received(record, split.all_train)
     trained = np.setdiff1d(np.flatnonzero(counts < FEW_ROWS), split.held_receivers)
@@ -288,7 +288,7 @@ def _stage_scores(record: Record, part: FittedPart, metrics: dict[str, Any], arr
     if not used:
         return {}
     predictions = part.fitted.by_stage(part.split)
-    task, rows = TASKS[record.task], arrays["row"]
+    task, rows = record.task, arrays["row"]
     spaced = evenly_spaced(len(rows), MOST_OF_STAGES)
     truth = arrays["truth"][:, spaced]
     for report in used:
@@ -370,7 +370,7 @@ def reference_predictions(record: Record, split: Split) -> dict[str, Observation
         InputError: data that allow none, uplink and downlink of different numbers of antennas, or a receiver that
             received no training row.
     """
-    task, kind, rows = TASKS[record.task], record.observation.dtype, split.test
+    task, kind, rows = record.task, record.observation.dtype, split.test
     predictions: dict[str, Any] = {}
     if record.uplink is not None and task.from_uplink:
         predictions[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers))
@@ -385,10 +385,10 @@ def reference_predictions(record: Record, split: Split) -> dict[str, Observation
 def _interpolated(record: Record, split: Split) -> dict[str, NDArray[Any]]:
     """References [n_rx, m, ...] that are computed from the positions of training rows."""
     alone = split.held_receivers and not len(split.left)
-    key, entry = (LAW, MRI) if alone else (TASKS[record.task].reference, IDW)
+    key, entry = (LAW, MRI) if alone else (record.task.reference, IDW)
     plain = replace(split, train=split.all_train, validation=split.validation[:0])
     problem = Problem(record, default_settings(entry, (), {})).seen(split)
-    fitted = with_few_rows(entry, record.task).fit(problem, plain, Session(Path(), Path()))  # writes no file
+    fitted = with_few_rows(entry, record.task.name).fit(problem, plain, Session(Path(), Path()))  # writes no file
 
     def of_all(inputs: Inputs) -> NDArray[Any]:
         return np.stack([fitted.predict(inputs, receiver).mean for receiver in range(len(record.receivers))])

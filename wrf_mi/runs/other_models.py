@@ -18,7 +18,6 @@ from ..datasets.folder_files import read_csv
 from ..datasets.observations import place_of
 from ..models import MODELS
 from ..synthetic import load_record
-from ..tasks import TASKS
 from .evaluate import Scores, evaluate, pool, write_results
 from .folder import RunConfig, check_new, new_run_folder, start_run
 from .released_outputs import read_released
@@ -89,7 +88,7 @@ def score_predictions(
     costs = {key: float(arrays.get(key, np.nan)) for key in COSTS}
     source = str(data) if not isinstance(data, Record) else record.source or record.name
     stated: tuple[Any, ...] = (None, None, AntennaOptions(), False, False, {})
-    config = RunConfig(name, source, record.task, split, n_train, seed, *stated)
+    config = RunConfig(name, source, record.task.name, split, n_train, seed, *stated)
     header = {"model": name, "dataset": source, "split": split, "seed": seed, "predictions": str(path)}
     with new_run_folder(folder, overwrite):
         start_run(folder, config, splits)
@@ -109,7 +108,7 @@ def _read_npz(path: Path, record: Record) -> dict[str, NDArray[Any]]:
         arrays = dict(stored_arrays(path))
     if "prediction" not in arrays:
         raise InputError(f"{path}: no array prediction; {REMEDY}")
-    task, number = TASKS[record.task], len(record.receivers)
+    task, number = record.task, len(record.receivers)
     expected = record.observation.shape[2:]
     for key in {"prediction", "std", STD_MEAN} & arrays.keys():
         values = arrays[key]
@@ -140,7 +139,7 @@ def _in_order(path: Path, arrays: dict[str, NDArray[Any]], record: Record) -> di
 
 def _read_csv(path: Path, record: Record) -> dict[str, NDArray[Any]]:
     """Arrays of a ``.csv`` file of signal strengths."""
-    if TASKS[record.task].axes:
+    if record.task.axes:
         raise InputError(f"{path}: .csv holds signal strengths, {record.name} {record.task}; give .npz")
     table = read_csv(path, skip_blank=True)
     names = [receiver.name for receiver in record.receivers]

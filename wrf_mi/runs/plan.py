@@ -28,7 +28,6 @@ from ..estimators.model import default_settings
 from ..estimators.receiver_places import check_placeable, placed_problem, tell_places
 from ..models import MODELS, Model, Problem, known_model
 from ..synthetic import load_record
-from ..tasks import TASKS, task_of
 from ..training.session import OnProgress, quiet
 from .folder import (
     GIVEN,
@@ -60,14 +59,14 @@ def plan_run(
         splits = [replace(rows, wanted_m=wanted_m) for rows in splits]
     for rows in splits:
         check_held_receivers(record, rows, model, MODELS.values())
-        check_observations(record, rows, model.complete, may_be_silent=TASKS[record.task].in_decibel)
+        check_observations(record, rows, model.complete, may_be_silent=record.task.may_be_silent)
     problem = Problem(record, settings, seed, scene, request.material, request.antennas, stated=stated)
     check_placeable(problem, splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = split.name if isinstance(split, Split) else split
     options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
     names = None if stated is None else tuple(sorted(stated))
-    config = RunConfig(request.model, source, record.task, name, request.n_train, *options, names)
+    config = RunConfig(request.model, source, record.task.name, name, request.n_train, *options, names)
     placed = placed_problem(problem.seen(splits[-1]), splits[-1], config.entry, on_progress)
     config.entry.check(placed, splits)
     check_stated(config.entry, placed, splits)
@@ -77,7 +76,7 @@ def plan_run(
 
 def _wanted_m(record: Record, wanted: str | Path | FloatArray) -> FloatArray:
     """Positions where predictions are wanted; `InputError`: none, or a task whose hold-out does not depend on them."""
-    if not task_of(record).in_decibel:
+    if not record.task.in_decibel:
         raise InputError(f"--for: {record.name} holds {record.task}; positions shape the hold-out of rssi; omit it")
     positions_m = np.asarray(read_positions(Path(wanted)).positions_m if isinstance(wanted, str | Path) else wanted)
     if positions_m.ndim != 2 or positions_m.shape[1] != 3 or not np.isfinite(positions_m).all() or not len(positions_m):
@@ -89,7 +88,7 @@ def _serving_model(record: Record, request: RunRequest) -> Model:
     """Registry entry that serves a record; `InputError`: none does, or arguments belong to other models."""
     entry = known_model(request.model)
     check_record(entry, record, (other for other in MODELS.values() if other.scene != "required"))
-    model = entry.serving(record.task, request.scene is not None)
+    model = entry.serving(record.task.name, request.scene is not None)
     for name, option, data in (("evaluation", "", "Gaussians"), ("receiver", "-model", "fields of spectra")):
         if getattr(request, name) is not None and name not in model.train_arguments:
             able = ", ".join(other.name for other in MODELS.values() if name in other.train_arguments)
@@ -157,7 +156,7 @@ def _preset(model: Model, name: str | None) -> tuple[str, ...]:
 def least_rows(record: Record, request: RunRequest) -> int:
     """Training rows below which receivers are left out; by default no receiver of signal strengths is."""
     if request.min_rows is None:
-        return 0 if TASKS[record.task].in_decibel else LEAST_ROWS
+        return 0 if record.task.shares_law else LEAST_ROWS
     if request.min_rows < 0:
         raise InputError(f"min_rows {request.min_rows}: give a number of training rows, 0 or more")
     return request.min_rows

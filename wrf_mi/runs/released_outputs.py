@@ -53,7 +53,7 @@ def read_released(path: Path, record: Record) -> dict[str, NDArray[Any]]:
     kind, read = {".txt": ("rssi", _read_strengths), ".mat": ("csi", _read_channels)}.get(
         path.suffix.lower() if not path.is_dir() else "", ("spectrum", _read_spectra)
     )
-    if record.task != kind:
+    if record.task.name != kind:
         raise InputError(f"{path}: outputs of this form hold {kind}, {record.name} {record.task}; give .npz")
     if record.official is None:
         raise InputError(f"{path}: {place_of(record)} has no test_index.txt, whose order outputs have; give .npz")

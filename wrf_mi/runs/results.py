@@ -268,7 +268,7 @@ def constant_scores(record: Record, split: Split, truth: NDArray[Any]) -> dict[s
     included, that a receiver received; a receiver without any, which the split holds out, takes those of all receivers.
     Truth is NaN where it is not scored.
     """
-    task, rows = TASKS[record.task], split.all_train
+    task, rows = record.task, split.all_train
     observed = record.seen(split).observation[:, rows]
     received = np.asarray(np.isfinite(observed).reshape(*observed.shape[:2], -1).all(axis=2))
     trained: dict[str, list[FloatArray]] = {}

@@ -23,7 +23,6 @@ from ..core.array_files import stored_arrays, write_arrays
 from ..core.types import FloatArray, IntArray
 from ..estimators.held_out import arrays_of_held_out, fold_of, hold_out_once, stored_held_out
 from ..estimators.model import HeldOutPrediction, Model, Problem, Session
-from ..tasks import task_of
 from ..training.by_distance import unit_means
 from ..training.selection import HeldOut, improves, last_gain
 from .stage import Option, Stage, State
@@ -178,7 +177,7 @@ class Engine:
         return last_gain(best_of, higher_is_better=True, confidence=confidence)
 
     def _report(self, stage: Stage, name: str, scores: dict[str, FloatArray], best: str, path: Path) -> OptionReport:
-        sign, mean = 1 if task_of(self._problem.record).higher_is_better else -1, float(scores[name].mean())
+        sign, mean = 1 if self._problem.record.task.higher_is_better else -1, float(scores[name].mean())
         why = "best" if name == best else "no clear gain" if mean > scores[best].mean() else "worse"
         seconds = float(stored_arrays(path)["seconds"])
         return OptionReport(stage.name, name, name == best, f"{why} on held-out rows", sign * mean, seconds)
@@ -191,7 +190,7 @@ class Engine:
         """Mean scores of the independent units of rows that judge a stage by a chain, the higher the better."""
         record, judging = self._problem.record, np.flatnonzero(stage.judging(self._split, fold.held_out.row))
         means = self._predicted(fold, plan).mean[None, judging]
-        of_each = task_of(record).mixtures(means, fold.held_out.observed(record)[judging])
+        of_each = record.task.mixtures(means, fold.held_out.observed(record)[judging])
         return unit_means(of_each(np.ones((len(judging), 1)), np.arange(len(judging))), self._unit(fold)[judging])
 
     def _path(self, plan: Plan, finish: bool = False) -> Path:

@@ -27,7 +27,6 @@ from ..estimators.model import (
     from_field_arrays,
 )
 from ..estimators.reception import Reception
-from ..tasks import task_of
 from ..training.by_distance import LEAST, Intervals, Mixture, expected_size
 from ..training.selection import RowDistance, rows_at_receiver
 from .side import FittedInScene, by_stage
@@ -272,8 +271,7 @@ class FittedMixture(Fitted):
         if len(rows) and self.residuals is not None:
             residual = self.residuals(tx_pos_m[rows], receiver, shape)
             mean[rows] += _spread(residual_weight[rows], shape) * residual
-        if task_of(self.problem.record).image:
-            mean = np.clip(mean, 0, 1)  # residuals leave the range of greys
+        mean = self.problem.record.task.limited(mean)  # residuals leave the range of observations
         prediction = Prediction(mean)
         if std and self.deviations:
             prediction = Prediction(mean, size, std_mean=size_of_mean if np.isfinite(size_of_mean).all() else None)
@@ -302,7 +300,7 @@ class FittedMixture(Fitted):
             factor = self.intervals(mean, np.ones(mean.shape), distance_m).stated_std
             of_mean = None if prediction.std_mean is None else prediction.std_mean * factor
             return Prediction(mean, np.maximum(prediction.stated_std * factor, LEAST), std_mean=of_mean)
-        return self.intervals(mean, expected_size(task_of(self.problem.record), Prediction(mean)), distance_m)
+        return self.intervals(mean, expected_size(self.problem.record.task, Prediction(mean)), distance_m)
 
     def fit_reception(self, rows: HoldOut, every: Sequence[Prediction]) -> None:
         """Fit the probability of reception by the parts' predictions of `HeldOut.every`, fitted without these rows."""

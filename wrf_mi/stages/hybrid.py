@@ -35,7 +35,6 @@ from ..estimators.model import (
     known_positions,
 )
 from ..models import MODELS
-from ..tasks import task_of
 from ..training.by_distance import GAPS
 from ..training.selection import away_as
 from .fitted import FIELD_IN_SCENE, PATHS, TRACED, UPLINK_PARTS, FittedMixture, Residuals, left_over
@@ -80,7 +79,7 @@ class HybridSettings(CheckedSettings):
 
 def scene_side(record: Record) -> Model:
     """Entry of the scene's side; a map of strengths is traced at one carrier."""
-    return TracedStrengths() if task_of(record).in_decibel and record.frequencies_hz is not None else TracedPaths()
+    return TracedStrengths() if record.task.kriged_about_paths and record.frequencies_hz is not None else TracedPaths()
 
 
 def _stages_of(problem: Problem) -> dict[str, str]:
@@ -113,7 +112,7 @@ def _means(problem: Problem) -> list[tuple[str, bool]]:
     if problem.record.uplink is not None:
         of_uplink = [("r2f2-scene", True)] * with_scene + [(name, False) for name in UPLINK_PARTS]
         means = of_uplink if MEAN in settings.wanted else []
-    elif with_scene and task_of(problem.record).receiver_with_scene and {*settings.wanted} & {*STAGES} - {RESIDUAL}:
+    elif with_scene and problem.record.task.receiver_with_scene and {*settings.wanted} & {*STAGES} - {RESIDUAL}:
         means = [(PATHS, True)]
     if settings.stages is not None and FIELD in settings.wanted:
         # The graph of paths has a field itself; beside kriged strengths it is a part of its own, which takes minutes.
@@ -129,14 +128,14 @@ def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
     if name == PATHS:
         return scene_side(problem.record), problem
     model = {FIELD: "wrf-gs+", FIELD_IN_SCENE: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
-    entry = MODELS[model].serving(problem.record.task, scene)
+    entry = MODELS[model].serving(problem.record.task.name, scene)
     arguments = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
     # Those of the hybrid are steps of a field that is a part.
     is_field = name in (FIELD, FIELD_IN_SCENE)
     steps = [f"steps={problem.settings.steps}"] if is_field and problem.settings.steps else []
     settings = default_settings(entry, steps, arguments)
     inner = replace(problem, dataset=problem.record, settings=settings, stated=frozenset())
-    entry = with_few_rows(entry, problem.record.task)
+    entry = with_few_rows(entry, problem.record.task.name)
     return entry, inner if scene else replace(inner, scene=None, material=None)
 
 
@@ -172,12 +171,11 @@ def _fitted(problem: Problem, split: Split, session: Session) -> FittedMixture:
                 left = left_over(side, problem.record, split)
                 residuals = Residuals.of(left, problem.record, split, problem.seed)
     chosen = fit.weights()
-    used, scores, in_decibel = fit.used(chosen), fit.scores(chosen), task_of(problem.record).in_decibel
+    used, scores = fit.used(chosen), fit.scores(chosen)
     # A fit that ends before it is stored goes on from all parts.
     session.discarded.extend(place.folder for name, place in places.items() if name not in used)
     if KRIGING in fit.names and len(fit.names) > 1:
-        # Strengths are kriged about the scene's in every case.
-        gained = in_decibel or not {KRIGING, RESIDUAL}.isdisjoint(used)
+        gained = problem.record.task.kriged_about_paths or not {KRIGING, RESIDUAL}.isdisjoint(used)
         reports.append(StageReport(RESIDUAL, gained, scores.get(NAME), time.perf_counter() - begun))
     stated = {"stages": stated_reports(reports), "form": chosen.form, "held_out": scores}
     fitted = fit.mixture(chosen, residuals, stated)

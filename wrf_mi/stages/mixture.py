@@ -17,7 +17,6 @@ from ..core import InputError, Prediction, Split
 from ..core.types import FloatArray
 from ..estimators.held_out import fit_model, held_out_predictions, hold_out_once, labelled
 from ..estimators.model import Arrays, Fitted, HeldOutPrediction, Model, Problem, Session, known_positions
-from ..tasks import task_of
 from ..training import by_distance
 from ..training.by_distance import SINGLE, Intervals, Mixture
 from ..training.selection import HeldOut
@@ -116,13 +115,13 @@ class MixtureFit:
         assert self.rows is not None
         means = np.stack([prediction.mean for prediction in self.predictions.values()])
         record = self._problem.record
-        return task_of(record).mixtures(means, self.rows.held_out.observed(record))
+        return record.task.mixtures(means, self.rows.held_out.observed(record))
 
     def scores(self, chosen: ChosenWeights) -> dict[str, float]:
         """Mean held-out scores of the predictions and of the mixture, by name; none without held-out rows."""
         if self.rows is None:
             return {}
-        distance_m, higher = self.rows.held_out.distance_m, task_of(self._problem.record).higher_is_better
+        distance_m, higher = self.rows.held_out.distance_m, self._problem.record.task.higher_is_better
         every, alone = np.arange(len(distance_m)), np.eye(len(self.names))
         weights = {
             name: np.broadcast_to(one, (len(every), len(one))) for name, one in zip(self.names, alone, strict=True)
@@ -171,11 +170,11 @@ class MixtureFit:
 
         ``weights`` [q, k] are those that each held-out row has not chosen: intervals are cross-fitted over the groups.
         """
-        task, observed = task_of(self._problem.record), held_out.observed(self._problem.record)
+        task, observed = self._problem.record.task, held_out.observed(self._problem.record)
         states = np.array([name in used and each.std is not None for name, each in self.predictions.items()])
         # Mixed spectra and channels have errors like their magnitudes: what kriging of few rows states is next to
         # nothing at some values, and a factor that suits these is much too wide elsewhere.
-        states &= task.in_decibel or states.all()
+        states &= task.trusts_stated_std or states.all()
         predicted = mixed(weights, [*self.predictions.values()], states)
         mean, of_rows = predicted.mean, (held_out.distance_m, held_out.row, held_out.group)
         # Kriging of two or three rows may pass through all of them.
@@ -185,7 +184,7 @@ class MixtureFit:
         # Few rows tell a factor of stated deviations, not how errors depend on them.
         std, ones = predicted.std, np.ones(mean.shape)
         intervals = by_distance.fit_intervals(mean / std, observed / std, ones, *of_rows)
-        if task.in_decibel:
+        if task.trusts_stated_std:
             # Strengths calibrate what they state by rows that they hold out: few more rows change little of it.
             rows = len(np.unique(held_out.row))
             trust = rows / (rows + STATED_ROWS)

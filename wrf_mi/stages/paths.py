@@ -20,8 +20,7 @@ from ..estimators import model
 from ..estimators.gaussian.model import WRF_GS_PLUS, FittedField
 from ..estimators.held_out import hold_out_once
 from ..estimators.model import Arrays, Model, Problem, Session
-from ..tasks import task_of
-from ..training.config import TrainConfig, calibration_config, task_settings
+from ..training.config import TrainConfig, calibration_config
 from ..training.trainer import Trainer
 from ..training.validation import HeldOutReports
 from .engine import LEAST_ROWS, Engine, Fold
@@ -57,14 +56,14 @@ def config_of(problem: Problem, split: Split, few: bool) -> TrainConfig:
     together from the first step: of six ways the best in the mean of three draws of 5 of the laboratory's training
     rows, judged by 60 others.
     """
-    task, wanted = task_of(problem.record), problem.settings.wanted
+    task, wanted = problem.record.task, problem.settings.wanted
     if FIELD in wanted and not few:
-        config = with_settings(TrainConfig(), task_settings(task.name, task.image, True))
+        config = with_settings(TrainConfig(), task.settings_with_scene)
         if SURFACES not in wanted:
             config = with_settings(config, ["traced.surface=0"])
     else:
         parts = ["gain", *(["materials"] if {CALIBRATION, CORRECTED} & {*wanted} else [])]
-        config = calibration_config([*parts, *(["surface"] if SURFACES in wanted else [])], task.image)
+        config = calibration_config([*parts, *(["surface"] if SURFACES in wanted else [])], task.settings_of_paths)
         config = with_settings(config, ["traced.materials=surface", *(["traced.alone=0"] if few else [])])
     settings = problem.settings
     of_hybrid = [f"seed={problem.seed}", f"deterministic={str(settings.deterministic).lower()}"]
@@ -123,8 +122,8 @@ class PathsStage(Stage):
         if judging < LEAST_ROWS or too_few(problem.record, split):
             return [Option(TRAINED, self._unjudged)]
         options = [Option(AS_TRACED, self._as_traced)]
-        if task_of(problem.record).image and not wanted & {CALIBRATION, CORRECTED, SURFACES, FIELD}:
-            return options  # images have no gain that could be trained
+        if not problem.record.task.has_gain and not wanted & {CALIBRATION, CORRECTED, SURFACES, FIELD}:
+            return options
         stated = [False, True] if {CALIBRATION, CORRECTED} & wanted else [False]
         before = ""
         for freedom, name in enumerate((CALIBRATED, SURFACES, FIELD)):
@@ -142,7 +141,7 @@ class PathsStage(Stage):
         return in_regions(split, row)
 
     def _as_traced(self, state: State, split: Split, session: Session) -> State:
-        config = calibration_config(["gain"], task_of(state.problem.record).image)
+        config = calibration_config(["gain"], state.problem.record.task.settings_of_paths)
         of_gain = replace(state.problem, settings=config, checked=[])
         session.report("tracing", 0.0)
         return replace(state, fitted=FittedPaths(WRF_GS_PLUS.as_traced(of_gain, split, session), state.problem))
@@ -214,7 +213,7 @@ class TracedPaths(Model):
         side = state.fitted
         assert isinstance(side, FittedPaths)
         side.problem, side.unseen, side.options = state.problem, engine.unseen, engine.stated_reports()
-        side.stages = tuple(_reports(engine, side.fitted, task_of(problem.record).higher_is_better))
+        side.stages = tuple(_reports(engine, side.fitted, problem.record.task.higher_is_better))
         # Reports of other carriers have residuals of their own.
         if RESIDUAL in problem.settings.wanted and problem.record.carriers_hz is None:
             side.with_residuals = engine.of_fold("with-residuals", partial(_with_residuals, problem))
@@ -248,7 +247,7 @@ def _with_residuals(problem: Problem, state: State, fold: Fold, mean: FloatArray
         if of_receiver.any():
             at_m = problem.record.tx_pos_m[held_out.row[of_receiver]]
             result[of_receiver] += residuals(at_m, place, mean.shape[1:])
-    return np.clip(result, 0, 1) if task_of(problem.record).image else result
+    return problem.record.task.limited(result)
 
 
 def _reports(engine: Engine, graph: FittedField, higher_is_better: bool) -> list[StageReport]:

@@ -15,7 +15,7 @@ from ..core import Prediction, Split
 from ..correction import default_options
 from ..estimators.gaussian.model import FittedField
 from ..estimators.model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem
-from ..tasks import instrument_of, task_of
+from ..tasks import instrument_of
 from ..tracing import TraceOptions
 from ..tracing.tracer import RayTracer, fit_offsets
 from .scene import CALIBRATION, CORRECTED, FIELD, MEAN, STAGES, SURFACES, StageReport
@@ -98,7 +98,7 @@ def _traced(problem: Problem, split: Split) -> PredictAll:
     assert problem.scene is not None
     tracer = RayTracer(problem.scene, instrument_of(stated), options, problem.material)
     offsets = None
-    if task_of(record).in_decibel:
+    if record.task.has_offsets:
         every = split.all_train
         rows = every[:: -(-len(every) // OFFSET_ROWS)]
         offsets = fit_offsets(tracer(record.tx_pos_m[rows]), record.seen(split).observation[:, rows])

@@ -46,7 +46,7 @@ def load_record(name_or_folder: str | Path | Any, progress: bool = False) -> Rec
         InputError: as `wrf_mi.datasets.load`.
 
     >>> record = load_record("laboratory")
-    >>> record.task, record.observation.shape[2:]
+    >>> record.task.name, record.observation.shape[2:]
     ('spectrum', (90, 360))
     """
     makers: dict[str, Callable[..., Record]] = {LABORATORY: laboratory_record, ROOM: traced_room}

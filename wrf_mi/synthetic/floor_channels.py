@@ -26,6 +26,7 @@ from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..datasets import make_splits, read_nerf2_csi, write_nerf2_csi
+from ..tasks import CSI
 from ..tracing.sionna.scenes import open_scene
 from .searches import Searches, trace_channels
 from .stored import Files, scene_files, stored
@@ -145,7 +146,7 @@ def _trace(scene_folder: Path, name: str, plan: FloorPlan, walk: Walk, progress:
     up, down = (with_noise(band, walk.snr_db, noise) for band in (channel[..., :HALF], channel[..., HALF:]))
     record = Record(
         name=name,
-        task="csi",
+        task=CSI,
         tx_pos_m=positions,
         receivers=(receiver,),
         observation=down.astype(np.complex64)[None],

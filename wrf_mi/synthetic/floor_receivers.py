@@ -28,6 +28,7 @@ from ..datasets.ble_folder import CARRIER_HZ
 from ..datasets.deepmimo import CHANNEL_PARAMS
 from ..datasets.folder_files import write_extra, write_official
 from ..receivers.channel import rssi_dbm
+from ..tasks import RSSI
 from ..tracing.deepmimo import write_deepmimo
 from ..tracing.paths.result import TraceResult
 from ..tracing.paths.solve import trace_paths
@@ -181,7 +182,7 @@ def strengths_of(traced: TraceResult, floor: FloorReceivers) -> Record:
     strength[strength < floor.sensitivity_dbm] = np.nan
     return Record(
         name=NAME,
-        task="rssi",
+        task=RSSI,
         tx_pos_m=traced.tx_pos_m,
         receivers=traced.receivers,
         observation=strength.astype(np.float32),

@@ -34,6 +34,7 @@ from ..datasets import read_spectrum_folder, write_spectrum_folder
 from ..receivers.array import bartlett_spectrum
 from ..receivers.channel import array_channels
 from ..receivers.reports import minmax_scale
+from ..tasks import SPECTRUM
 from ..tracing.options import TraceOptions
 from ..tracing.paths.result import recompute
 from ..tracing.sionna.path_solver import sionna_diffraction
@@ -212,7 +213,7 @@ def _spectra(
     first_test, rows = room.train * len(scenes), np.arange(len(positions) * len(scenes))
     record = Record(
         name=name,
-        task="spectrum",
+        task=SPECTRUM,
         tx_pos_m=np.repeat(positions, len(scenes), axis=0),
         receivers=receivers,
         observation=spectra.reshape(len(receivers), len(rows), *size),

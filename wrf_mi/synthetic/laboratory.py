@@ -17,7 +17,8 @@ from ..core import Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
 from ..datasets import make_splits, read_spectrum_folder, write_spectrum_folder
-from ..receivers.instruments import SpectrumInstrument
+from ..receivers.instruments import Instrument
+from ..tasks import SPECTRUM
 from ..tracing.options import TraceOptions
 from ..tracing.tracer import RayTracer
 from .stored import SCANNED_RAYS, Files, scan_file, stored
@@ -64,9 +65,9 @@ def laboratory_record(folder: str | Path | None = None, progress: bool = False) 
     def write(folder: Path, recipe: Files) -> None:
         positions, frequency_hz = transmitter_path(), np.array([FREQUENCY_HZ])
         receiver = replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M))
-        tracer = RayTracer(info.folder, SpectrumInstrument((receiver,), frequency_hz), OPTIONS)
+        tracer = RayTracer(info.folder, Instrument("array", (receiver,), frequency_hz), OPTIONS)
         spectra = tracer.observe(tracer.trace(positions, progress))
-        record = Record(NAME, "spectrum", positions, (receiver,), spectra, frequencies_hz=frequency_hz)
+        record = Record(NAME, SPECTRUM, positions, (receiver,), spectra, frequencies_hz=frequency_hz)
         split = make_splits(record, "random", seed=OPTIONS.seed)[0]
         record = replace(record, official=(split.all_train, split.test))
         extra = scan_file(info.xml, OPTIONS.seed, SCANNER_M) | recipe

@@ -1,31 +1,23 @@
-"""Tasks: form of observations, score and instrument."""
+"""Tasks of this package: spectra, signal strengths and channels, their losses and the instrument of a record."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+import numpy as np
 
 from ..core import InputError, Record
-from ..core.registry import Registry
-from ..receivers.instruments import Instrument
-from .task import CARRIER, LAW, UPLINK, Csi, Rssi, Spectrum, Task
+from ..core import Task as Task
+from ..core.angles import FloatArray
+from ..core.task import CARRIER, LAW, LOSSES, TASKS, UPLINK, Loss
+from ..receivers.instruments import SIZE, Instrument
+from .csi import Csi
+from .rssi import Rssi
+from .spectrum import Spectrum
 
-ENTRY_POINTS = "wrf_mi.tasks"  # Group of the entry points by which other packages add tasks
-
-
-TASKS: Mapping[str, Task] = Registry("task", ENTRY_POINTS, {task.name: task for task in (Spectrum(), Rssi(), Csi())})
-"""Every task by its name in `wrf_mi.core.Record.task`."""
-
-
-Loss = Callable[..., Any]
-"""``loss(prediction, truth, batch, *shape)``: arguments and result of `Task.loss`, a Dr.Jit float of one value."""
-LOSS_ENTRY_POINTS = "wrf_mi.losses"  # Group of the entry points by which other packages add losses
-LOSSES: Registry[Loss] = Registry(
-    "loss",
-    LOSS_ENTRY_POINTS,
-    {name: f"wrf_mi.tasks.losses:{name.replace('-', '_')}" for name in ("absolute-error", "squared-error")},
+SPECTRUM, RSSI, CSI = Spectrum(), Rssi(), Csi()
+TASKS.add_builtin({task.name: task for task in (SPECTRUM, RSSI, CSI)})
+LOSSES.add_builtin(
+    {name: f"wrf_mi.tasks.losses:{name.replace('-', '_')}" for name in ("absolute-error", "squared-error")}
 )
-"""Losses by name beside those of the tasks, as in ``wrf-mi train --set loss.name=squared-error``."""
 
 
 def known_loss(name: str) -> Loss:
@@ -36,36 +28,43 @@ def known_loss(name: str) -> Loss:
     return LOSSES[name]
 
 
-def task_of(record: Record) -> Task:
-    """The task of a record (InputError: an unknown task)."""
-    if record.task not in TASKS:
-        raise InputError(f"{record.source or record.name}: task {record.task!r}; known are {', '.join(TASKS)}")
-    return TASKS[record.task]
-
-
 def instrument_of(record: Record) -> Instrument:
-    """The instrument of a record (InputError: an unknown task, position, carrier or array)."""
-    return task_of(record).instrument(record)
+    """The instrument of a record, for ray tracing (InputError: an unknown task, position, carrier or array)."""
+    task = record.task
+    if not task.receiver_with_scene:
+        raise InputError(f"{record.name}: no receiver model reports {task.name} from paths; choose another model")
+    frequencies_hz, record = _carrier_hz(record, task.carrier_stated_in), task.with_arrays(record)
+    size = task.image_size(record.observation.shape) or SIZE
+    return Instrument(task.receiver_with_scene, record.receivers, frequencies_hz, record.tx_antenna, size)
+
+
+def _carrier_hz(record: Record, stated_in: str) -> FloatArray:
+    """Frequencies of a record, `InputError` if these or positions are unknown; ``stated_in`` names key and file."""
+    positions = [record.tx_pos_m, *(receiver.position_m for receiver in record.receivers)]
+    if not all(np.isfinite(position_m).all() for position_m in positions):
+        raise InputError(f"{record.name}: positions unknown, so there is nothing to trace between; use another method")
+    if record.frequencies_hz is None:
+        raise InputError(f"{record.name}: carrier frequency unknown; state {stated_in}")
+    return record.frequencies_hz
 
 
 def require(record: Record, *names: str, why: str) -> None:
     """Refuse a record of another task than those named (InputError: the message ends with ``why``)."""
-    if record.task not in names:
-        raise InputError(f"{record.name}: holds {record.task}; {why}")
+    if record.task.name not in names:
+        raise InputError(f"{record.name}: holds {record.task.name}; {why}")
 
 
 __all__ = [
     "CARRIER",
-    "ENTRY_POINTS",
+    "CSI",
     "LAW",
     "LOSSES",
-    "LOSS_ENTRY_POINTS",
+    "RSSI",
+    "SPECTRUM",
     "TASKS",
     "UPLINK",
     "Loss",
-    "Task",
     "instrument_of",
     "known_loss",
     "require",
-    "task_of",
 ]

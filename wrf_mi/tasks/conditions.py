@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Receiver, Record
+from ..core import InputError, Receiver, Record, Task
 from ..core.angles import FloatArray
 from ..core.antenna import UPRIGHT
 from ..core.carriers import middle_carrier
 from ..core.types import IntArray
-from . import instrument_of, task_of
+from . import instrument_of
 
 
 def real_parts(values: NDArray[Any]) -> NDArray[np.float32]:
@@ -74,7 +74,7 @@ def conditions_of(rows: IntArray, outputs: Outputs) -> IntArray:
 
 def outputs_of(record: Record) -> Outputs:
     """The outputs for a record (InputError: other antennas than the uplink's, or several receivers beside one)."""
-    if not task_of(record).is_complex:
+    if not record.task.is_complex:
         known = record.frequencies_hz
         return Outputs(False, 1, np.zeros(1) if known is None else np.asarray(known, float)[:1])
     shape = record.observation.shape
@@ -140,7 +140,7 @@ def known_headings(heading_rad: ArrayLike | None, count: int, used: bool) -> Flo
 
 def channel_scales(record: Record, rows: IntArray) -> FloatArray:
     """Units of each receiver's channels in given rows [n_rx] (`wrf_mi.tasks.Task.unit`); 1 for other tasks."""
-    task = task_of(record)
+    task = record.task
     if not task.is_complex:
         return np.ones(len(record.receivers))
     return np.array([task.unit(observed[rows]) for observed in record.observation])
@@ -155,7 +155,7 @@ def truth_of(
     the receiver's ``scales``, or [n * antennas, 2 outputs] divided as in `normalised_uplink`.
     """
     observed = record.observation[receiver, rows]
-    if not task_of(record).is_complex:
+    if not record.task.is_complex:
         return np.asarray(observed, np.float32).reshape(len(rows), -1)
     if outputs.by_uplink:
         assert record.uplink is not None
@@ -164,6 +164,13 @@ def truth_of(
     else:
         channel = observed / scales[receiver]
     return real_parts(channel.reshape(-1, outputs.count))
+
+
+def observations_from(
+    task: Task, targets: NDArray[Any], divisor: NDArray[Any] | float, shape: tuple[int, ...]
+) -> NDArray[Any]:
+    """Observations of ``shape`` from targets, the inverse of `truth_of`."""
+    return channels_from(targets, divisor, shape) if task.is_complex else targets.reshape(shape)
 
 
 def channels_from(parts: NDArray[Any], divisor: NDArray[Any] | float, shape: tuple[int, ...]) -> NDArray[np.complex64]:

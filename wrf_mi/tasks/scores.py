@@ -14,6 +14,7 @@ from skimage.metrics import structural_similarity
 
 from ..core import InputError, Prediction
 from ..core.angles import FloatArray
+from ..core.task import MixtureScores
 from ..core.types import IntArray
 
 EXACT = np.finfo(float).eps ** 2  # Smallest relative squared error that float64 resolves
@@ -26,8 +27,6 @@ BINS = 10  # Bins of predicted probabilities
 LEVEL = 0.9  # Probability of prediction intervals and regions
 REAL_90, COMPLEX_90 = 1.6449, 1.5174
 """Standard deviations within which a share `LEVEL` of a normal and of a circular complex normal variable lie."""
-MixtureScores = Callable[[FloatArray, IntArray], FloatArray]
-"""From weights [n, k] of sum 1 and numbers [n] of observations to scores [n] of weighted means of k predictions."""
 
 
 def ssim(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:

@@ -180,7 +180,7 @@ def choose_options(
     """Choose depth, rays and kinds of path for a stated error of received power, and of spectra if there are any.
 
     A sample of the transmitters [n, 3] is traced. Kept are kinds of path that are on in ``options``, and the seed;
-    ``kinds`` of `CHOSEN_KINDS` may be switched on. ``spectra``: see `wrf_mi.receivers.instruments.SpectrumInstrument`;
+    ``kinds`` of `CHOSEN_KINDS` may be switched on. ``spectra``: see `wrf_mi.receivers.instruments.Instrument`;
     None: power alone is judged. Where the estimate stays above ``target_db`` (a warning says so), the largest settings
     are taken.
 

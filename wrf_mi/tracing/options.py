@@ -67,7 +67,7 @@ class TraceOptions(SpecularOptions):
         scattering_coefficient: share of the reflected amplitude that every surface scatters, 0..1, if ``scattering`` is
             on; None: that of each material.
         phase_error: standard deviation of the phase that each reflection adds, rad, for errors of a mesh and of its
-            materials; spectra are then expectations (`wrf_mi.receivers.instruments.SpectrumInstrument`).
+            materials; spectra are then expectations (`wrf_mi.receivers.instruments.Instrument`).
     """
 
     line_of_sight: bool = True

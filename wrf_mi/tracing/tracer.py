@@ -16,7 +16,7 @@ from ..core import Antenna, InputError, Receiver
 from ..core.carriers import by_carrier
 from ..core.types import FloatArray, IntArray
 from ..receivers import received_power
-from ..receivers.instruments import Instrument, SpectrumInstrument
+from ..receivers.instruments import Instrument
 from .options import DEFAULTS, TraceOptions
 from .paths.result import TraceResult, recompute, recomputed_gains
 from .paths.solve import Prepared, spread, trace_paths
@@ -37,7 +37,7 @@ class RayTracer:
 
     Args:
         scene: see `wrf_mi.tracing.open_scene`.
-        instrument: receivers and their reports, see `wrf_mi.tasks.Task.instrument`.
+        instrument: receivers and their reports, see `wrf_mi.tasks.instrument_of`.
         options: kinds of path, depth, rays.
         material: radio material of a bare mesh.
 
@@ -51,9 +51,7 @@ class RayTracer:
     def __init__(
         self, scene: str | Path, instrument: Instrument, options: TraceOptions = DEFAULTS, material: str | None = None
     ) -> None:
-        if options.phase_error and isinstance(instrument, SpectrumInstrument):
-            instrument = replace(instrument, phase_error=options.phase_error)
-        self.instrument = instrument
+        self.instrument = replace(instrument, phase_error=options.phase_error or instrument.phase_error)
         self.options = options
         self._at = cache(partial(open_scene, scene, material=material))
         self.scene = self._at(instrument.carrier_hz)

@@ -307,12 +307,9 @@ class Intervals:
 def expected_size(task: Task, prediction: Prediction) -> FloatArray:
     """Size of the expected error of each value, from which intervals are calibrated.
 
-    The standard deviation that a model states; else the magnitude of the prediction, but for powers in decibels, whose
-    magnitude says nothing about the error.
+    The standard deviation that a model states; else what the task expects (`wrf_mi.core.Task.error_size`).
     """
-    if prediction.std is not None:
-        return prediction.std
-    return np.ones(prediction.mean.shape) if task.in_decibel else np.abs(prediction.mean).astype(float)
+    return task.error_size(prediction.mean) if prediction.std is None else prediction.std
 
 
 def fit_intervals(

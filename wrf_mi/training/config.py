@@ -13,8 +13,8 @@ from pydantic import Field
 from ..core import InputError, Split
 from ..core.settings import NOT_NEGATIVE, CheckedSettings, Count, Inside, Positive, Share, ShareBelow1, with_settings
 from ..gaussians.network import unambiguous_scale
-from ..graph.receivers import AUTO
 from ..graph.settings import SPLATTED, EvaluationName, TracedConfig
+from ..receivers.registry import AUTO
 from ..tasks import TASKS
 
 AcuteAngle = Annotated[float, Field(gt=0, lt=90, description="more than 0 and less than 90")]
@@ -190,9 +190,9 @@ class TrainConfig(LoopConfig):
         seed: seed of starting values and of the order of rows.
         deterministic: bit-identical results from run to run, on one thread of the CPU.
         loss: loss of the training.
-        receiver: receiver model (`wrf_mi.graph.receivers`). For spectra ``"pixel"``: magnitude at each direction (the
-            papers'), ``"array"``: the Bartlett spectrum of the array's element signals, scaled as the instrument does;
-            ``"auto"``: array with a scene, else pixel. For signal strengths ``"power"``, for channels ``"csi"``.
+        receiver: receiver model (`wrf_mi.receivers.registry`). For spectra ``"pixel"``: magnitude at each direction
+            (the papers'), ``"array"``: the Bartlett spectrum of the array's element signals, scaled as the instrument
+            does; ``"auto"``: array with a scene, else pixel. For signal strengths ``"power"``, for channels ``"csi"``.
         evaluation: evaluation of Gaussians in steps and predictions: ``"splatted"``, or ``"traced"`` by ``mi.render``
             with the Mitsuba plugins, where walls of a scene attenuate what lies behind them; a step then takes several
             times as long.
@@ -249,21 +249,8 @@ The paper states no scale of coordinates; metres are assumed. Loss, networks and
 FAST = ("steps=6000", "initial.gaussians=150", "density.every=0", "optimiser.ema_decay=0.998")
 """Half of the time for a hundredth of the median SSIM of `rfid-lab`: fewer steps of fewer Gaussians."""
 
-ONE_ANTENNA = (
-    "batch=16",
-    "steps=18000",
-    "initial.gaussians=60",
-    "initial.size_deg=15",
-    "network.width=64",
-    "network.layers=4",
-    "density.every=0",
-    "validate_every=500",
-    "patience=8",
-)
-"""Settings of a field of signal strengths or channels that differ from a field of spectra: few numbers result."""
 PATHS = ("steps=500", "batch=128", "holdout_steps_fraction=0.9", "validate_every=50", "patience=8", "density.every=0")
 """Settings of paths alone: few parameters converge soon."""
-PATHS_OF_IMAGES = ("batch=8",)  # further settings where observations are images of thousands of numbers
 HELD = ("traced.gain=0", "traced.material=0", "traced.pattern=0", "traced.surface=0")
 CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "gain": ("traced.gain=0.05",),
@@ -274,44 +261,18 @@ CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "surface": ("traced.surface=0.02",),
 }
 """Trainable parts of the traced side by name; rates as ``--set`` takes them."""
-JOINT_ONE_ANTENNA = (*ONE_ANTENNA, "traced.alone=0.05", "traced.materials=surface")
-"""Settings of Gaussians beside the paths of a scene for one antenna: the few parameters of paths converge soon."""
-JOINT_STRENGTHS = (*JOINT_ONE_ANTENNA, "traced.depth=6", "traced.reflections=2", "traced.pattern_degree=3")
-"""Settings for signal strengths: paths through walls of two surfaces each, and shadowing by the carrier's body."""
-JOINT_IMAGES = (
-    "batch=8",
-    "steps=2000",
-    # Paths explain most of an image: a network of an eighth of the operations corrects them as well, in half the time.
-    "network.width=128",
-    "network.layers=4",
-    "initial.signal=0.02",
-    "density.every=0",
-    "validate_every=100",
-    "patience=3",
-    "traced.alone=0.15",
-    "traced.materials=surface",
-)
-"""Settings where observations are images: paths explain most of one, and Gaussians add little at first."""
-ALONE: Mapping[str, tuple[str, ...]] = {"rssi": ONE_ANTENNA, "csi": ONE_ANTENNA}
-JOINT: Mapping[str, tuple[str, ...]] = {"rssi": JOINT_STRENGTHS, "csi": JOINT_ONE_ANTENNA}
-"""Settings by task, without and with a scene."""
-
-
-def task_settings(task: str, image: bool, with_scene: bool) -> tuple[str, ...]:
-    """Settings of a task that differ from `TrainConfig`; ``image``: whether observations are images."""
-    # Images are the papers' task: `TrainConfig` has their settings.
-    if image:
-        return JOINT_IMAGES if with_scene else ()
-    return (JOINT if with_scene else ALONE).get(task, ())
 
 
 def default_config(task: str, with_scene: bool = False) -> TrainConfig:
     """Default settings for a task, without or with the paths of a scene."""
-    return with_settings(TrainConfig(), task_settings(task, TASKS[task].image, with_scene))
+    kind = TASKS[task]
+    return with_settings(TrainConfig(), kind.settings_with_scene if with_scene else kind.settings)
 
 
-def calibration_config(parts: Iterable[str], images: bool = False) -> TrainConfig:
-    """The settings of a fit of paths alone, of the parts of `CALIBRATED`; ``images``: whether observations are images.
+def calibration_config(parts: Iterable[str], further: Iterable[str] = ()) -> TrainConfig:
+    """The settings of a fit of paths alone, of the parts of `CALIBRATED`.
+
+    ``further`` are those of the task (`wrf_mi.core.Task.settings_of_paths`).
 
     Raises:
         InputError: no part, or an unknown one.
@@ -322,8 +283,7 @@ def calibration_config(parts: Iterable[str], images: bool = False) -> TrainConfi
         raise InputError(f"calibration {','.join(unknown) or 'of nothing'}: choose of {', '.join(CALIBRATED)}")
     # All parts are held first, as the settings of paths train some of them by default.
     moved = [setting for part in chosen for setting in CALIBRATED[part]]
-    more = PATHS_OF_IMAGES if images else ()
-    return with_settings(TrainConfig(), [f"model={PATHS_ALONE}", *PATHS, *more, *HELD, *moved])
+    return with_settings(TrainConfig(), [f"model={PATHS_ALONE}", *PATHS, *further, *HELD, *moved])
 
 
 BEST = ("steps=15000",)  # two thirds more time for a few thousandths of the median SSIM

@@ -32,7 +32,7 @@ from ..gaussians.operator import Images, PixelOperator, pixel_weights, static_si
 from ..gaussians.parameters import CHUNK_SIZE
 from ..gaussians.tiles import perception_plane
 from ..graph.graph import Alone, Batch, Field, Graph, Report
-from ..graph.receivers import PIXEL
+from ..receivers.registry import PIXEL
 from ..receivers.reports import SQUARED_MAGNITUDE_EPS
 from ..tracing.paths.traced_field import TracedField
 from ..version import __version__

@@ -14,7 +14,7 @@ from ..datasets.observations import LARGEST, computable
 from ..gaussians import FIELDS, Encoding, random_gaussians
 from ..gaussians.attributes import with_attributes
 from ..graph.graph import Field
-from ..graph.receivers import Form
+from ..receivers.registry import Form
 from .config import PATHS_ALONE, NetworkConfig, TrainConfig
 
 BYTES_PER_NEURON, BYTES_PER_PAIR, BYTES_PER_NUMBER = 11, 1000, 24

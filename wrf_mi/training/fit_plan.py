@@ -18,8 +18,8 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..datasets.observations import check_observations, check_rows
 from ..graph.graph import Field, Graph
-from ..graph.receivers import AUTO, Form, receiver_kind
-from ..tasks import Loss, known_loss, task_of
+from ..receivers.registry import AUTO, Form, receiver_model
+from ..tasks import Loss, known_loss
 from ..tasks.conditions import normalised_uplink, outputs_of, placed_receivers
 from ..tracing.paths.traced_field import TracedField
 from .adam import Schedule, density_rounds, plan
@@ -77,7 +77,7 @@ def targets_of(record: Record, rows: IntArray, with_scene: bool = False) -> Targ
     Raises:
         InputError: an unknown position, or an uplink without a signal or with a different number of antennas.
     """
-    task, observed = task_of(record), np.asarray(record.observation)
+    task, observed = record.task, np.asarray(record.observation)
     if record.uplink is None or with_scene:
         if not np.isfinite(record.tx_pos_m[rows]).all():
             row = int(rows[~np.isfinite(record.tx_pos_m[rows]).all(axis=1)][0])
@@ -123,13 +123,13 @@ def _real(values: NDArray[np.generic]) -> NDArray[np.float32]:
 
 def _receiver_of(record: Record, config: TrainConfig, with_scene: bool) -> str:
     """Name of the receiver model that reports a record (InputError: none, or one that it does not suit)."""
-    task = task_of(record)
+    task = record.task
     default = task.receiver_with_scene if with_scene else task.receiver
     if not default:
         raise InputError(f"{record.name}: no receiver model reports {task.name}; choose another model")
     name = default if config.receiver == AUTO else config.receiver
-    receiver_kind(name, task.name)
-    arrays = task.is_complex and record.observation.ndim > 3
+    receiver_model(name, task.name)
+    arrays = len(task.outputs(record.observation.shape[2:])) > 1
     if with_scene and arrays and any(receiver.array_m is None for receiver in record.receivers):
         raise InputError(f"{record.name}: antennas' positions unknown; state base_station in base-station.yml")
     return name
@@ -137,15 +137,14 @@ def _receiver_of(record: Record, config: TrainConfig, with_scene: bool) -> str:
 
 def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> Form:
     """Form of a record's observations, whose basis is computed from training ``rows`` (InputError: unsuitable)."""
-    task, name = task_of(record), _receiver_of(record, config, with_scene)
-    height, width = map(int, record.observation.shape[-2:] if task.image else (config.view.height, config.view.columns))
-    basis, outputs = None, tuple[int, ...]()
-    if task.is_complex:
-        basis, outputs = _basis(targets, rows, config.view.components), tuple(map(int, record.observation.shape[2:]))
+    task, name = record.task, _receiver_of(record, config, with_scene)
+    shape = record.observation.shape[2:]
+    height, width = task.image_size(shape) or (config.view.height, config.view.columns)
+    outputs = task.outputs(shape)
+    basis = _basis(targets, rows, config.view.components) if outputs else None
     features = 0 if record.uplink is None or with_scene else len(targets.condition)
     headings = with_scene and config.traced.pattern_degree > 0 and record.tx_heading_rad is not None
-    # The tracer finds no path through many walls; what was measured there is the weakest of all.
-    floor_db = float(np.nanmin(record.observation[:, rows])) if with_scene and task.in_decibel else np.nan
+    floor_db = task.floor_db(record.observation[:, rows]) if with_scene else np.nan
     size, carriers_hz = (height, width), targets.carriers_hz
     return Form(name, size, record.frequencies_hz, outputs, basis, features, headings, floor_db, carriers_hz)
 
@@ -202,9 +201,9 @@ class FitPlan:
         held_out: bool = False,
     ) -> None:
         check_rows(split, record, f"split {split.name}")
-        self.task, name = task_of(record), config.loss.name
+        self.task, name = record.task, config.loss.name
         self.loss: Loss = known_loss(name) if name else partial(self.task.loss, ssim_weight=config.loss.ssim_weight)
-        check_observations(record, split, complete=self.task.image)
+        check_observations(record, split, complete=self.task.complete)
         rows = split.all_train
         config = config.resolved(record.tx_pos_m[rows])
         self.record, self.split, self.config = record, split, config

@@ -20,7 +20,7 @@ from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..gaussians.parameters import Gaussians
 from ..graph.graph import Alone, Field, Graph
-from ..graph.receivers import PIXEL, Form
+from ..receivers.registry import PIXEL, Form
 from ..receivers.spreads import PathStatistics, joined
 from ..tasks.conditions import known_headings, normalised_uplink
 from ..tracing.paths.traced_field import TracedField

@@ -25,7 +25,6 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..datasets.observations import LEAST_ROWS, fitted_receivers, rows_received
 from ..datasets.splits import rows_left
-from ..tasks import task_of
 
 Option = TypeVar("Option")
 
@@ -377,7 +376,7 @@ def _received_or_not(record: Record, fold: Split, seed: int) -> IntArray:
     trained = np.concatenate([fold.all_train, fold.test])
     if (
         fold.held_receivers
-        or not task_of(record).in_decibel
+        or not record.task.may_be_silent
         or not np.isnan(record.observation[numbers][:, trained]).any()
     ):
         return np.zeros((0, 2), np.int64)

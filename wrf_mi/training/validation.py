@@ -147,7 +147,7 @@ class Validation:
         """
         plan, rows = self.plan, self._held_out(False)
         best = self._held_out_reports(predict, state, rows)
-        if plan.graph.scene is None or not plan.task.image:
+        if plan.graph.scene is None or not plan.task.averages_phases:
             return best
         observed = np.concatenate([self._observed(port, port_rows) for port, port_rows in enumerate(rows)])
         before = np.ravel(plan.task.training_score(best, observed))

@@ -94,7 +94,7 @@ class DataReport:
             "dataset": self.dataset,
             "ok": self.ok,
             "source": self.source,
-            "task": None if record is None else record.task,
+            "task": None if record is None else record.task.name,
             "rows": None if record is None else len(record),
             "faults": [_plain(fault) for fault in self.faults],
             "suspicions": [asdict(suspicion) for suspicion in self.suspicions],

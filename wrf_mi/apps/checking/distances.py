@@ -6,7 +6,6 @@ import numpy as np
 
 from ...core import Prediction, Record
 from ...core.angles import FloatArray
-from ...tasks import task_of
 from .units import NamedTexts
 
 FEWEST_ROWS = 30
@@ -29,7 +28,7 @@ def unlike_units(record: Record) -> NamedTexts:
     surveyed = np.isfinite(places).all(axis=1)
     # With a single receiver a factor moves the rows as another place of it would.
     enough = surveyed.sum() >= 2 and len(record) >= FEWEST_ROWS
-    if record.task not in ("rssi", "csi") or not record.has_positions or not enough:
+    if record.task.name not in ("rssi", "csi") or not record.has_positions or not enough:
         return
     rows = np.linspace(0, len(record) - 1, min(len(record), MOST_ROWS)).astype(int)
     levels, places = levels_db(record)[surveyed][:, rows], places[surveyed]
@@ -60,7 +59,7 @@ def _distances_m(at_m: FloatArray, places_m: FloatArray) -> FloatArray:
 
 def levels_db(record: Record) -> FloatArray:
     """Received power [n_rx, n] in dB, NaN where nothing was received."""
-    task = task_of(record)
+    task = record.task
     return np.stack([task.level(Prediction(observed)).mean for observed in record.observation]).astype(float)
 
 

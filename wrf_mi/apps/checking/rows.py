@@ -15,7 +15,6 @@ from ...core.files import listed
 from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS, LEAST_ROWS, fitted_receivers
 from ...datasets.sentinels import suspicious_values
-from ...tasks import task_of
 from .units import NamedTexts, is_above_0_dbm
 
 FEWEST_STRENGTHS = 4
@@ -35,10 +34,10 @@ APART = (
 
 def not_heard(record: Record) -> NamedTexts:
     """Numbers for "not heard" among signal strengths, and channels and spectra of zeros."""
-    if record.task == "rssi":
+    if record.task.name == "rssi":
         yield from _strengths(record)
         return
-    what = {"csi": "channels", "spectrum": "spectra"}.get(record.task)
+    what = {"csi": "channels", "spectrum": "spectra"}.get(record.task.name)
     if what is None:
         return
     for receiver, observed in zip(record.receivers, record.observation, strict=True):
@@ -91,7 +90,7 @@ def _percent(share: float) -> str:
 
 def few_rows(record: Record) -> NamedTexts:
     """Receivers that received too few training rows to be fitted, of the official split or of all rows."""
-    strengths = task_of(record).in_decibel
+    strengths = record.task.shares_law
     least = FEW_ROWS if strengths else LEAST_ROWS
     train, _ = record.official or (np.arange(len(record)), None)
     split = Split("official" if record.official else "all rows", 0, train, np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -114,7 +113,7 @@ def named_rows(rows: IntArray) -> str:
 
 def repeated_rows(record: Record) -> NamedTexts:
     """Rows with position, conditions and observation of an earlier row, and test rows among the training rows."""
-    received = _received_values(record) >= (FEWEST_STRENGTHS if record.task == "rssi" else 1)
+    received = _received_values(record) >= (FEWEST_STRENGTHS if record.task.name == "rssi" else 1)
     per_receiver = (record.observation, record.n_readings, record.std)
     parts = [np.moveaxis(part, 1, 0) for part in per_receiver if part is not None]
     per_row = (record.tx_pos_m, record.tx_heading_rad, record.carriers_hz, record.uplink)
@@ -143,7 +142,7 @@ def constant_observations(record: Record) -> NamedTexts:
         if len(received) > 1 and (values[received] == values[received[0]]).all():
             what = "received the same in every row; give what was measured, or leave the receiver out"
             yield "constant", f"receiver {receiver.name}: {what}"
-        elif record.task == "spectrum":
+        elif record.task.name == "spectrum":
             # Spectra of zeros are reported as not heard.
             blank = np.flatnonzero((values.min(axis=1) == values.max(axis=1)) & values.any(axis=1))
             if len(blank):

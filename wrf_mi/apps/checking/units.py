@@ -55,7 +55,7 @@ def far_from_origin(record: Record) -> str | None:
 
 def strength_scale(record: Record) -> NamedTexts:
     """Signal strengths of receivers that are nowhere below 0 dBm, 1 mW: a few metres from a strong transmitter."""
-    if record.task != "rssi":
+    if record.task.name != "rssi":
         return
     pairs = zip(record.receivers, record.observation, strict=True)
     if names := [receiver.name for receiver, observed in pairs if is_above_0_dbm(observed)]:

@@ -185,7 +185,7 @@ def summary(record: Record) -> dict[str, Any]:
     hz_of = record.receiver_carriers_hz
     return {
         "name": record.name,
-        "task": record.task,
+        "task": record.task.name,
         "source": record.source,
         "rows": len(record),
         "receivers": {r.name: int(count) for r, count in zip(record.receivers, received.sum(axis=1), strict=True)},

@@ -100,8 +100,8 @@ def _written(task: str | None, write: Callable[[Path, Record, bool], object]) ->
 
     def write_layout(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
         record = source.record(options.progress)
-        if task is not None and record.task != task:
-            layouts = ", ".join(name for name, of in TASKS_OF.items() if of in (record.task, None))
+        if task is not None and record.task.name != task:
+            layouts = ", ".join(name for name, of in TASKS_OF.items() if of in (record.task.name, None))
             raise InputError(f"{source.name}: a data set of {record.task}, the layout holds {task}; choose {layouts}")
         write(out, record, options.replace)
         return {"rows": len(record), "receivers": len(record.receivers)}

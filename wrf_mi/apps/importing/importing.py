@@ -20,6 +20,7 @@ from ...core.files import listed, one_line
 from ...core.types import IntArray
 from ...datasets.ble_folder import CARRIER_HZ, write_ble_folder
 from ...datasets.unknown import SENT, name_words
+from ...tasks import RSSI
 from .files import Table, joined, read_table
 from .forms import HERTZ, described, find_columns, parsed_columns, unit_of, without_slots
 from .options import ImportOptions, option_name
@@ -351,7 +352,7 @@ class _Import:
             self.notes.append(f"no carrier is stated: {carrier_hz:.4g} Hz (--frequency)")
         return Record(
             name=self.out.name,
-            task="rssi",
+            task=RSSI,
             tx_pos_m=position_m,
             receivers=receivers,
             observation=means.dbm.round(STRENGTH_DIGITS).astype(np.float32),

@@ -53,7 +53,7 @@ from ...parallel import Scheduler, row_parts
 from ...receivers.spreads import PathStatistics
 from ...runs.results import RECEPTION
 from ...runs.run import Run, open_run
-from ...tasks import Task, task_of
+from ...tasks import Task
 from ...training.session import OnProgress, quiet
 from . import grid
 from .coverage import coverage_probability
@@ -110,7 +110,7 @@ def radio_map(
     """
     opened = run if isinstance(run, Run) else open_run(run)
     maps_package("xarray")
-    task = task_of(opened.problem.record)
+    task = opened.problem.record.task
     _check(opened, task, surface, height_m, transmit_dbm, threshold_dbm)
     known = opened.receivers
     numbers = range(len(known)) if receivers is None else [receiver_index(known, name) for name in receivers]
@@ -256,7 +256,7 @@ def _mapped_part(
 def _of_chunk(
     run: Run, fitted: Fitted, positions_m: FloatArray, receiver: int, conditions: Conditions
 ) -> dict[str, Any]:
-    task, count = task_of(run.problem.record), len(positions_m)
+    task, count = run.problem.record.task, len(positions_m)
     inputs = conditions.inputs(positions_m)
     parts = fitted.decompose(inputs, receiver)
     added = conditions.transmit_dbm if task.level_kind == "gain" else 0.0

@@ -21,7 +21,6 @@ from ...datasets.labelled import of_receivers
 from ...models import Session
 from ...runs.folder import load_rows
 from ...runs.run import Run, open_run
-from ...tasks import task_of
 from ...tasks.scores import LEVEL
 from ...training.session import Interrupted, OnProgress, quiet
 from .grid import Candidates, candidates_of
@@ -87,7 +86,7 @@ def located_run(run: str | Path | Run) -> Run:
     """
     opened = open_run(run) if not isinstance(run, Run) else run
     record = opened.problem.record
-    task = task_of(record)
+    task = record.task
     if not task.in_decibel or task.axes:
         text = f"predicts {task.name}; positions are found from powers in decibels"
         raise InputError(f"{opened.folder}: {text}; give a run on signal strengths")

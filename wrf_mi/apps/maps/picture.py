@@ -27,7 +27,6 @@ from ...runs.run import Run
 from ...runs.scene_view import surfaces_of
 from ...scene.mesh.surfaces import cut_lines
 from ...scene.preview import AZIMUTH_DEG, ELEVATION_DEG, MOST_FACES
-from ...tasks import task_of
 from .dataset import COVERAGE, POWER, STD, STD_OF_MEAN
 
 if TYPE_CHECKING:
@@ -287,7 +286,7 @@ def _draw_mesh(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: 
 def _measured(dataset: xarray.Dataset, run: Run, number: int) -> _Measured:
     """Rows with a level at a receiver of a map, at its carrier, thinned."""
     record, split = run.problem.record, load_rows(run.folder, run.problem.record)
-    task, index = task_of(record), int(np.atleast_1d(dataset.attrs["receiver_numbers"])[number])
+    task, index = record.task, int(np.atleast_1d(dataset.attrs["receiver_numbers"])[number])
     added = float(dataset.attrs["transmit_power_dbm"]) if task.level_kind == "gain" else 0.0
     level = task.level(Prediction(record.observation[index])).mean + added
     known = np.isfinite(level) & np.isfinite(record.tx_pos_m).all(axis=1)

@@ -19,15 +19,15 @@ from ...core import Antenna, InputError, Prediction, Receiver, Split, receiver_a
 from ...core.array_files import keyed, under
 from ...core.settings import names_of
 from ...graph.graph import Graph
-from ...graph.receivers import GAPS, Form
 from ...graph.settings import TRACED_NAMES
+from ...receivers.registry import GAPS, Form
 from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers, scene_carrier
 from ...tracing.options import without_effect
 from ...tracing.paths.edited_scene import parameters_in
 from ...training.by_distance import Reach
 from ...training.checkpoint import CHECKPOINT, LOG, append_log, cut_log, read_checkpoint, write_checkpoint
-from ...training.config import PRESETS, TrainConfig, task_settings, unused_of_loop, validates
+from ...training.config import PRESETS, TrainConfig, unused_of_loop, validates
 from ...training.fields import check_params, field_of
 from ...training.fit_plan import FitPlan
 from ...training.initial import initial_gaussians, starting_values
@@ -228,8 +228,12 @@ class GaussianField(Model):
         self.name, self.summary = name, summary
         if task is not None:
             # A training step evaluates all pixels of a spectrum at once, so that none may be missing.
-            self.complete = TASKS[task].image
-            self.defaults = task_settings(task, self.complete, with_scene)
+            self.complete = TASKS[task].complete
+            self.defaults = TASKS[task].settings_with_scene if with_scene else TASKS[task].settings
+
+    def serves(self, task: str) -> bool:
+        """Whether a receiver model reports the task, also one of another package."""
+        return bool(TASKS[task].receiver)
 
     def serving(self, task: str, with_scene: bool) -> Model:
         """The model with its default settings for data of a task, with or without a scene."""
@@ -298,9 +302,8 @@ class GaussianField(Model):
     def as_traced(self, problem: Problem, split: Split, session: Session) -> FittedField:
         """The paths of a scene without any training, with the gains that training would start from."""
         plan = self._plan(problem, split)
-        # Images are scaled to their extremes: there is no gain, and no row has to be traced.
-        sides = [] if plan.task.image else plan.traced()
-        params = {} if plan.task.image else starting_values(plan, sides, (), None)
+        # Without a gain no row has to be traced.
+        params = starting_values(plan, plan.traced(), (), None) if plan.task.has_gain else {}
         return FittedField(self._arrays(plan, params, problem, split), plan.config, problem, session.folder)
 
     def _trainer(self, session: Session, plan: FitPlan, before: Trainer | None) -> Trainer:

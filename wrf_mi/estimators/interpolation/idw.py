@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from ...core import InputError, Receiver, Split
-from ...tasks import task_of
 from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows, observed_rows
 
@@ -106,7 +105,7 @@ class Idw(ByReceiverModel):
     def fit_single(self, rows: ReceiverRows) -> InverseDistance:
         """Keep the rows of a receiver."""
         settings: IdwSettings = rows.problem.settings
-        task, k = task_of(rows.problem.record), _count(rows.problem)
+        task, k = rows.problem.record.task, _count(rows.problem)
         softening_m = task.softening_m if settings.softening_m is None else settings.softening_m
         return InverseDistance(k, settings.power, softening_m).fit(rows.tx_pos_m, rows.observation)
 
@@ -117,7 +116,7 @@ class Idw(ByReceiverModel):
 
 def _count(problem: Problem) -> int:
     stated: int | None = problem.settings.neighbours
-    return task_of(problem.record).neighbours if stated is None else stated
+    return problem.record.task.neighbours if stated is None else stated
 
 
 MODEL = Idw()

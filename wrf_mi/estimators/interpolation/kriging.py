@@ -21,7 +21,6 @@ from scipy.optimize import minimize
 from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, names_of
-from ...tasks import task_of
 from ..model import Arrays, Problem
 from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
@@ -303,7 +302,7 @@ class GenericKriging(ByReceiverModel):
 
     def takes_headings(self, record: Record, settings: KrigingSettings) -> bool:
         """Whether the settings let headings count, which matter to strengths alone."""
-        return settings.heading and task_of(record).in_decibel
+        return settings.heading and record.task.follows_heading
 
     def uses_places(self, problem: Problem, splits: Sequence[Split]) -> bool:
         """Whether its trend is a law of distance."""
@@ -336,7 +335,7 @@ class GenericKriging(ByReceiverModel):
 
 
 def _trend_name(problem: Problem) -> str:
-    return problem.settings.trend or (LOG_DISTANCE if task_of(problem.record).in_decibel else CONSTANT)
+    return problem.settings.trend or (LOG_DISTANCE if problem.record.task.shares_law else CONSTANT)
 
 
 def _trend(name: str, receiver: Receiver) -> Trend:

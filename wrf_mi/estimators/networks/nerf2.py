@@ -34,8 +34,7 @@ from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.settings import Count
 from ...core.types import IntArray
-from ...receivers.reports import SQUARED_MAGNITUDE_EPS
-from ...tasks import Task, conditions, task_of
+from ...tasks import conditions
 from ...training.config import AdamConfig, unused_of_loop, validates
 from ...training.session import FitSession
 from .. import model
@@ -44,7 +43,6 @@ from .layers import Coordinates, columns, feature_count
 from .nerf2_march import Nerf2Network, Networks, RayPoints, constant_parts, look, march
 from .training import Network, NetworkSettings, network_adam, opaque_rows, train_network
 
-DB_UNIT = 10.0  # unit of the loss of signal strengths, dB
 POINTS_PER_CHUNK = 1 << 15  # points whose attenuation is evaluated together in predictions
 PAIRS_PER_CHUNK = 1 << 18
 """Pairs of a point and a condition that are evaluated together in predictions: bounds the memory."""
@@ -83,25 +81,6 @@ def rays_of(data: Mapping[str, Any], receiver: Any, picked: Any, count: int) -> 
     return {**data, "direction": direction, "origin": origin}
 
 
-def report(offset: Any, parts: tuple[Any, Any], task: Task, shape: tuple[int, int, int], rx: Any) -> Any:
-    """Report of the instrument, from the rays' flat parts [outputs * batch * rays]; a tensor.
-
-    Greys [batch, rays]; powers in dBm [batch, 1]; channels' real parts, then imaginary ones, [batch, 2 outputs].
-    """
-    outputs, batch, rays = shape
-    re, im = parts
-    tensor = type(offset)
-    if task.image:
-        return tensor(dr.sqrt(re * re + im * im + SQUARED_MAGNITUDE_EPS), (batch, rays))
-    # Rays have equal solid angles; the root makes the size of incoherent sums independent of the number of rays.
-    re, im = (dr.block_sum(part, rays) * (1 / np.sqrt(rays)) for part in (re, im))
-    if task.in_decibel:
-        decibels = float(10 / np.log(10)) * dr.log(re * re + im * im + SQUARED_MAGNITUDE_EPS)
-        return tensor(dr.gather(type(re), offset.array, rx) + decibels, (batch, 1))
-    both = tensor(dr.concat([re, im]), (2 * outputs, batch))
-    return dr.moveaxis(both, 0, 1)
-
-
 class Nerf2Field(Fitted):
     """A fitted field, evaluated in two steps that are recorded once.
 
@@ -109,6 +88,7 @@ class Nerf2Field(Fitted):
     ``scales`` are the units of the receivers' channels, [n_rx].
 
     Attributes:
+        by_pixel: whether rays go through the pixels of spectra.
         groups: indices of the receivers that share networks.
         data: constants of every evaluation on the device: rays of all receivers, and `constant_parts`.
         network: networks whose weights are to be replaced.
@@ -122,17 +102,16 @@ class Nerf2Field(Fitted):
         self, record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
     ) -> None:
         self.settings, self.coordinates, self.far_m, self.scales = settings, coordinates, far_m, scales
-        self.outputs, self.task = conditions.outputs_of(record), task_of(record)
+        self.outputs, self.task = conditions.outputs_of(record), record.task
         self._shape = record.observation.shape[2:]
         self.networks: list[Nerf2Network] = []
         self._points: tuple[int, list[RayPoints]] | None = None
         receivers = conditions.placed_receivers(record, self.outputs.by_uplink)
         everyone = tuple(range(len(receivers)))
         self.groups: tuple[tuple[int, ...], ...] = (everyone,) if settings.shared else tuple((r,) for r in everyone)
-        if self.task.image:
-            rays = pixel_directions(*record.observation.shape[-2:]).reshape(-1, 3)
-        else:
-            rays = fibonacci_sphere(settings.sphere_rays)
+        size = self.task.image_size(self._shape)
+        self.by_pixel = bool(size)
+        rays = pixel_directions(*size).reshape(-1, 3) if size else fibonacci_sphere(settings.sphere_rays)
         self.n_rays = len(rays)
         self._condition = feature_count(settings.tx_octaves) if record.uplink is None else 2 * record.uplink.shape[-1]
         origins = np.stack([receiver.position_m for receiver in receivers]) - coordinates.centre_m
@@ -155,7 +134,7 @@ class Nerf2Field(Fitted):
             with dr.suspend_grad():
                 batch, rays = condition.shape[1], points.first.shape[1] // s.samples
                 parts = march(network.with_state(params), points, condition, s.samples)
-                return report(params["offset"], parts, self.task, (self.outputs.count, batch, rays), receiver)
+                return self.task.of_rays(parts, (self.outputs.count, batch, rays), params["offset"], receiver)
 
         self._looked, self._marched = looked, marched
 
@@ -172,9 +151,7 @@ class Nerf2Field(Fitted):
             self._points = receiver, self.look(network, receiver)
         condition, divisor = self.condition_of(inputs, receiver)
         values, shape = self.march(network, self._points[1], condition, receiver), (len(inputs), *self._shape)
-        return Prediction(
-            conditions.channels_from(values, divisor, shape) if self.task.is_complex else values.reshape(shape)
-        )
+        return Prediction(conditions.observations_from(self.task, values, divisor, shape))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Settings, frame and weights."""
@@ -189,7 +166,7 @@ class Nerf2Field(Fitted):
         index = dr.opaque(mi.UInt32, receiver)
         everything = np.arange(self.n_rays) if rays is None else rays
         most = max(1, POINTS_PER_CHUNK // self.settings.samples)
-        chunks = np.array_split(everything, -(-len(everything) // most) if self.task.image else 1)
+        chunks = np.array_split(everything, -(-len(everything) // most) if self.by_pixel else 1)
         parts = [rays_of(self.data, index, opaque_rows(chunk), self.n_rays) for chunk in chunks]
         # Shapes of results are recorded for the shapes of tensors, and not of arrays.
         dr.eval(parts)
@@ -227,17 +204,16 @@ def step_loss(network: Nerf2Network, data: Mapping[str, Any], drawn: Mapping[str
     condition = columns(data["condition"], drawn["rows"])
     batch = condition.shape[1]
     parts = march(network, points, condition, field.settings.samples)
-    predicted = report(network.offset, parts, field.task, (field.outputs.count, batch, rays), drawn["receiver"])
+    predicted = field.task.of_rays(parts, (field.outputs.count, batch, rays), network.offset, drawn["receiver"])
     # Truths of the batch: spectra at the step's rays, other reports in whole.
     values = data["truth"].shape[1]
     reported = predicted.shape[1]
     slot = dr.arange(type(drawn["rows"]), batch * reported)
     row = dr.gather(type(slot), drawn["rows"], slot // reported) + drawn["receiver"] * data["condition"].shape[1]
-    column = dr.gather(type(slot), drawn["rays"], slot % reported) if field.task.image else slot % reported
+    column = dr.gather(type(slot), drawn["rays"], slot % reported) if field.by_pixel else slot % reported
     truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, reported))
     error = predicted - truth
-    if field.task.in_decibel:
-        error = error * (1 / DB_UNIT)  # of size one, as greys are: one learning rate serves both
+    error = error * (1 / field.task.loss_unit)  # of size one, as greys are: one learning rate serves all
     return dr.mean(error * error, axis=None).array
 
 
@@ -261,11 +237,11 @@ def _fit_group(
     data = field.data | {"condition": condition, "truth": to_tensor(np.nan_to_num(truth))}
     dr.make_opaque(data)
     initial = field.initial(rng)
-    if field.task.in_decibel:
+    if field.task.has_offsets:
         # Offsets start at the mean level: the networks then learn differences of a few dB.
         for r in members:
             initial.offset[r] = np.mean(record.observation[r, known[np.concatenate(rows[r])]])
-    n_rays, spectrum = field.n_rays, field.task.image
+    n_rays, spectrum = field.n_rays, field.by_pixel
     config = s if spectrum else replace(s, batch=s.sphere_batch)
     all_rays = opaque_rows(np.arange(n_rays))
 
@@ -309,7 +285,7 @@ class Nerf2Model(Model):
     def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
         """Settings of rays of another task, of validation without rows, of positions beside an uplink."""
         s, record, unused = problem.settings, problem.record, unused_of_loop(problem.settings, validates(splits))
-        if task_of(record).image:
+        if record.task.image_size(record.observation.shape):
             unused |= dict.fromkeys(("sphere_rays", "sphere_batch"), "rays are pixels of spectra")
         else:
             unused |= {"rays": "of spectra; give sphere_rays", "batch": "of spectra; give sphere_batch"}
