@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 Row0 = Literal["top", "bottom"]
 """Side of a plan where the first row of a grid lies: top is the largest y, bottom the smallest."""
 
-NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m", "time_s")  # arrays of numbers in an NPZ file
+NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m")  # arrays of numbers in an NPZ file
 OCCUPIED_PROBABILITY = 0.65
 """A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
 FREE_PROBABILITY = 0.196  # a cell less likely than this is free (``free_thresh`` there)
@@ -72,14 +72,6 @@ class PlanGrid:
         """Centres [n, 2] of the cells of a mask."""
         row, column = np.nonzero(mask)
         return self.origin_m + self.resolution_m * (np.stack([column, row], axis=-1) + 0.5)
-
-
-@dataclass(frozen=True)
-class PlanPoints:
-    """LiDAR returns [n, 2] in a horizontal plane and the times [n] of their scans, equal within a scan, or None."""
-
-    xy_m: FloatArray
-    time_s: FloatArray | None = None
 
 
 def grid_from_probability(
@@ -137,15 +129,13 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None) -> Plan
     return PlanGrid(occupied, np.zeros_like(occupied), cell, low)
 
 
-def read_plan(
-    path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None
-) -> PlanGrid | PlanPoints | FloatArray:
+def read_plan(path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None) -> PlanGrid | FloatArray:
     """Any file that shows a plan, recognised by its ending and its content.
 
     - ``.npz`` with ``log_odds`` [rows, columns], ``row_0`` ("top" or "bottom"), ``resolution_m``, and optionally
       ``origin_m`` [2] of the lower left corner, zero by default. Values that all lie in 0..1 are taken as probabilities
       (log odds of free cells are negative).
-    - ``.npz`` with points ``xy_m`` [n, 2] and optionally ``time_s`` [n], equal for all returns of a scan.
+    - ``.npz`` with points ``xy_m`` [n, 2], LiDAR returns in a horizontal plane.
     - ``.png``, ``.pgm``, ``.jpg``: a picture, dark where occupied, transparent pixels on white, with or without the
       ``.yaml`` of a ROS map beside it, which may be given in its place (`wrf_mi.scene.plan.pictures.read_sheet`); its
       yaw has to be zero. Without a YAML, and with other greys than those of map_saver, lines thinner than
@@ -159,10 +149,11 @@ def read_plan(
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
 
     Returns:
-        A grid, points, or wall vertices [n, 2].
+        A grid, whose cells are nowhere free where the file holds points, or wall vertices [n, 2].
 
     Raises:
-        InputError: missing, unreadable or incomplete, or ``row_0`` for a file whose format fixes it.
+        InputError: missing, unreadable or incomplete, points with the times of their scans, or ``row_0`` for a file
+            whose format fixes it.
     """
     path = Path(path)
     if not path.is_file():
@@ -179,7 +170,7 @@ def read_plan(
         case ".csv":
             return read_layout(path)
         case ".xyz" | ".txt":
-            return _read_text(path)
+            return _grid_of_points(path, _read_text(path), resolution_m)
     raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .jpg, .yaml, .csv or .xyz")
 
 
@@ -194,7 +185,7 @@ def read_layout(path: str | Path) -> FloatArray:
     return vertices
 
 
-def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> PlanGrid | PlanPoints:
+def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> PlanGrid:
     try:
         content = stored_arrays(path)
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
@@ -211,15 +202,17 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
         raise InputError(f"{text}; give one of them")
     if row_0 is not None:
         raise _no_rows(path, "it holds points, which have no rows")
-    return _points_of_arrays(path, numbers["xy_m"], numbers.get("time_s"))
+    if "time_s" in content:
+        text = f"{path}: time_s: scans from several places are not aligned"
+        raise InputError(f"{text}; give the map of a SLAM program, or leave out time_s if their poses are exact")
+    return _grid_of_points(path, numbers["xy_m"], resolution_m)
 
 
-def _points_of_arrays(path: Path, xy: FloatArray, time: FloatArray | None) -> PlanPoints:
-    if xy.shape[1:] != (2,):
-        raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
-    if time is not None and time.shape != xy.shape[:1]:
-        raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
-    return PlanPoints(xy, time)
+def _grid_of_points(path: Path, xy_m: FloatArray, resolution_m: float | None) -> PlanGrid:
+    try:
+        return grid_from_points(xy_m, resolution_m)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def _grid_of_arrays(
@@ -305,7 +298,8 @@ def without_thin_lines(grid: PlanGrid, name: str = "plan") -> PlanGrid:
     return replace(grid, occupied=grid.occupied & ~lines, free=grid.free | lines)
 
 
-def _read_text(path: Path) -> PlanPoints:
+def _read_text(path: Path) -> FloatArray:
+    """Points [n, 2] of a text of two columns."""
     rows = []
     for number, line in enumerate(text_lines(path), 1):
         words = line.split("#")[0].replace(",", " ").split()
@@ -319,4 +313,4 @@ def _read_text(path: Path) -> PlanPoints:
             raise InputError(f"{path}: line {number}: expected two numbers x, y, found {' '.join(words)!r}")
     if not rows:
         raise InputError(f"{path}: no points; give rows x y in metres")
-    return PlanPoints(np.array(rows))
+    return np.array(rows)

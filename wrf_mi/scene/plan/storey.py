@@ -11,9 +11,8 @@ from ...core import InputError
 from ...core.angles import FloatArray
 from ..mesh.outline import triangulated
 from ..mesh.surfaces import Surface, number_names
-from .alignment import grid_from_scans
 from .lines import HALF_WIDTH_M, THICKEST_WALL_M
-from .sources import PlanGrid, PlanPoints, grid_from_points
+from .sources import PlanGrid
 from .walked import NARROWEST_ROOM_M, mapped_part
 from .walls import find_walls, joined
 
@@ -81,20 +80,6 @@ def _filled(area: BaseGeometry) -> BaseGeometry:
     return shapely.unary_union(outlines) if outlines else Polygon()
 
 
-def walls_of_plan(source: PlanGrid | PlanPoints | FloatArray, resolution_m: float | None = None) -> FloatArray:
-    """Straight walls [n, 2, 2] of a grid, points, or wall vertices [n, 2] in metres; `InputError`: it has none.
-
-    Points whose scans are known by their times are aligned with one another first, and free space is found from the
-    places of the sensor (`wrf_mi.scene.plan.alignment`).
-    """
-    if isinstance(source, PlanPoints):
-        if source.time_s is None:
-            source = grid_from_points(source.xy_m, resolution_m)
-        else:
-            source = grid_from_scans(source.xy_m, source.time_s)
-    return find_walls(source) if isinstance(source, PlanGrid) else layout_walls(np.asarray(source, float))
-
-
 def at_inner_faces(walls_m: FloatArray, grid: PlanGrid) -> FloatArray:
     """Walls [n, 2, 2], the middle lines of those in a grid, with outer walls thicker than the blur of a map moved to
     their inner faces, where reflections happen, and the floor ends.
@@ -119,11 +104,10 @@ def at_inner_faces(walls_m: FloatArray, grid: PlanGrid) -> FloatArray:
 
 
 def plan_surfaces(
-    source: PlanGrid | PlanPoints | FloatArray,
+    source: PlanGrid | FloatArray,
     *,
     height_m: float,
     floor_m: float = 0.0,
-    resolution_m: float | None = None,
     name: str = "plan",
 ) -> list[Surface]:
     """Surfaces of a storey: walls extruded from floor to ceiling, and both of these.
@@ -132,7 +116,6 @@ def plan_surfaces(
         source: the plan, as `wrf_mi.scene.plan.sources.read_plan` returns it.
         height_m: height from floor to ceiling, above zero.
         floor_m: z of the floor.
-        resolution_m: side of a cell to count points in.
         name: name of the source, for errors.
 
     Returns:
@@ -144,11 +127,15 @@ def plan_surfaces(
     if not (np.isfinite(height_m) and height_m > 0 and np.isfinite(floor_m)):
         raise InputError(f"height {height_m} m above {floor_m} m: give a height above zero (--wall-height, metres)")
     try:
-        walls_m = walls_of_plan(source, resolution_m)
         if isinstance(source, PlanGrid):
-            walls_m = at_inner_faces(walls_m, source)
-        area = floor_of(walls_m)
-        flat, faces = triangulated(mapped_part(area, source, name) if isinstance(source, PlanGrid) else area)
+            walls_m = find_walls(source)
+            # Points show no thickness: the cells of a noisy wall are on both sides of its face.
+            walls_m = at_inner_faces(walls_m, source) if source.free.any() else walls_m
+            area = mapped_part(floor_of(walls_m), source, name)
+        else:
+            walls_m = layout_walls(np.asarray(source, float))
+            area = floor_of(walls_m)
+        flat, faces = triangulated(area)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
     top_m, halves = floor_m + height_m, np.array([[0, 1, 2], [0, 2, 3]])
