@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from xml.etree.ElementTree import Element
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from ...core import InputError
 from ...core.angles import FloatArray
@@ -18,16 +18,16 @@ from ...core.memory import require_memory
 from ...core.types import IntArray
 from ...scene.mesh.files import POLYGON_READERS, mesh_parts, triangles_of
 from ...scene.mesh.polygon_files import Polygons
-from ...scene.mesh.surfaces import bodies, without_area
-from ...tracing.sionna.scenes import placed_mesh, same_triangles, triangles_by_mitsuba
+from ...scene.mesh.surfaces import bodies, copies, without_area
+from ...tracing.sionna.scenes import REFUSALS, placed_mesh, reason, same_triangles, triangles_by_mitsuba
 from .scene_findings import Finding
-from .scene_xml_faults import PARAMETERS, SceneXml, number, similar_file
-from .triangle_faults import copies, double_sheets, is_flat, open_solids, wound_both_ways
+from .scene_xml_faults import PARAMETERS, SceneXml, similar_file
+from .triangle_faults import double_sheets, open_solids, sheet_numbers, wound_both_ways
 
 MEMORY = {".obj": 30}  # bytes of memory for each byte of a mesh file; others take `MEMORY_BINARY`
 MEMORY_BINARY = 12
 SINGULAR = 1e-9  # least ratio of the scales of a transform
-UNIT = 1e-3  # largest deviation of the length of an axis of rotation from 1
+UNIT = 1e-3  # largest deviation of rotations from orthonormal matrices
 MOST_CORNERS = 2000  # corners of a polygon that is not convex: crossings of its edges grow with the square
 RESTORE = "export the mesh anew"
 
@@ -57,7 +57,7 @@ def scene_parts(scene: SceneXml) -> Iterator[ShapePart | Finding]:
         materials = [identifier for identifier, _ in scene.materials(shape)]
         part = ShapePart(name, materials[0] if materials else "", scene.path, np.empty((0, 3, 3)), shape)
         plugin = shape.get("type", "")
-        matrix = to_world(scene, shape) if plugin in PARAMETERS else np.eye(4)
+        matrix = to_world(shape) if plugin in PARAMETERS else np.eye(4)
         if isinstance(matrix, str):
             remedy = "correct the transform: scales other than 0, axes of length 1, finite numbers"
             yield Finding("transform", scene.path, name, matrix, remedy)
@@ -99,77 +99,39 @@ def _analytic(scene: SceneXml, shape: Element, part: ShapePart) -> Iterator[Shap
         yield replace(part, corners_m=np.asarray(mesh.triangles, float))
 
 
-def to_world(scene: SceneXml, shape: Element) -> FloatArray | str:
-    """Matrix [4, 4] of a shape's ``to_world`` in double precision, or what is wrong with it.
-
-    Source: Mitsuba 3, scene format, "Transformations": each element is applied after those before it.
-    """
-    matrix = np.eye(4)
-    for transform in shape.findall("transform"):
-        for step in transform:
-            try:
-                matrix = _step(step) @ matrix
-            except ValueError as error:
-                return f"<{step.tag}> of its transform: {one_line(error)}"
+def to_world(shape: Element) -> FloatArray | str:
+    """Matrix [4, 4] of a shape's ``to_world`` in double precision, or what is wrong with it."""
+    steps = [step for transform in shape.findall("transform") for step in transform]
+    try:
+        matrix = _matrix(steps)
+        turn = _matrix([step for step in steps if step.tag == "rotate"])[:3, :3]
+    except REFUSALS as error:
+        return f"its transform: {reason(error)}"
+    # By axes of another length than 1, Mitsuba's rotations shear.
+    if np.abs(turn @ turn.T - np.eye(3)).max() > UNIT:
+        return "the axis of <rotate> of its transform is no unit vector, with which Mitsuba shears the mesh"
     scales = np.linalg.svd(matrix[:3, :3], compute_uv=False) if np.isfinite(matrix).all() else np.zeros(3)
     if scales[2] <= SINGULAR * scales[0]:
         return "its transform is not finite or leaves no volume"
     return matrix
 
 
-def _step(step: Element) -> FloatArray:
-    """Matrix [4, 4] of an element of a transform; `ValueError` for another element or a text that is no number."""
-    neutral = 1.0 if step.tag == "scale" else 0.0
-    match step.tag:
-        case "translate":
-            return trimesh.transformations.translation_matrix(_vector(step, neutral))
-        case "scale":
-            return np.diag([*_vector(step, neutral), 1.0])
-        case "rotate":
-            angle, axis = np.radians(_numbers(step.get("angle", "0"), 1)[0]), _vector(step, neutral)
-            if abs(np.linalg.norm(axis) - 1) > UNIT:
-                raise ValueError("its axis is no unit vector, with which Mitsuba shears the mesh")
-            return np.asarray(trimesh.transformations.rotation_matrix(angle, axis))
-        case "matrix":
-            return _matrix(_numbers(step.get("value", "")))
-        case "lookat":
-            origin, target, up = (_numbers(step.get(name, ""), 3) for name in ("origin", "target", "up"))
-            forward = trimesh.unitize(target - origin)
-            left = trimesh.unitize(np.cross(up, forward))
-            return _matrix(np.column_stack([left, np.cross(forward, left), forward, origin]).ravel())
-    raise ValueError("unknown")
+def _matrix(steps: Sequence[Element]) -> FloatArray:
+    """Matrix [4, 4] of the elements of a transform by Mitsuba's parser, which unlike its shapes has double precision.
 
+    Errors are those of Mitsuba (`REFUSALS`).
+    """
+    import mitsuba as mi
 
-def _matrix(values: FloatArray) -> FloatArray:
-    """Matrix [4, 4] by the numbers of its first three columns and rows, of its first three rows, or all."""
-    matrix = np.eye(4)
-    match len(values):
-        case 9:
-            matrix[:3, :3] = values.reshape(3, 3)
-        case 12 | 16:
-            matrix[: len(values) // 4] = values.reshape(-1, 4)
-        case _:
-            raise ValueError(f"{len(values)} numbers; give 9 or 16")
-    return matrix
-
-
-def _vector(step: Element, neutral: float) -> FloatArray:
-    """Vector [3] of an element that states x, y and z, or all of them as ``value``."""
-    stated = step.get("value")
-    if stated is None:
-        return np.concatenate([_numbers(step.get(axis, str(neutral)), 1) for axis in "xyz"])
-    values = _numbers(stated)
-    if len(values) not in (1, 3):
-        raise ValueError(f"{len(values)} numbers; give 1 or 3")
-    return np.broadcast_to(values, 3)
-
-
-def _numbers(text: str, count: int | None = None) -> FloatArray:
-    words = text.replace(",", " ").split()
-    values = [number(word) for word in words]
-    if None in values or (count is not None and len(values) != count):
-        raise ValueError(f"{text[:40]!r} is no number" if count == 1 else f"{text[:40]!r} are not the numbers needed")
-    return np.array(values, float)
+    if not steps:
+        return np.eye(4)
+    root = Element("scene", version="3.0.0")
+    SubElement(SubElement(root, "shape", type="rectangle"), "transform", name="to_world").extend(steps)
+    parsed = mi.parser.parse_string(
+        mi.parser.ParserConfig(mi.variant() or ""), ElementTree.tostring(root, encoding="unicode")
+    )
+    (stated,) = [node.props["to_world"] for node in parsed.nodes if "to_world" in node.props.keys()]  # noqa: SIM118
+    return np.array(stated.matrix, float)
 
 
 def read_triangles(part: ShapePart, plugin: str) -> Iterator[ShapePart | Finding]:
@@ -292,7 +254,7 @@ def _near_sheets(parts: list[ShapePart], corners: FloatArray, owner: IntArray) -
     involved = np.unique(owner[pairs])
     flat = np.zeros(len(corners), bool)
     for k in involved:
-        flat[owner == k] = _in_sheets(parts[k])
+        flat[owner == k] = sheet_numbers(parts[k].corners_m) >= 0
     for i, j in np.unique(owner[pairs], axis=0):
         kind = "double-sheet" if flat[pairs[(owner[pairs] == (i, j)).all(axis=1)]].any() else "party-wall"
         other = "" if i == j else f" of {parts[i].name or 'the mesh'}"
@@ -304,11 +266,3 @@ def _near_sheets(parts: list[ShapePart], corners: FloatArray, owner: IntArray) -
 def materials_of(parts: Sequence[ShapePart]) -> IntArray:
     """Number of each part's material [n]."""
     return np.unique([part.material for part in parts], return_inverse=True)[1].reshape(-1)
-
-
-def _in_sheets(part: ShapePart) -> NDArray[np.bool_]:
-    """Which triangles of a part belong to flat bodies."""
-    flat = np.zeros(len(part.corners_m), bool)
-    for body in bodies(part.corners_m):
-        flat[body.faces] = is_flat(body)
-    return flat

@@ -12,7 +12,7 @@ import trimesh
 
 from ...core.angles import FloatArray
 from .planes import STOREY_M, THICKEST_M, UPRIGHT, WALL_SHARE, Face, Mask, Plane, kinds, least_level_area, with_axes
-from .surfaces import KINDS, Body, Kind, Surface, bodies, bounds, number_names
+from .surfaces import KINDS, Body, Kind, Surface, bodies, bounds, main_extent, number_names
 
 FLAT_M = 0.01  # largest distance of the vertices of a facet's triangles from its plane
 PARALLEL = np.cos(np.radians(2))
@@ -93,13 +93,10 @@ def _room_facets(mesh_bodies: Sequence[Body]) -> list[_Facet]:
 
 def _slab(body: Body, index: int) -> _Facet | None:
     """A body that is a sheet or slab as one facet in its middle, or None."""
-    cross = trimesh.triangles.cross(body.corners_m)
-    normal = cross[np.argmax(np.linalg.norm(cross, axis=-1))]
-    normal = normal / np.linalg.norm(normal)
-    away = body.corners_m @ normal
-    if np.ptp(away) > THICKEST_M:
+    normal, low, high = main_extent(body.corners_m)
+    if high - low > THICKEST_M:
         return None
-    return _facet(body, np.ones(len(away), bool), normal, float(away.min() + away.max()) / 2, index)
+    return _facet(body, np.ones(len(body.corners_m), bool), normal, (low + high) / 2, index)
 
 
 def _facets(body: Body, index: int) -> Iterator[_Facet]:

@@ -24,7 +24,7 @@ from ..coordinates import FORMATS, UNITS_M, Up, check_extent, require_precise, s
 from .polygon_files import Polygons, read_obj, read_ply
 from .scene_files import USD_SUFFIXES, Beside, bare_gltf, gltf_facts, read_collada, read_usd
 from .sheets import as_sheets
-from .surfaces import Surface, number_names, without_area
+from .surfaces import Surface, copies, number_names, without_area
 
 logger = logging.getLogger(__name__)
 
@@ -201,15 +201,13 @@ def sound_surfaces(parts: Sequence[trimesh.Trimesh], unit_m: float, name: str | 
     for part_name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
         vertices = np.asarray(part.vertices, float) * unit_m
         faces = np.asarray(part.faces, np.int64)
-        solid = faces[~without_area(vertices[faces])]
-        # Copies may have other vertices: STL has no shared vertices.
-        _, same = np.unique(vertices, axis=0, return_inverse=True)
-        _, first = np.unique(np.sort(same.reshape(-1)[solid], axis=1), axis=0, return_index=True)
-        for count, what in ((len(faces) - len(solid), "degenerate"), (len(solid) - len(first), "doubled")):
-            if count:
+        for find, what in ((without_area, "degenerate"), (copies, "doubled")):
+            left_out = find(vertices[faces])
+            if count := np.count_nonzero(left_out):
                 logger.warning("%s: %d %s faces of %s left out", name, count, what, part_name)
-        if len(first):
-            surfaces.append(Surface(part_name, "other", vertices, solid[np.sort(first)]))
+            faces = faces[~left_out]
+        if len(faces):
+            surfaces.append(Surface(part_name, "other", vertices, faces))
     if not surfaces:
         raise InputError(f"{name}: every face is degenerate (no area); export it anew, or give its --units")
     return surfaces

@@ -12,7 +12,7 @@ import trimesh
 
 from ...core.angles import FloatArray
 from .planes import Mask, Plane, with_axes
-from .surfaces import Surface, bodies
+from .surfaces import Surface, bodies, main_extent
 
 logger = logging.getLogger(__name__)
 
@@ -65,15 +65,12 @@ def as_sheets(surfaces: Sequence[Surface], name: str | Path) -> list[Surface]:
 
 def _middle(corners_m: FloatArray) -> FloatArray | None:
     """One face of a thin closed body, moved to its middle; None for a thicker one."""
-    cross = trimesh.triangles.cross(corners_m)
-    normal = cross[np.argmax(np.linalg.norm(cross, axis=-1))]
-    normal = normal / np.linalg.norm(normal)
-    away = corners_m @ normal
-    if np.ptp(away) > PANEL_M:
+    normal, low, high = main_extent(corners_m)
+    if high - low > PANEL_M:
         return None
+    cross = trimesh.triangles.cross(corners_m)
     front = corners_m[cross @ normal > np.linalg.norm(cross, axis=-1) / 2]
-    middle = (away.min() + away.max()) / 2
-    return np.asarray(front + (middle - front @ normal)[..., None] * normal)
+    return np.asarray(front + ((low + high) / 2 - front @ normal)[..., None] * normal)
 
 
 def _copies(corners_m: FloatArray) -> Mask:
