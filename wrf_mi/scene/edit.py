@@ -143,8 +143,8 @@ def _chosen(folder: str | Path, surfaces: Sequence[Surface], patterns: Sequence[
     for pattern in patterns:
         names = {surface.name for surface in surfaces if fnmatchcase(surface.name, pattern)}
         if not names:
-            known = listed(surface.name for surface in surfaces)
-            raise InputError(f"{folder}: no surface {pattern!r}; it has {known}")
+            present = listed(surface.name for surface in surfaces)
+            raise InputError(f"{folder}: no surface {pattern!r}; it has {present}")
         chosen |= names
     return chosen
 

@@ -120,10 +120,10 @@ def boxes(surfaces: Sequence[Surface]) -> Boxes:
     names = _free_names({surface.name for surface in surfaces})
     hidden, members = list[Rectangle](), dict[frozenset[str], None]()
     for box in filter(_has_size_of_furniture, _boxes(furniture)):
-        known, missing = _known_and_missing(box, [*furniture, *hidden], around)
+        present, missing = _present_and_missing(box, [*furniture, *hidden], around)
         completing = [replace(face, name=next(names)) for face in missing]
         hidden += completing
-        members[frozenset(face.name for face in known + completing)] = None
+        members[frozenset(face.name for face in present + completing)] = None
     halves = np.array([[0, 1, 2], [0, 2, 3]])
     return Boxes([Surface(face.name, "other", face.corners, halves) for face in hidden], list(members))
 
@@ -132,18 +132,18 @@ def _free_names(names_in_use: set[str]) -> Iterator[str]:
     return (name for number in count(1) if (name := f"{PREFIX}{number:02d}") not in names_in_use)
 
 
-def _known_and_missing(
+def _present_and_missing(
     box: Box, furniture: Sequence[Rectangle], around: Sequence[Rectangle]
 ) -> tuple[list[Rectangle], list[Rectangle]]:
     """Faces of furniture in the place of a box's faces, and its faces in whose place no face is known."""
-    known, missing = list[Rectangle](), list[Rectangle]()
+    present, missing = list[Rectangle](), list[Rectangle]()
     for face in _faces_of_box(*box):
         in_place = [other for other in furniture if face.covered_by(other)]
-        known += in_place
+        present += in_place
         # Walls and floors in its place hide a face for good, and belong to no box.
         if not in_place and not any(map(face.covered_by, around)):
             missing.append(face)
-    return known, missing
+    return present, missing
 
 
 def _has_size_of_furniture(box: Box) -> bool:

@@ -69,13 +69,13 @@ def scene_parts(scene: SceneXml) -> Iterator[ShapePart | Finding]:
 
 def _from_file(scene: SceneXml, shape: Element, part: ShapePart, matrix: FloatArray) -> Iterator[ShapePart | Finding]:
     """A shape with a mesh file, or with one of the same name elsewhere in the folder, in the scene's frame."""
-    plugin, stated = shape.get("type", ""), scene.file_of(shape) or ""
+    plugin, file_name = shape.get("type", ""), scene.file_of(shape) or ""
     try:
-        file: Path | None = inside(scene.path.parent, stated, scene.path)
+        file: Path | None = inside(scene.path.parent, file_name, scene.path)
     except InputError:
         file = None  # named by `xml_findings`
     if file is None or not file.is_file():
-        file = similar_file(scene.path.parent, stated)
+        file = similar_file(scene.path.parent, file_name)
     if file is None or file.suffix.lower() != f".{plugin}":
         return
     for result in read_triangles(replace(part, file=file), plugin):
@@ -130,24 +130,30 @@ def _matrix(steps: Sequence[Element]) -> FloatArray:
     parsed = mi.parser.parse_string(
         mi.parser.ParserConfig(mi.variant() or ""), ElementTree.tostring(root, encoding="unicode")
     )
-    (stated,) = [node.props["to_world"] for node in parsed.nodes if "to_world" in node.props.keys()]  # noqa: SIM118
-    return np.array(stated.matrix, float)
+    (placement,) = [node.props["to_world"] for node in parsed.nodes if "to_world" in node.props.keys()]  # noqa: SIM118
+    return np.array(placement.matrix, float)
 
 
 def read_triangles(part: ShapePart, plugin: str) -> Iterator[ShapePart | Finding]:
     """A part with the triangles of its PLY or OBJ file in the file's frame, and findings about its polygons."""
     file, name = part.file, part.name
-    polygons = _polygons(file, name)
-    if isinstance(polygons, Finding):
-        yield polygons
-        return
     try:
-        if polygons.sizes.max() > MOST_CORNERS:
+        require_memory(MEMORY.get(file.suffix.lower(), MEMORY_BINARY) * file.stat().st_size, str(file), "divide it")
+        polygons = POLYGON_READERS[file.suffix.lower()](file)
+        if len(polygons.sizes) and polygons.sizes.max() > MOST_CORNERS:
             raise ValueError(f"a polygon of {polygons.sizes.max()} corners; {MOST_CORNERS} at most are cut")
         triangles, _ = triangles_of(polygons)
-    except ValueError as error:
-        text, _, remedy = one_line(error).rpartition("; ")
-        yield Finding("mesh", file, name, text, remedy)
+    except Exception as error:  # NumPy raises a dozen kinds on damaged files
+        text, _, remedy = one_line(error).removeprefix(f"{file}: ").partition("; ")
+        yield Finding("mesh", file, name, f"cannot be read: {text}", remedy or RESTORE)
+        return
+    if not len(polygons.sizes):
+        yield Finding("empty-mesh", file, name, "has no faces", "remove the shape, or restore the file")
+        return
+    bad = np.flatnonzero(~np.isfinite(polygons.vertices).all(axis=1))
+    if len(bad):
+        text = f"{len(bad)} vertices are not finite, first vertex {bad[0] + 1}"
+        yield Finding("not-finite", file, name, text, "correct the numbers, or export the mesh anew")
         return
     corners = polygons.vertices[triangles]
     if _may_differ(polygons, file):
@@ -158,23 +164,6 @@ def read_triangles(part: ShapePart, plugin: str) -> Iterator[ShapePart | Finding
             text += f", {many} faces have more than three corners" if many else ""
             yield Finding("polygons", file, name, text, "cut the faces into triangles (--repair does)")
     yield replace(part, corners_m=corners)
-
-
-def _polygons(file: Path, name: str) -> Polygons | Finding:
-    """Polygons of a PLY or OBJ file, or why it has none."""
-    try:
-        require_memory(MEMORY.get(file.suffix.lower(), MEMORY_BINARY) * file.stat().st_size, str(file), "divide it")
-        polygons = POLYGON_READERS[file.suffix.lower()](file)
-    except Exception as error:  # NumPy raises a dozen kinds on damaged files
-        text, _, remedy = one_line(error).removeprefix(f"{file}: ").partition("; ")
-        return Finding("mesh", file, name, f"cannot be read: {text}", remedy or RESTORE)
-    if not len(polygons.sizes):
-        return Finding("empty-mesh", file, name, "has no faces", "remove the shape, or restore the file")
-    bad = np.flatnonzero(~np.isfinite(polygons.vertices).all(axis=1))
-    if len(bad):
-        text = f"{len(bad)} vertices are not finite, first vertex {bad[0] + 1}"
-        return Finding("not-finite", file, name, text, "correct the numbers, or export the mesh anew")
-    return polygons
 
 
 def _may_differ(polygons: Polygons, file: Path) -> bool:

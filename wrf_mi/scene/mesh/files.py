@@ -65,12 +65,12 @@ def mesh_parts(path: str | Path, up: Up | None = None) -> list[trimesh.Trimesh]:
 def _parts(file: Path, up: Up | None) -> tuple[list[trimesh.Trimesh], float | None]:
     """The parts of a mesh file, with z up, and the unit of their coordinates in metres if the file states it."""
     try:
-        parts, unit_m, stated = _stored_parts(file)
+        parts, unit_m, up_in_file = _stored_parts(file)
         for name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
             _check_part(part)
             if len(bad := np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))):
                 raise InputError(f"{file}: vertex {bad[0] + 1} of {name} is not finite; correct the mesh")
-            part.vertices = turned(np.asarray(part.vertices, float), up or stated)
+            part.vertices = turned(np.asarray(part.vertices, float), up or up_in_file)
     except InputError:
         raise
     except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files

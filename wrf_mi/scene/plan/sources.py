@@ -20,8 +20,17 @@ from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.array_files import stored_arrays
 from ...core.files import inside, listed, one_line, text_lines
+from ...core.types import IntArray
 from ...datasets.folder_files import read_columns
-from .pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES, WHITE, read_pixels, read_sheet
+from .pictures import (
+    FREE_PROBABILITY,
+    OCCUPIED_PROBABILITY,
+    PICTURE_SUFFIXES,
+    SHEET_SUFFIXES,
+    WHITE,
+    read_pixels,
+    read_sheet,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -30,9 +39,6 @@ Row0 = Literal["top", "bottom"]
 """Side of a plan where the first row of a grid lies: top is the largest y, bottom the smallest."""
 
 NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m")  # arrays of numbers in an NPZ file
-OCCUPIED_PROBABILITY = 0.65
-"""A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
-FREE_PROBABILITY = 0.196  # a cell less likely than this is free (``free_thresh`` there)
 POINT_CELL_M = 0.05  # side of the cells that points are counted in, as usual for maps of indoor robots
 LARGEST_GRID_CELLS = 4_000_000  # 100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away
 THINNEST_WALL_M = 0.05  # thinner lines of a drawing are door leaves, dimensions and letters
@@ -61,12 +67,12 @@ class PlanGrid:
         """Cells of which it is not known what is there [rows, columns]."""
         return ~(self.occupied | self.free)
 
-    def occupied_at(self, xy_m: FloatArray) -> Mask:
-        """Whether the cells of points [..., 2] are occupied; those outside the grid are not."""
+    def cell_indices(self, xy_m: FloatArray) -> tuple[tuple[IntArray, IntArray], Mask]:
+        """Row and column [...] of the cells of points [..., 2], and whether they lie in the grid; (0, 0) outside it."""
         column, row = np.moveaxis(np.floor((xy_m - self.origin_m) / self.resolution_m).astype(int), -1, 0)
         rows, columns = self.occupied.shape
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        return np.asarray(self.occupied[np.where(inside, row, 0), np.where(inside, column, 0)] & inside)
+        within = np.asarray((row >= 0) & (row < rows) & (column >= 0) & (column < columns))
+        return (np.where(within, row, 0), np.where(within, column, 0)), within
 
     def centres_m(self, mask: Mask) -> FloatArray:
         """Centres [n, 2] of the cells of a mask."""
@@ -226,8 +232,8 @@ def _grid_of_arrays(
     if origin.shape != (2,) or not np.isfinite(origin).all():
         raise InputError(f"{path}: origin_m is {origin.tolist()}; give x and y of the lower left corner in metres")
     values = content["log_odds"]
-    known = values[~np.isnan(values)]
-    if known.size and (known.min() < 0 or known.max() > 1):  # else they are probabilities
+    measured = values[~np.isnan(values)]
+    if measured.size and (measured.min() < 0 or measured.max() > 1):  # else they are probabilities
         values = 1 / (1 + np.exp(-np.clip(values, -50, 50)))
     row_0 = row_0 or _stated_side(path, content.get("row_0"))
     return grid_from_probability(values, resolution_m, row_0, origin, str(path))
@@ -252,16 +258,15 @@ def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
     is_sheet = path.suffix.lower() in SHEET_SUFFIXES
     file, sheet = path if is_sheet else path.with_suffix(".yaml"), None
     if file.is_file():
-        sheet = read_sheet(file, resolution_m, (FREE_PROBABILITY, OCCUPIED_PROBABILITY))
-        path, resolution_m = inside(path.parent, sheet.image, path) if is_sheet else path, sheet.resolution_m
+        sheet = read_sheet(file, resolution_m)
+        path, resolution_m = inside(path.parent, sheet.image, path) if is_sheet else path, sheet.resolution
     if resolution_m is None:
         raise InputError(f"{path}: a picture has no resolution; give the side of a pixel in metres (--resolution)")
     pixels = read_pixels(path, LARGEST_PICTURE)
     probability = pixels.probability(sheet)
     if sheet is not None:
-        return grid_from_probability(
-            probability, resolution_m, "top", sheet.origin_m, str(path), thresholds=sheet.thresholds
-        )
+        thresholds = sheet.free_thresh, sheet.occupied_thresh
+        return grid_from_probability(probability, resolution_m, "top", sheet.origin[:2], str(path), thresholds)
     if pixels.coloured:  # a drawing: what is no line is ground, of whatever colour
         probability = np.where(probability > OCCUPIED_PROBABILITY, 1.0, 0.0)
     grid = grid_from_probability(probability, resolution_m, "top", name=str(path))

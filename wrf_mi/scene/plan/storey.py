@@ -9,7 +9,7 @@ from shapely.geometry.base import BaseGeometry
 
 from ...core import InputError
 from ...core.angles import FloatArray
-from ..mesh.outline import triangulated
+from ..mesh.outline import merged, opened, triangulated
 from ..mesh.surfaces import Surface, number_names
 from .lines import HALF_WIDTH_M, THICKEST_WALL_M
 from .sources import PlanGrid
@@ -64,14 +64,11 @@ def _with_open_rooms(area: BaseGeometry, lines: BaseGeometry) -> BaseGeometry:
     """An area with the rooms whose walls are at its edge, so that it covers all walls without them."""
     added = shapely.difference(_closed(lines, LARGEST_GAP_M / 2), area)
     # Opened by the width of a door, without which the space between both faces of a wall counts as a room.
-    opened = shapely.buffer(added, -NARROWEST_ROOM_M / 2, join_style="mitre")
-    rooms = shapely.get_parts(shapely.buffer(opened, NARROWEST_ROOM_M / 2, join_style="mitre"))
+    rooms = shapely.get_parts(opened(added, NARROWEST_ROOM_M / 2))
     near = shapely.buffer(lines, EDGE_M)
     walled = shapely.length(shapely.intersection(shapely.boundary(rooms), near)) >= WALLED * shapely.length(rooms)
     rooms = rooms[walled & (shapely.area(rooms) >= SMALLEST_FLOOR_M2)]
-    # Widened by a millimetre, because rounding leaves slits between an area and its complement.
-    joined = shapely.union_all([shapely.buffer(part, 1e-3, join_style="mitre") for part in (area, *rooms)])
-    return _filled(shapely.buffer(joined, -1e-3, join_style="mitre")) if len(rooms) else area
+    return _filled(merged([area, *rooms])) if len(rooms) else area
 
 
 def _filled(area: BaseGeometry) -> BaseGeometry:
@@ -95,7 +92,8 @@ def at_inner_faces(walls_m: FloatArray, grid: PlanGrid) -> FloatArray:
         if inside[0] == inside[1]:
             continue
         inwards = left if inside[0] else -left
-        occupied = grid.occupied_at(on_wall[:, None] + depth[:, None] * inwards)
+        cells, within = grid.cell_indices(on_wall[:, None] + depth[:, None] * inwards)
+        occupied = grid.occupied[cells] & within
         # At most places no other wall meets this one.
         half_m = float(np.median(depth[0] * (np.argmin(occupied, axis=1) + 0.5)))
         if HALF_WIDTH_M < half_m <= THICKEST_WALL_M / 2:

@@ -58,8 +58,8 @@ def _wkt_units(record: object) -> Iterator[str]:
 def require_stated_metres(files: Sequence[Path], units: str | None) -> None:
     """Refuse (`InputError`) scans for which no units are given and whose headers state others than metres."""
     for file in files if units is None else ():
-        if (stated := stated_units(file)) and stated != ["m"]:
-            raise InputError(f"{file}: {units_text(stated)}; {units_remedy(stated)}")
+        if (file_units := stated_units(file)) and file_units != ["m"]:
+            raise InputError(f"{file}: {units_text(file_units)}; {units_remedy(file_units)}")
 
 
 def units_text(units: list[str]) -> str:
