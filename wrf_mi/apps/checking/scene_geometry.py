@@ -17,7 +17,6 @@ from ...core.files import inside, one_line
 from ...core.memory import require_memory
 from ...core.types import IntArray
 from ...scene.mesh.files import POLYGON_READERS, mesh_parts, triangles_of
-from ...scene.mesh.polygon_files import Polygons
 from ...scene.mesh.surfaces import bodies, copies, without_area
 from ...tracing.sionna.scenes import REFUSALS, placed_mesh, reason, same_triangles, triangles_by_mitsuba
 from .scene_findings import Finding
@@ -156,22 +155,13 @@ def read_triangles(part: ShapePart, plugin: str) -> Iterator[ShapePart | Finding
         yield Finding("not-finite", file, name, text, "correct the numbers, or export the mesh anew")
         return
     corners = polygons.vertices[triangles]
-    if _may_differ(polygons, file):
-        by_mitsuba = triangles_by_mitsuba(file, plugin)
-        if not same_triangles(np.asarray(corners, np.float32), by_mitsuba):
-            many = int((polygons.sizes > 3).sum())
-            text = "Sionna RT reads other triangles in it" if len(by_mitsuba) else "Sionna RT refuses the file"
-            text += f", {many} faces have more than three corners" if many else ""
-            yield Finding("polygons", file, name, text, "cut the faces into triangles (--repair does)")
+    by_mitsuba = triangles_by_mitsuba(file, plugin)
+    if not same_triangles(np.asarray(corners, np.float32), by_mitsuba):
+        many = int((polygons.sizes > 3).sum())
+        text = "Sionna RT reads other triangles in it" if len(by_mitsuba) else "Sionna RT refuses the file"
+        text += f", {many} faces have more than three corners" if many else ""
+        yield Finding("polygons", file, name, text, "cut the faces into triangles (--repair does)")
     yield replace(part, corners_m=corners)
-
-
-def _may_differ(polygons: Polygons, file: Path) -> bool:
-    """Whether Mitsuba may read other triangles: binary PLY of triangles alone are the same."""
-    if (polygons.sizes != 3).any() or file.suffix.lower() != ".ply":
-        return True
-    with file.open("rb") as stream:
-        return b"format binary_" not in stream.read(100)
 
 
 def mesh_file_parts(file: Path) -> Iterator[ShapePart | Finding]:
