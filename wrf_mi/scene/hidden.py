@@ -113,6 +113,7 @@ def boxes(surfaces: Sequence[Surface]) -> Boxes:
 
     Faces are named ``hidden_01`` and so on, less the names that surfaces have.
     """
+    # Walls, floor and ceiling may stand in the place of a box's face, but are no faces of boxes.
     furniture, around = (
         list(_faces([surface for surface in surfaces if (surface.kind == "other") == is_furniture]))
         for is_furniture in (True, False)
@@ -197,6 +198,7 @@ def _boxes(faces: Sequence[Rectangle]) -> Iterator[Box]:
     """Boxes of which two faces are known."""
     sides = [face for face in faces if abs(face.normal[2]) < 0.5]
     tops = [face for face in faces if abs(face.normal[2]) > 0.5]
+    # A top states its outline, and a side below it the height; of two sides the outline is at right angles or parallel.
     for top, side in product(tops, sides):
         if _is_below(top, side):
             yield top.corners[:, :2], side.heights_m[0], top.centre[2]
@@ -226,6 +228,7 @@ def _corner(first: Rectangle, second: Rectangle) -> FloatArray | None:
     lows, highs = np.stack([first.heights_m, second.heights_m], axis=1)
     if abs(first.normal @ second.normal) > UPRIGHT or highs.min() - lows.max() < LEAST_SIDE_M:
         return None
+    # Each end of the one with each end of the other.
     for a, b in product((first.sides[0, :2], -first.sides[0, :2]), (second.sides[0, :2], -second.sides[0, :2])):
         end, begin = first.centre[:2] - a, second.centre[:2] - b
         if np.linalg.norm(end - begin) < TOUCH_M:
@@ -240,6 +243,7 @@ def _between(first: Rectangle, second: Rectangle) -> FloatArray | None:
     """Base [4, 2] of the box between two sides of equal outline; None: they are not opposite."""
     a, gap = first.sides[0, :2], second.centre - first.centre
     size = np.linalg.norm(a)
+    # From one middle to the other: along the sides, where opposite ones do not differ, and square to them.
     along, across = float(gap[:2] @ a / size), gap[:2] - (gap[:2] @ a) / size**2 * a
     longer = np.linalg.norm(first.sides, axis=1) - np.linalg.norm(second.sides, axis=1)
     if abs(first.normal @ second.normal) < np.sqrt(1 - UPRIGHT**2) or np.linalg.norm(across) < SAME_M:

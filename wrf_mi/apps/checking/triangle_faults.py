@@ -82,6 +82,7 @@ def double_sheets(corners_m: FloatArray, owner: IntArray) -> IntArray:
     direction = np.unique(
         np.column_stack([np.round(normals / NORMAL_STEP).astype(np.int64), owner[valid]]), axis=0, return_inverse=True
     )[1].reshape(-1)
+    # Only faces of one direction and material, with offsets in one run without a gap, can be too near to each other.
     order = np.lexsort((offset_m, direction))
     jumps = (np.diff(direction[order]) != 0) | (np.diff(offset_m[order]) > FARTHEST_M)
     pairs = [np.empty((0, 2), np.int64)]

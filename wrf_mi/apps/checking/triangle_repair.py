@@ -46,6 +46,7 @@ def _one_plane(parts: list[ShapePart]) -> list[ShapePart]:
     # The later of two sheets moves; where it is a wall of a solid, the other one.
     for fixed, other in [*pairs.tolist(), *pairs[:, ::-1].tolist()]:
         still, mover = ((int(owner[face]), int(sheet[owner[face]][row[face]])) for face in (fixed, other))
+        # A sheet moves once, and none onto one that has moved, or chains of sheets would drift.
         if mover[1] < 0 or {mover, still} & moved:
             continue
         faces = sheet[mover[0]] == mover[1]

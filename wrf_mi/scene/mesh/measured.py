@@ -39,6 +39,8 @@ def is_measured(surfaces: Sequence[Surface]) -> bool:
     count = len(area)
     ends = (np.concatenate([first, second]), np.concatenate([second, first]))
     links = sparse.csr_array((np.concatenate([sign, sign]), ends), shape=(count, count))
+    # Diffusion over neighbours, their normals turned to the side of the face; weighted by area, as noise turns small
+    # faces most. Only directions matter, and scaling keeps the sums in range.
     mean = normals * area[:, None]
     for _ in range(RINGS):
         mean = mean + links @ mean

@@ -80,6 +80,7 @@ def _copies(corners_m: FloatArray) -> Mask:
         plane = with_axes(Plane(normal, float(corners_m[rows[0], 0] @ normal), corners_m[:1], np.zeros(3), 0.0))
         flat = shapely.polygons(plane.flat(corners_m[rows]))
         area = shapely.area(flat)
+        # The larger side stays: the other one may be a copy of a part of it.
         larger = area[facing].sum() >= area[~facing].sum()
         behind = facing != larger
         front = shapely.union_all(shapely.make_valid(flat[~behind]), grid_size=0.1 * SAME_PLANE_M)
@@ -92,6 +93,7 @@ def _planes(corners_m: FloatArray) -> Iterator[tuple[FloatArray, np.ndarray, Mas
     """Planes with faces of both directions: normal, numbers of their triangles, and which look along the normal."""
     cross = trimesh.triangles.cross(corners_m)
     normals = cross / np.linalg.norm(cross, axis=-1, keepdims=True)
+    # Rounded normals and offsets are keys: comparing all pairs of faces would grow with their square.
     leading = np.take_along_axis(normals, np.abs(normals).argmax(axis=1)[:, None], axis=1)
     upward = normals * np.sign(leading)  # one direction for both sides of a plane
     offset = np.einsum("fk,fk->f", corners_m.mean(axis=1), upward)

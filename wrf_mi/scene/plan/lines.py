@@ -75,6 +75,7 @@ def dominant_direction(occupied: Mask) -> float:
     quarter = np.arange(0, np.pi / 2, DIRECTION_STEP_RAD)
     normals = np.concatenate([quarter, quarter - np.pi / 2])
     votes, _, _ = hough_line(occupied, theta=normals)
+    # Squares: votes of one offset of a wall's direction are its length, while other directions spread them evenly.
     sharp = np.square(votes.astype(float)).sum(axis=0).reshape(2, -1).sum(axis=0)
     # The middle of the peak: its top is uncertain by degrees in smeared plans.
     middle = len(quarter) // 2
@@ -124,6 +125,7 @@ def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[WallRu
         image = images[axis]
         first = max(0, row - half)
         across, along = np.nonzero(image[first : row + half + 1, begin:end])
+        # Slope of the line through the run's cells, as a rise over its length.
         rise = np.polyfit(along, across, 1)[0] * (end - begin) * step
         if abs(rise) > LARGEST_RISE_M:
             # The next direction may explain it.

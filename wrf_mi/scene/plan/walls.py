@@ -181,12 +181,14 @@ def _tidy(runs: Sequence[WallRun], grid: PlanGrid) -> list[WallRun]:
 def _merged(runs: Sequence[WallRun], strips: _Strips) -> list[WallRun]:
     """Parallel runs of the same smear merged, at the offset of the longest."""
     walls: list[WallRun] = []
+    # The longest first: its offset has the least error, and shorter runs of its smear take it.
     for run in sorted(runs, key=lambda r: -r.length):
         for i, wall in enumerate(walls):
             apart = abs(wall.offset - run.offset)
             begin, end = max(wall.start, run.start), min(wall.end, run.end)
             if wall.axis != run.axis or apart > SAME_WALL_M or end - begin < run.length / 2:
                 continue
+            # Two faces of a partition have no free cells between them; two sides of a corridor do.
             if strips.free_between(wall, run, (begin, end)) > FREE_SHARE:
                 continue
             walls[i] = replace(wall, start=min(wall.start, run.start), end=max(wall.end, run.end))
@@ -206,10 +208,11 @@ def _bridged(runs: Sequence[WallRun], strips: _Strips) -> list[WallRun]:
             i += 1
             continue
         a = walls[i]
+        # Errors of an offset fall with the number of its cells.
         offset = (a.offset * a.length + partner.offset * partner.length) / (a.length + partner.length)
         walls[i] = WallRun(a.axis, offset, min(a.start, partner.start), max(a.end, partner.end))
         walls.remove(partner)
-        i = 0
+        i = 0  # the longer wall may bridge gaps that its pieces did not
     return walls
 
 
@@ -230,6 +233,7 @@ def _without_fronts(runs: Sequence[WallRun], strips: _Strips) -> list[WallRun]:
     """Runs without those that stand before a longer parallel run with nothing free between them."""
     walls = sorted(runs, key=lambda run: run.length)
     for run in tuple(walls):
+        # Share of the run, cell by cell, behind which some longer wall stands: several may share the back.
         covered = np.zeros(max(1, round(run.length / strips.grid.resolution_m)), bool)
         for wall in walls:
             near = 0 < abs(wall.offset - run.offset) <= FURNITURE_DEPTH_M
