@@ -104,17 +104,17 @@ def _facets(body: Body, index: int) -> Iterator[_Facet]:
     cross = trimesh.triangles.cross(body.corners_m)
     size = np.linalg.norm(cross, axis=-1)
     normals = cross / size[:, None]
-    left = np.ones(len(size), bool)
+    unassigned = np.ones(len(size), bool)
     for _ in range(MOST_FACETS):
-        if not left.any():
+        if not unassigned.any():
             return
-        seed = int(np.argmax(np.where(left, size, 0)))
+        seed = int(np.argmax(np.where(unassigned, size, 0)))
         normal = normals[seed]
         offset = float(body.corners_m[seed].mean(axis=0) @ normal)
-        inside = left & (np.abs(normals @ normal) > PARALLEL)
+        inside = unassigned & (np.abs(normals @ normal) > PARALLEL)
         inside[inside] = (np.abs(body.corners_m[inside] @ normal - offset) < FLAT_M).all(axis=-1)
         inside[seed] = True  # rounding may put a large triangle's corners out of its own plane
-        left &= ~inside
+        unassigned &= ~inside
         yield _facet(body, inside, normal, offset, index)
 
 

@@ -87,11 +87,11 @@ def at_inner_faces(walls_m: FloatArray, grid: PlanGrid) -> FloatArray:
         length = np.linalg.norm(end - begin)
         along = (end - begin) / length
         on_wall = begin + np.arange(0, length, step)[:, None] * along
-        left = np.array([-along[1], along[0]])
-        inside = [np.mean(shapely.contains_xy(area, on_wall + side * EDGE_M * left)) > 0.5 for side in (1, -1)]
+        to_left = np.array([-along[1], along[0]])
+        inside = [np.mean(shapely.contains_xy(area, on_wall + side * EDGE_M * to_left)) > 0.5 for side in (1, -1)]
         if inside[0] == inside[1]:
             continue
-        inwards = left if inside[0] else -left
+        inwards = to_left if inside[0] else -to_left
         cells, within = grid.cell_indices(on_wall[:, None] + depth[:, None] * inwards)
         occupied = grid.occupied[cells] & within
         # At most places no other wall meets this one.

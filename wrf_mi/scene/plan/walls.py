@@ -48,12 +48,12 @@ def find_walls(grid: PlanGrid) -> FloatArray:
     Walls along and across the main direction are taken first; the remaining cells may show further directions.
     """
     grid = without_specks(grid)
-    left, walls = grid, list[FloatArray]()
+    unexplained, walls = grid, list[FloatArray]()
     for pass_ in range(MOST_DIRECTIONS):
-        if not left.occupied.any():
+        if not unexplained.occupied.any():
             break
-        angle = dominant_direction(left.occupied)
-        view = turned(left, angle)
+        angle = dominant_direction(unexplained.occupied)
+        view = turned(unexplained, angle)
         runs = find_runs(view) if pass_ == 0 else find_runs(view, SHORTEST_OBLIQUE_M)
         if not runs:
             break
@@ -62,14 +62,14 @@ def find_walls(grid: PlanGrid) -> FloatArray:
         pieces = [run.ends_m @ rotation_2d(angle).T for run in (*runs, *tidy)]
         walls += pieces[len(runs) :]
         # The occupied cells that lie at these walls are explained.
-        cells = shapely.points(left.centres_m(left.occupied))
+        cells = shapely.points(unexplained.centres_m(unexplained.occupied))
         reach = [CLEARED_M + run.thick_m for run in (*runs, *tidy)]
         lines = shapely.linestrings(np.array(pieces))
         near = shapely.STRtree(cells).query(lines, predicate="dwithin", distance=reach)[1]
-        occupied = left.occupied.copy()
+        occupied = unexplained.occupied.copy()
         row, column = np.nonzero(occupied)
         occupied[row[near], column[near]] = False
-        left = without_specks(replace(left, occupied=occupied))
+        unexplained = without_specks(replace(unexplained, occupied=occupied))
     if not walls:
         raise InputError("no straight wall was found; is the resolution right, and is it a plan of walls?")
     walls_m = _without_clutter(joined(np.array(walls)))

@@ -124,7 +124,7 @@ def sights_of(points_m: FloatArray, viewpoints_m: FloatArray, viewpoint: IntArra
     return [origin] if origin.fits(LEAST_SEEN) else []
 
 
-def seen(
+def returns_and_shadows(
     sights: Sequence[Sight], plane: Plane, targets_m: FloatArray, walls: Sequence[Face], band_m: float, before: Mask
 ) -> tuple[IntArray, Mask]:
     """What scanners saw of points [n, 3] of a plane.
