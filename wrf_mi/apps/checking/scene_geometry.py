@@ -17,7 +17,7 @@ from ...core.files import inside, one_line
 from ...core.memory import require_memory
 from ...core.types import IntArray
 from ...scene.mesh.files import POLYGON_READERS, mesh_parts, triangles_of
-from ...scene.mesh.surfaces import bodies, copies, without_area
+from ...scene.mesh.surfaces import bodies, copies, first_copies, without_area
 from ...tracing.sionna.scenes import REFUSALS, placed_mesh, reason, same_triangles, triangles_by_mitsuba
 from .scene_findings import Finding
 from .scene_xml_faults import PARAMETERS, SceneXml, similar_file
@@ -215,15 +215,11 @@ def between_parts(parts: list[ShapePart]) -> Iterator[Finding]:
     owner = np.repeat(np.arange(len(parts)), [len(part.corners_m) for part in parts])
     corners = np.concatenate([part.corners_m for part in parts])
     valid = np.flatnonzero(~without_area(corners))
-    inside_part = np.zeros(len(corners), bool)
-    for k in range(len(parts)):
-        rows = valid[owner[valid] == k]
-        inside_part[rows] = copies(corners[rows])
-    doubled = valid[copies(corners[valid])]
-    for k in np.unique(owner[doubled[~inside_part[doubled]]]):
-        count, part = np.count_nonzero(owner[doubled] == k), parts[k]
+    # Of copies within a part `part_findings` are.
+    is_copy = owner[valid][first_copies(corners[valid])] < owner[valid]
+    for k, count in zip(*np.unique(owner[valid][is_copy], return_counts=True), strict=True):
         text = f"{count} faces are copies of those of a shape before it"
-        yield Finding("duplicate-faces", part.file, part.name, text, "remove one of both (--repair does)")
+        yield Finding("duplicate-faces", parts[k].file, parts[k].name, text, "remove one of both (--repair does)")
     yield from _near_sheets(parts, corners, owner)
 
 

@@ -136,9 +136,15 @@ def welded(corners_m: FloatArray, same_m: float = SAME_CORNER_M) -> trimesh.Trim
     return mesh
 
 
+def first_copies(corners_m: FloatArray) -> IntArray:
+    """Number of the first of triangles [f, 3, 3] that has the corners of each, in any order [f]."""
+    first, group = trimesh.grouping.unique_rows(np.sort(welded(corners_m, COPY_M).faces, axis=1))
+    return np.asarray(first[group])
+
+
 def copies(corners_m: FloatArray) -> NDArray[np.bool_]:
     """Which triangles [f, 3, 3] have the corners of an earlier one, in any order."""
-    return np.asarray(~welded(corners_m, COPY_M).unique_faces())
+    return first_copies(corners_m) != np.arange(len(corners_m))
 
 
 def shared_edges(corners_m: FloatArray) -> tuple[IntArray, IntArray]:
