@@ -22,8 +22,7 @@ from wrf_mi.core.types import IntArray
 from wrf_mi.datasets.newrf import KEYS, read_arrays
 from wrf_mi.scene.coordinates import extra_package
 from wrf_mi.scene.make import make_scene
-from wrf_mi.scene.plan.alignment import grid_from_scans
-from wrf_mi.scene.plan.sources import PlanGrid, PlanPoints, Row0, grid_from_points, read_layout, read_plan
+from wrf_mi.scene.plan.sources import PlanGrid, Row0, read_layout, read_plan
 from wrf_mi.scene.plan.storey import layout_walls
 from wrf_mi.scene.plan.walls import find_walls
 from wrf_mi.scene.register import best_scale, register_walls, sample_walls
@@ -201,43 +200,30 @@ def wall_agreement(made_m: FloatArray, true_m: FloatArray, near_m: float = NEAR_
 
 
 def flat_plan() -> dict[str, Any]:
-    """Walls from ``lidar/gridmap.npz`` and ``lidar/points.npz`` of flat-ble, registered to ``layout.csv``.
+    """Walls from ``lidar/gridmap.npz`` of flat-ble, registered to ``layout.csv``.
 
-    An upper bound for any method is the share of the layout near an occupied cell. Each source has shares, what can be
+    An upper bound for any method is the share of the layout near an occupied cell. Figures are shares, what can be
     seen, walls, scale of the registration, seconds.
     """
     home = data_folder("flat-ble")
     true = layout_walls(read_layout(home / "layout.csv"))
-    lidar = home / "lidar"
-    grid, returns = read_plan(lidar / "gridmap.npz", GRID_RESOLUTION_M, GRID_ROW_0), read_plan(lidar / "points.npz")
-    if not isinstance(grid, PlanGrid) or not isinstance(returns, PlanPoints) or returns.time_s is None:
-        raise InputError(f"{lidar}: expected log_odds in gridmap.npz, xy_m and time_s in points.npz")
-    begin = time.perf_counter()
-    scans = grid_from_scans(returns.xy_m, returns.time_s)
-    aligning_s = time.perf_counter() - begin
-    figures: dict[str, Any] = {
-        "gridmap": _measured_plan(grid, true),
-        "points": _measured_plan(scans, true) | {"aligning_seconds": aligning_s},
-        # In the layout's frame by the robot's poses; too blurred for a fit to be accepted.
-        "points without alignment": _measured_plan(grid_from_points(returns.xy_m), true, register=False),
-    }
-    rows = []
-    for name, shares in figures.items():
-        what = f"{name}: layout within {NEAR_M} m of a wall made, and the reverse"
-        value = "{layout_found:.2f} and {walls_right:.2f} (seen at all: {layout_seen:.2f})".format_map(shares)
-        rows.append(line(what, value, ASKED if name == "gridmap" else "-"))
-    return {"rows": rows, **figures}
+    file = home / "lidar" / "gridmap.npz"
+    grid = read_plan(file, GRID_RESOLUTION_M, GRID_ROW_0)
+    if not isinstance(grid, PlanGrid):
+        raise InputError(f"{file}: expected log_odds")
+    shares = _measured_plan(grid, true)
+    what = f"gridmap: layout within {NEAR_M} m of a wall made, and the reverse"
+    value = "{layout_found:.2f} and {walls_right:.2f} (seen at all: {layout_seen:.2f})".format_map(shares)
+    return {"rows": [line(what, value, ASKED)], "gridmap": shares}
 
 
-def _measured_plan(grid: PlanGrid, true: FloatArray, register: bool = True) -> dict[str, Any]:
+def _measured_plan(grid: PlanGrid, true: FloatArray) -> dict[str, Any]:
     begin = time.perf_counter()
     walls, cells = find_walls(grid), grid.centres_m(grid.occupied)
     seconds = time.perf_counter() - begin
-    scale = None
-    if register:
-        motion = register_walls(sample_walls(walls), true)
-        walls, cells = (points @ motion[:2, :2].T + motion[:2, 3] for points in (walls, cells))
-        scale, _ = best_scale(sample_walls(walls), np.zeros(3), true)
+    motion = register_walls(sample_walls(walls), true)
+    walls, cells = (points @ motion[:2, :2].T + motion[:2, 3] for points in (walls, cells))
+    scale, _ = best_scale(sample_walls(walls), np.zeros(3), true)
     share_found, right = wall_agreement(walls, true)
     layout = shapely.unary_union(shapely.linestrings(true))
     near = shapely.intersection(layout, shapely.buffer(shapely.multipoints(cells), NEAR_M))

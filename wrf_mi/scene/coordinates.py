@@ -43,7 +43,10 @@ CONVERSIONS = {
     **dict.fromkeys((".zip", ".7z", ".rar"), "unpack it"),
 }
 """How scenes in other formats become one that is read, by the ending of the file."""
-EXTRAS = {"laspy": "lidar", "open3d": "lidar", "pye57": "lidar", "lzf": "lidar", "collada": "meshes", "pxr": "meshes"}
+EXTRAS = {
+    **dict.fromkeys(("laspy", "open3d", "pye57", "lzf", "pyproj"), "lidar"),
+    **dict.fromkeys(("collada", "pxr"), "meshes"),
+}
 """Extra of this package that installs a package; `SYSTEM` are libraries that Open3D needs and a small system lacks."""
 SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
 LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5

@@ -105,19 +105,19 @@ def edit_scene(
     surfaces, materials = read_surfaces(folder)
     if not moves and not remove:
         raise InputError(f"{folder}: nothing to change; name parts to move or to remove")
-    unmoved, moved_names, gone = surfaces, set[str](), _chosen(folder, surfaces, remove)
+    unmoved, moved_names, removed_names = surfaces, set[str](), _chosen(folder, surfaces, remove)
     for move in moves:
         names = _chosen(folder, surfaces, move.parts)
-        surfaces = _after(move, surfaces, names, gone)
+        surfaces = _after(move, surfaces, names, removed_names)
         moved_names |= names
-    left = [surface for surface in surfaces if surface.name not in gone]
-    _check_moves(unmoved, left, moved_names)
-    entries = {surface.name: materials.surfaces[surface.name] for surface in left}
+    remaining = [surface for surface in surfaces if surface.name not in removed_names]
+    _check_moves(unmoved, remaining, moved_names)
+    entries = {surface.name: materials.surfaces[surface.name] for surface in remaining}
     changes = [f"{','.join(move.parts)} moved by {move.shift_m} m and {move.turn_deg:g} degrees" for move in moves]
     changes += [f"{name} removed" for name in remove]
     return write_scene(
         out,
-        left,
+        remaining,
         frame=f"that of {folder}",
         source=str(folder),
         materials=replace(materials, surfaces=entries),
@@ -143,8 +143,8 @@ def _chosen(folder: str | Path, surfaces: Sequence[Surface], patterns: Sequence[
     for pattern in patterns:
         names = {surface.name for surface in surfaces if fnmatchcase(surface.name, pattern)}
         if not names:
-            known = listed(surface.name for surface in surfaces)
-            raise InputError(f"{folder}: no surface {pattern!r}; it has {known}")
+            present = listed(surface.name for surface in surfaces)
+            raise InputError(f"{folder}: no surface {pattern!r}; it has {present}")
         chosen |= names
     return chosen
 

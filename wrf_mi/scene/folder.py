@@ -164,11 +164,11 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
 
 
 def _origin(folder: Path, facts: Mapping[Any, Any]) -> tuple[float, ...] | None:
-    stated = facts.get("origin_m")
-    if not stated:
+    value = facts.get("origin_m")
+    if not value:
         return None
     try:
-        origin_m = tuple(map(float, stated))
+        origin_m = tuple(map(float, value))
     except (TypeError, ValueError):
         origin_m = ()
     if len(origin_m) != 3 or not np.isfinite(origin_m).all():

@@ -113,6 +113,7 @@ def boxes(surfaces: Sequence[Surface]) -> Boxes:
 
     Faces are named ``hidden_01`` and so on, less the names that surfaces have.
     """
+    # Walls, floor and ceiling may stand in the place of a box's face, but are no faces of boxes.
     furniture, around = (
         list(_faces([surface for surface in surfaces if (surface.kind == "other") == is_furniture]))
         for is_furniture in (True, False)
@@ -120,10 +121,10 @@ def boxes(surfaces: Sequence[Surface]) -> Boxes:
     names = _free_names({surface.name for surface in surfaces})
     hidden, members = list[Rectangle](), dict[frozenset[str], None]()
     for box in filter(_has_size_of_furniture, _boxes(furniture)):
-        known, missing = _known_and_missing(box, [*furniture, *hidden], around)
+        present, missing = _present_and_missing(box, [*furniture, *hidden], around)
         completing = [replace(face, name=next(names)) for face in missing]
         hidden += completing
-        members[frozenset(face.name for face in known + completing)] = None
+        members[frozenset(face.name for face in present + completing)] = None
     halves = np.array([[0, 1, 2], [0, 2, 3]])
     return Boxes([Surface(face.name, "other", face.corners, halves) for face in hidden], list(members))
 
@@ -132,18 +133,18 @@ def _free_names(names_in_use: set[str]) -> Iterator[str]:
     return (name for number in count(1) if (name := f"{PREFIX}{number:02d}") not in names_in_use)
 
 
-def _known_and_missing(
+def _present_and_missing(
     box: Box, furniture: Sequence[Rectangle], around: Sequence[Rectangle]
 ) -> tuple[list[Rectangle], list[Rectangle]]:
     """Faces of furniture in the place of a box's faces, and its faces in whose place no face is known."""
-    known, missing = list[Rectangle](), list[Rectangle]()
+    present, missing = list[Rectangle](), list[Rectangle]()
     for face in _faces_of_box(*box):
         in_place = [other for other in furniture if face.covered_by(other)]
-        known += in_place
+        present += in_place
         # Walls and floors in its place hide a face for good, and belong to no box.
         if not in_place and not any(map(face.covered_by, around)):
             missing.append(face)
-    return known, missing
+    return present, missing
 
 
 def _has_size_of_furniture(box: Box) -> bool:
@@ -197,6 +198,7 @@ def _boxes(faces: Sequence[Rectangle]) -> Iterator[Box]:
     """Boxes of which two faces are known."""
     sides = [face for face in faces if abs(face.normal[2]) < 0.5]
     tops = [face for face in faces if abs(face.normal[2]) > 0.5]
+    # A top states its outline, and a side below it the height; of two sides the outline is at right angles or parallel.
     for top, side in product(tops, sides):
         if _is_below(top, side):
             yield top.corners[:, :2], side.heights_m[0], top.centre[2]
@@ -226,6 +228,7 @@ def _corner(first: Rectangle, second: Rectangle) -> FloatArray | None:
     lows, highs = np.stack([first.heights_m, second.heights_m], axis=1)
     if abs(first.normal @ second.normal) > UPRIGHT or highs.min() - lows.max() < LEAST_SIDE_M:
         return None
+    # Each end of the one with each end of the other.
     for a, b in product((first.sides[0, :2], -first.sides[0, :2]), (second.sides[0, :2], -second.sides[0, :2])):
         end, begin = first.centre[:2] - a, second.centre[:2] - b
         if np.linalg.norm(end - begin) < TOUCH_M:
@@ -240,6 +243,7 @@ def _between(first: Rectangle, second: Rectangle) -> FloatArray | None:
     """Base [4, 2] of the box between two sides of equal outline; None: they are not opposite."""
     a, gap = first.sides[0, :2], second.centre - first.centre
     size = np.linalg.norm(a)
+    # From one middle to the other: along the sides, where opposite ones do not differ, and square to them.
     along, across = float(gap[:2] @ a / size), gap[:2] - (gap[:2] @ a) / size**2 * a
     longer = np.linalg.norm(first.sides, axis=1) - np.linalg.norm(second.sides, axis=1)
     if abs(first.normal @ second.normal) < np.sqrt(1 - UPRIGHT**2) or np.linalg.norm(across) < SAME_M:

@@ -293,8 +293,8 @@ def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> 
     if up is not None:
         raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
     plan = read_plan(file, resolution_m, row_0)
-    walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, resolution_m=resolution_m, name=str(file))
-    return _Source(file, walls, plan if isinstance(plan, PlanGrid) else None)
+    walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, name=str(file))
+    return _Source(file, walls, plan if isinstance(plan, PlanGrid) and plan.free.any() else None)
 
 
 def _split(raw: Sequence[Surface], file: Path, up: Up | None) -> list[Surface]:

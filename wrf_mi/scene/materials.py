@@ -101,8 +101,8 @@ class Materials:
         entries = {name: self.surfaces.get(name, kind) for name, kind in kinds.items()}
         full = replace(self, rules={**RULES, **self.rules}, surfaces=entries)
         used = dict.fromkeys([*full.rules.values(), *(full.of(name, "other") for name in entries)])
-        stated = {m: float(self.thickness_m.get(m, THICKNESS_M[m])) for m in used if m in THICKNESS_M}
-        return replace(full, thickness_m=stated)
+        thickness_m = {m: float(self.thickness_m.get(m, THICKNESS_M[m])) for m in used if m in THICKNESS_M}
+        return replace(full, thickness_m=thickness_m)
 
 
 def read_materials(path: str | Path) -> Materials:
@@ -115,19 +115,19 @@ def read_materials(path: str | Path) -> Materials:
     parts = _read_parts(file)
     for name, values in parts["constants"].items():
         _check_constants(file, name, values)
-    known = (*parts["constants"], *KNOWN)
+    allowed = (*parts["constants"], *KNOWN)
     for kind, material in parts["rules"].items():
         if kind not in KINDS:
             raise InputError(f"{file}: rules: no kind {kind!r}; known are {', '.join(KINDS)}")
-        _check_material(f"{file}: rules: {kind}", material, known)
+        _check_material(f"{file}: rules: {kind}", material, allowed)
     for name, entry in parts["surfaces"].items():
         if not isinstance(name, str) or not SURFACE_NAME.fullmatch(name):
             raise InputError(f"{file}: surfaces: {shown(name)} names no mesh; use letters, digits, _, - and .")
-        _check_material(f"{file}: surfaces: {name}", entry, (*KINDS, *known))
+        _check_material(f"{file}: surfaces: {name}", entry, (*KINDS, *allowed))
     thicknesses(file, parts["thickness_m"])
-    for name, stated in parts["scattering"].items():
+    for name, facts in parts["scattering"].items():
         _check_material(f"{file}: scattering", name, (*parts["constants"], *THICKNESS_M))
-        check_scattering(f"{file}: scattering: {name}", stated)
+        check_scattering(f"{file}: scattering: {name}", facts)
     return Materials(**parts)
 
 
@@ -144,23 +144,23 @@ def _read_parts(file: Path) -> dict[str, dict[Any, Any]]:
     return parts
 
 
-def _check_material(where: str, material: Any, known: Sequence[str]) -> None:
-    if material not in known:
-        raise InputError(f"{where}: unknown material {shown(material)}; known are {', '.join(known)}")
+def _check_material(where: str, material: Any, allowed: Sequence[str]) -> None:
+    if material not in allowed:
+        raise InputError(f"{where}: unknown material {shown(material)}; known are {', '.join(allowed)}")
 
 
-def thicknesses(file: Path, stated: Any) -> dict[str, float]:
+def thicknesses(file: Path, values: Any) -> dict[str, float]:
     """Thicknesses in metres of materials by name; `InputError` for anything else in ``stated``, a part of a file."""
-    if not isinstance(stated, dict):
-        raise InputError(f"{file}: thickness_m is {shown(stated)}; it must be a mapping, such as {{itu_brick: 0.2}}")
-    for material, thickness in stated.items():
+    if not isinstance(values, dict):
+        raise InputError(f"{file}: thickness_m is {shown(values)}; it must be a mapping, such as {{itu_brick: 0.2}}")
+    for material, thickness in values.items():
         if material not in THICKNESS_M:
-            known = ", ".join(THICKNESS_M)
-            raise InputError(f"{file}: thickness_m: unknown material {shown(material)}; known are {known}")
+            allowed = ", ".join(THICKNESS_M)
+            raise InputError(f"{file}: thickness_m: unknown material {shown(material)}; known are {allowed}")
         if not _is_number(thickness) or not 0 < thickness <= THICKEST_M:
             text = f"{file}: thickness_m: {material} is {shown(thickness)}"
             raise InputError(f"{text}; give metres above 0, {THICKEST_M:g} at most")
-    return dict(stated)
+    return dict(values)
 
 
 def _is_number(value: Any) -> bool:

@@ -74,6 +74,7 @@ def conflicts(positions_m: FloatArray, surfaces: Sequence[Surface]) -> tuple[int
     cut_m = box_of(surfaces)[0, 2] + WALKING_HEIGHT_M
     if np.isfinite(z_m).all():
         cut_m = np.median(z_m)
+    # Not at the walls' edges, where rounding decides whether they are cut.
     margin = EDGE_SHARE * (high_m - low_m)
     level_m = float(np.clip(cut_m, low_m + margin, high_m - margin))
     cut = shapely.STRtree(shapely.linestrings(np.concatenate([cut_lines(wall, level_m) for wall in walls])))
@@ -121,6 +122,7 @@ def _better_shift(positions_m: FloatArray, surfaces: Sequence[Surface], tolerate
     """The smallest of the shifts [2] in metres by which positions [n, 3] fit a scene best; None if they do not."""
     steps = np.arange(-SHIFT_M, SHIFT_M + SHIFT_STEP_M / 2, SHIFT_STEP_M)
     shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    # The smallest first: of shifts with equal counts `argmin` takes the first one.
     shifts = shifts[np.argsort(np.hypot(*shifts.T), kind="stable")]
     counts = [sum(conflicts(positions_m + np.append(shift, 0.0), surfaces)) for shift in shifts]
     return None if min(counts) > tolerated else np.asarray(shifts[np.argmin(counts)])

@@ -153,6 +153,7 @@ def register_walls(points_m: ArrayLike, walls_m: ArrayLike, name: str = "scene")
             raise InputError(f"{text}; {better}: check resolution and units, or give pairs")
         remedy = "check that the walls are of this place, and its units, or give pairs"
         raise InputError(f"{text}, and slightly other lengths fit no better: {remedy}")
+    # Square rooms fit after quarter turns, too; poses a few centimetres apart are refined from two starts, and equal.
     for other, other_score in others:
         apart = np.linalg.norm(_moved(points, pose) - _moved(points, other), axis=1)
         if np.sqrt(np.mean(apart**2)) > SAME_M and other_score > score - CLEAR_LEAD:
@@ -181,6 +182,7 @@ def _moved(points: FloatArray, pose: FloatArray) -> FloatArray:
 def _find_poses(points: FloatArray, walls: FloatArray) -> list[tuple[FloatArray, float]]:
     """Poses (x, y, angle) of points [n, 2] that fit walls [m, 2, 2], and their agreement 0 to 1, the best first."""
     points = points[:: -(-len(points) // MOST_POINTS)]
+    # About their middle, so that an error of the angle moves no point farther than the radius times it.
     middle = points.mean(axis=0)
     centred = points - middle
     targets = sample_walls(walls)
@@ -205,6 +207,7 @@ def _agreement(placed: FloatArray, targets: FloatArray, walls: FloatArray) -> fl
     """Mean of the shares of the scene at walls, and of the walls in the scene, where distances d count exp(-(d / 0.1
     m)^2 / 2).
     """
+    # Both ways: points of one wall alone agree with any plan, and a plan of many walls with any points.
     to_walls, to_points = distance_to_walls(placed, walls), cKDTree(placed).query(targets)[0]
     near, shown = (np.exp(-0.5 * (away / (NEAR_M / 2)) ** 2) for away in (to_walls, to_points))
     return float((near.mean() + shown.mean()) / 2)
@@ -218,12 +221,14 @@ def _starts(centred: FloatArray, targets: FloatArray, cell: float) -> list[Float
     low = targets.min(axis=0) - 2 * radius
     shape = np.ceil((targets.max(axis=0) + 2 * radius - low) / cell).astype(int) + 1
     half = int(np.ceil(radius / cell))
+    # Blurred by two cells: between two turns that are searched, the farthest points move by as much.
     wall_image = ndimage.gaussian_filter(_image((targets - low) / cell, shape), 2.0)
     peaks: list[tuple[float, FloatArray]] = []
     for angle in np.arange(TURNS) * (2 * np.pi / TURNS):
         kernel = _image(centred @ rotation_2d(angle).T / cell + half, np.array([2 * half + 1] * 2))
         # A convolution with the reversed picture is the correlation with it.
         match = fftconvolve(wall_image, kernel[::-1, ::-1], mode="same")
+        # The best match of a turn may be a wrong wall: its next best shifts are refined, too.
         for _ in range(PEAKS):
             peak = np.array(np.unravel_index(np.argmax(match), match.shape))
             peaks.append((float(match[tuple(peak)]), np.append(low + peak * cell, angle)))

@@ -19,27 +19,27 @@ EXPONENTS = ("alpha_r", "alpha_i")
 SCATTERING = (*SHARES, PATTERN, *PATTERNS["backscattering"])  # all that may be stated of it
 
 
-def check_scattering(where: str, stated: Any) -> dict[str, Any]:
+def check_scattering(where: str, facts: Any) -> dict[str, Any]:
     """What is stated of a material's scattering; `InputError` for anything else than `SHARES` and one of `PATTERNS`.
 
     The shares, ``lambda_`` among them, are numbers in 0..1, exponents whole numbers from 1.
     """
-    if not isinstance(stated, dict):
-        raise InputError(f"{where} is {shown(stated)}; give a mapping, such as {{{SHARES[0]}: 0.3}}")
-    pattern = stated.get(PATTERN, "lambertian")
+    if not isinstance(facts, dict):
+        raise InputError(f"{where} is {shown(facts)}; give a mapping, such as {{{SHARES[0]}: 0.3}}")
+    pattern = facts.get(PATTERN, "lambertian")
     if not isinstance(pattern, str) or pattern not in PATTERNS:
         raise InputError(f"{where}: unknown {PATTERN} {shown(pattern)}; known are {', '.join(PATTERNS)}")
-    known = (*SHARES, PATTERN, *PATTERNS[pattern])
-    for key, value in stated.items():
-        if key not in known:
-            raise InputError(f"{where}: no {shown(key)} with a {pattern} pattern; give {', '.join(known)}")
-        whole = key in EXPONENTS
-        is_number = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-        valid = is_number and (value >= 1 if whole else 0 <= value <= 1)
+    allowed = (*SHARES, PATTERN, *PATTERNS[pattern])
+    for key, value in facts.items():
+        if key not in allowed:
+            raise InputError(f"{where}: no {shown(key)} with a {pattern} pattern; give {', '.join(allowed)}")
+        is_integer = key in EXPONENTS
+        is_number = isinstance(value, int if is_integer else int | float) and not isinstance(value, bool)
+        valid = is_number and (value >= 1 if is_integer else 0 <= value <= 1)
         if key != PATTERN and not valid:
-            wanted = "a whole number from 1 upwards" if whole else "a number in 0..1"
+            wanted = "a whole number from 1 upwards" if is_integer else "a number in 0..1"
             raise InputError(f"{where}: {key} is {shown(value)}; give {wanted}")
-    return dict(stated)
+    return dict(facts)
 
 
 def stated_scattering(bsdf: Element, root: Element) -> dict[str, Any]:

@@ -46,8 +46,8 @@ OVERRULED = "has constants and an id of ITU-R P.2040, by which Sionna RT leaves 
 def overruled(bsdf: Element) -> bool:
     """Whether a BSDF states constants, in place of which Sionna RT takes those of ITU-R P.2040 for its id."""
     is_itu = bsdf.get("id", "").removeprefix("mat-").startswith(("itu_", "itu-"))
-    stated = {child.get("name") for child in bsdf}
-    return is_itu and bool(stated & {"relative_permittivity", "conductivity"})
+    parameters = {child.get("name") for child in bsdf}
+    return is_itu and bool(parameters & {"relative_permittivity", "conductivity"})
 
 
 def make_files_absolute(root: Element, path: Path) -> None:
@@ -121,8 +121,8 @@ def _check(element: Element, where: str, named: Mapping[int, str], folder: Path 
 
 def _check_plugin(element: Element, where: str) -> None:
     tag, plugin = element.tag, element.get("type", "")
-    known = PLUGINS.get(tag, "").split()
-    if plugin not in known if plugin else tag not in VALUES:
-        what = f"plugin {plugin[:40]!r} of <{tag}>" if known else f"element <{tag[:40]}>"
-        remedy = f"known are {', '.join(known or [*VALUES, *PLUGINS])}"
+    plugins = PLUGINS.get(tag, "").split()
+    if plugin not in plugins if plugin else tag not in VALUES:
+        what = f"plugin {plugin[:40]!r} of <{tag}>" if plugins else f"element <{tag[:40]}>"
+        remedy = f"known are {', '.join(plugins or [*VALUES, *PLUGINS])}"
         raise InputError(f"{where}: {one_line(what)} does not belong into a scene; {remedy}")

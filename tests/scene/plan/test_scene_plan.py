@@ -1,4 +1,4 @@
-"""Plans with known walls: what is found in maps, points, scans with wrong poses and layouts, and their files."""
+"""Plans with known walls: what is found in maps, points and layouts, and their files."""
 
 import numpy as np
 import pytest
@@ -6,17 +6,15 @@ from made_plans import INNER_M, L_ROOM_M, POSES_M, TWO_ROOMS_M, agreement, box, 
 from PIL import Image
 
 from wrf_mi.core import InputError
-from wrf_mi.scene.plan.alignment import grid_from_scans, sensor_of
 from wrf_mi.scene.plan.lines import dominant_direction
 from wrf_mi.scene.plan.sources import (
     PlanGrid,
-    PlanPoints,
     grid_from_points,
     grid_from_probability,
     read_layout,
     read_plan,
 )
-from wrf_mi.scene.plan.storey import floor_of, layout_walls, plan_surfaces, walls_of_plan
+from wrf_mi.scene.plan.storey import floor_of, layout_walls, plan_surfaces
 from wrf_mi.scene.plan.walls import find_walls, joined
 
 CLOSE_M = 0.1
@@ -95,42 +93,6 @@ def test_ends_meet_within_reach_and_doors_stay():
     # With a gap in the outer wall too, as where a door stood open.
     open_walls = np.concatenate([TWO_ROOMS_M[1:], [[[0, 0], [1, 0]], [[2, 0], [6, 0]]]])
     assert floor_of(open_walls).area == pytest.approx(24, rel=0.02)
-
-
-# --- scans with poses that are off
-
-
-def off_poses(walls, poses, seed=5):
-    """Scans, each moved by an error of its pose; three of each stop, half a second apart."""
-    rng = np.random.default_rng(seed)
-    xy, time, clock = [], [], 0.0
-    for i, pose in enumerate(poses):
-        shift, angle = rng.uniform(-0.4, 0.4, 2), rng.uniform(-8, 8)
-        for k in range(3):
-            cloud = scan(walls, pose, beams=360, seed=10 * i + k)
-            xy.append(pose + turn(cloud - pose, angle, shift) + rng.normal(0, 0.02, 2))
-            time.append(np.full(len(cloud), clock + 0.5 * k))
-        clock += 20.0
-    return np.concatenate(xy), np.concatenate(time)
-
-
-def test_scans_with_wrong_poses_are_aligned_and_their_sensors_found():
-    poses = np.array([[1.0, 1.0], [2.5, 3.0], [2.0, 1.5], [4.5, 1.4], [5.0, 3.0], [4.2, 2.5]])
-    xy, time = off_poses(TWO_ROOMS_M, poses)
-    grid = grid_from_scans(xy, time)
-    assert np.count_nonzero(grid.occupied) < 0.5 * np.count_nonzero(grid_from_points(xy).occupied)
-    # In its own frame, off by the mean error of the poses.
-    assert min(agreement(find_walls(grid), TWO_ROOMS_M, 0.25)) > 0.95
-    assert grid.free.any()
-    right = scans(TWO_ROOMS_M)
-    time = np.concatenate([np.full(len(c), 30.0 * i) for i, c in enumerate(right)])
-    walls = walls_of_plan(PlanPoints(np.concatenate(right), time))
-    assert min(agreement(walls, TWO_ROOMS_M, CLOSE_M)) > 0.95
-    scene = np.concatenate([TWO_ROOMS_M, WARDROBE, TABLE])
-    errors = [np.linalg.norm(sensor_of(scan(scene, pose)) - pose) for pose in POSES_M]
-    assert max(errors) < 0.15
-    crowd = np.random.default_rng(0).uniform(0, 5, (2000, 2))
-    assert sensor_of(crowd) is None
 
 
 # --- floors and surfaces
@@ -227,14 +189,14 @@ def test_row_0_of_the_caller_overrides_that_of_the_file_and_is_refused_where_the
             read_plan(tmp_path / name, 0.1, "top")
 
 
-def test_points_with_and_without_times_and_vertices_of_layouts(tmp_path):
-    np.savez(tmp_path / "a.npz", xy_m=np.eye(2), time_s=[0.0, 1.0])
-    source = read_plan(tmp_path / "a.npz")
-    assert isinstance(source, PlanPoints)
-    assert source.time_s.tolist() == [0, 1]
-    (tmp_path / "b.xyz").write_text("# a scan\n1 2\n3,4  # comment\n\n")
-    source = read_plan(tmp_path / "b.xyz")
-    assert (source.xy_m.tolist(), source.time_s) == ([[1, 2], [3, 4]], None)
+def test_points_become_cells_and_layouts_vertices(tmp_path):
+    np.savez(tmp_path / "a.npz", xy_m=np.array([[1.01, 2.02], [3.03, 4.04]]))
+    (tmp_path / "b.xyz").write_text("# a scan\n1.01 2.02\n3.03,4.04  # comment\n\n")
+    for name in ("a.npz", "b.xyz"):
+        source = read_plan(tmp_path / name, 0.1)
+        assert isinstance(source, PlanGrid)
+        np.testing.assert_allclose(source.centres_m(source.occupied), [[1.05, 2.05], [3.05, 4.05]])
+        assert not source.free.any()
     (tmp_path / "layout.csv").write_text("x,y\n0,0\n2.5,0\n2.5,1\n")
     for read in (read_layout, read_plan):
         assert read(tmp_path / "layout.csv").tolist() == [[0, 0], [2.5, 0], [2.5, 1]]
@@ -252,8 +214,9 @@ def test_points_with_and_without_times_and_vertices_of_layouts(tmp_path):
         ({"log_odds": np.full((3, 3), np.nan), "resolution_m": 0.1, "row_0": "top"}, "every cell is NaN"),
         ({"log_odds": np.full((3, 3), -1.0), "resolution_m": 0.1, "row_0": "top"}, "no cell is occupied"),
         ({"log_odds": np.array([["a"]]), "resolution_m": 0.1}, "log_odds holds no numbers"),
-        ({"xy_m": np.zeros((3, 3))}, r"xy_m has shape \(3, 3\)"),
-        ({"xy_m": np.zeros((3, 2)), "time_s": np.zeros(2)}, r"time_s has shape \(2,\); expected \[3\]"),
+        ({"xy_m": np.zeros((3, 3))}, r"points of a plan have shape .* these have \(3, 3\)"),
+        ({"xy_m": np.zeros((3, 2)), "time_s": np.zeros(3)}, "time_s: scans .* are not aligned; give the map of a SLAM"),
+        ({"xy_m": np.array([[0.0, np.nan]])}, "point 0 is not finite"),
         ({"other": np.zeros(2)}, "neither log_odds nor xy_m but other"),
     ],
 )
@@ -281,7 +244,7 @@ def test_arrays_without_a_plan_are_refused(tmp_path, arrays, line):
         ("a.png", "no picture", "give the side of a pixel"),
         ("a.yaml", "image: b.pgm\n", "not the YAML of a ROS map"),
         ("a.yaml", "- 1\n", "not the YAML of a ROS map"),
-        ("a.yaml", "image: b.pgm\nresolution: 0.1\norigin: [0, 0, 1.5]\n", "turned by 1.5 rad"),
+        ("a.yaml", "image: b.pgm\nresolution: 0.1\norigin: [0, 0, 1.5]\n", "give .* a yaw of 0"),
         ("a.yaml", "image: b.pgm\nresolution: 0.1\norigin: [0, 0, 0]\n", "not a picture that can be read"),
         ("a.dwg", "", "unknown ending"),
     ],

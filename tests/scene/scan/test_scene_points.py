@@ -199,7 +199,9 @@ def write_las_in(file, points, system):
         ({1024: 1, 3076: 9001}, ["m"]),
         ({1024: 1, 3076: 9002, 4099: 9003}, ["ft"]),
         ({1024: 2, 4099: 9001}, ["degrees", "m"]),
-        ({1024: 1, 3072: 25832}, []),
+        ({1024: 1, 3072: 25832}, ["m"]),
+        ({1024: 1, 3072: 2263}, ["ft"]),
+        ("PROJCS[", []),
     ],
 )
 def test_units_are_those_of_easting_and_of_height(system, units, tmp_path):

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from xml.etree.ElementTree import Element
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from ...core import InputError
 from ...core.angles import FloatArray
@@ -17,17 +17,16 @@ from ...core.files import inside, one_line
 from ...core.memory import require_memory
 from ...core.types import IntArray
 from ...scene.mesh.files import POLYGON_READERS, mesh_parts, triangles_of
-from ...scene.mesh.polygon_files import Polygons
-from ...scene.mesh.surfaces import bodies, without_area
-from ...tracing.sionna.scenes import placed_mesh, same_triangles, triangles_by_mitsuba
+from ...scene.mesh.surfaces import bodies, copies, first_copies, without_area
+from ...tracing.sionna.scenes import REFUSALS, placed_mesh, reason, same_triangles, triangles_by_mitsuba
 from .scene_findings import Finding
-from .scene_xml_faults import PARAMETERS, SceneXml, number, similar_file
-from .triangle_faults import copies, double_sheets, is_flat, open_solids, wound_both_ways
+from .scene_xml_faults import PARAMETERS, SceneXml, similar_file
+from .triangle_faults import double_sheets, open_solids, sheet_numbers, wound_both_ways
 
 MEMORY = {".obj": 30}  # bytes of memory for each byte of a mesh file; others take `MEMORY_BINARY`
 MEMORY_BINARY = 12
 SINGULAR = 1e-9  # least ratio of the scales of a transform
-UNIT = 1e-3  # largest deviation of the length of an axis of rotation from 1
+UNIT = 1e-3  # largest deviation of rotations from orthonormal matrices
 MOST_CORNERS = 2000  # corners of a polygon that is not convex: crossings of its edges grow with the square
 RESTORE = "export the mesh anew"
 
@@ -57,7 +56,7 @@ def scene_parts(scene: SceneXml) -> Iterator[ShapePart | Finding]:
         materials = [identifier for identifier, _ in scene.materials(shape)]
         part = ShapePart(name, materials[0] if materials else "", scene.path, np.empty((0, 3, 3)), shape)
         plugin = shape.get("type", "")
-        matrix = to_world(scene, shape) if plugin in PARAMETERS else np.eye(4)
+        matrix = to_world(shape) if plugin in PARAMETERS else np.eye(4)
         if isinstance(matrix, str):
             remedy = "correct the transform: scales other than 0, axes of length 1, finite numbers"
             yield Finding("transform", scene.path, name, matrix, remedy)
@@ -69,13 +68,13 @@ def scene_parts(scene: SceneXml) -> Iterator[ShapePart | Finding]:
 
 def _from_file(scene: SceneXml, shape: Element, part: ShapePart, matrix: FloatArray) -> Iterator[ShapePart | Finding]:
     """A shape with a mesh file, or with one of the same name elsewhere in the folder, in the scene's frame."""
-    plugin, stated = shape.get("type", ""), scene.file_of(shape) or ""
+    plugin, file_name = shape.get("type", ""), scene.file_of(shape) or ""
     try:
-        file: Path | None = inside(scene.path.parent, stated, scene.path)
+        file: Path | None = inside(scene.path.parent, file_name, scene.path)
     except InputError:
         file = None  # named by `xml_findings`
     if file is None or not file.is_file():
-        file = similar_file(scene.path.parent, stated)
+        file = similar_file(scene.path.parent, file_name)
     if file is None or file.suffix.lower() != f".{plugin}":
         return
     for result in read_triangles(replace(part, file=file), plugin):
@@ -99,128 +98,70 @@ def _analytic(scene: SceneXml, shape: Element, part: ShapePart) -> Iterator[Shap
         yield replace(part, corners_m=np.asarray(mesh.triangles, float))
 
 
-def to_world(scene: SceneXml, shape: Element) -> FloatArray | str:
-    """Matrix [4, 4] of a shape's ``to_world`` in double precision, or what is wrong with it.
-
-    Source: Mitsuba 3, scene format, "Transformations": each element is applied after those before it.
-    """
-    matrix = np.eye(4)
-    for transform in shape.findall("transform"):
-        for step in transform:
-            try:
-                matrix = _step(step) @ matrix
-            except ValueError as error:
-                return f"<{step.tag}> of its transform: {one_line(error)}"
+def to_world(shape: Element) -> FloatArray | str:
+    """Matrix [4, 4] of a shape's ``to_world`` in double precision, or what is wrong with it."""
+    steps = [step for transform in shape.findall("transform") for step in transform]
+    try:
+        matrix = _matrix(steps)
+        turn = _matrix([step for step in steps if step.tag == "rotate"])[:3, :3]
+    except REFUSALS as error:
+        return f"its transform: {reason(error)}"
+    # By axes of another length than 1, Mitsuba's rotations shear.
+    if np.abs(turn @ turn.T - np.eye(3)).max() > UNIT:
+        return "the axis of <rotate> of its transform is no unit vector, with which Mitsuba shears the mesh"
     scales = np.linalg.svd(matrix[:3, :3], compute_uv=False) if np.isfinite(matrix).all() else np.zeros(3)
     if scales[2] <= SINGULAR * scales[0]:
         return "its transform is not finite or leaves no volume"
     return matrix
 
 
-def _step(step: Element) -> FloatArray:
-    """Matrix [4, 4] of an element of a transform; `ValueError` for another element or a text that is no number."""
-    neutral = 1.0 if step.tag == "scale" else 0.0
-    match step.tag:
-        case "translate":
-            return trimesh.transformations.translation_matrix(_vector(step, neutral))
-        case "scale":
-            return np.diag([*_vector(step, neutral), 1.0])
-        case "rotate":
-            angle, axis = np.radians(_numbers(step.get("angle", "0"), 1)[0]), _vector(step, neutral)
-            if abs(np.linalg.norm(axis) - 1) > UNIT:
-                raise ValueError("its axis is no unit vector, with which Mitsuba shears the mesh")
-            return np.asarray(trimesh.transformations.rotation_matrix(angle, axis))
-        case "matrix":
-            return _matrix(_numbers(step.get("value", "")))
-        case "lookat":
-            origin, target, up = (_numbers(step.get(name, ""), 3) for name in ("origin", "target", "up"))
-            forward = trimesh.unitize(target - origin)
-            left = trimesh.unitize(np.cross(up, forward))
-            return _matrix(np.column_stack([left, np.cross(forward, left), forward, origin]).ravel())
-    raise ValueError("unknown")
+def _matrix(steps: Sequence[Element]) -> FloatArray:
+    """Matrix [4, 4] of the elements of a transform by Mitsuba's parser, which unlike its shapes has double precision.
 
+    Errors are those of Mitsuba (`REFUSALS`).
+    """
+    import mitsuba as mi
 
-def _matrix(values: FloatArray) -> FloatArray:
-    """Matrix [4, 4] by the numbers of its first three columns and rows, of its first three rows, or all."""
-    matrix = np.eye(4)
-    match len(values):
-        case 9:
-            matrix[:3, :3] = values.reshape(3, 3)
-        case 12 | 16:
-            matrix[: len(values) // 4] = values.reshape(-1, 4)
-        case _:
-            raise ValueError(f"{len(values)} numbers; give 9 or 16")
-    return matrix
-
-
-def _vector(step: Element, neutral: float) -> FloatArray:
-    """Vector [3] of an element that states x, y and z, or all of them as ``value``."""
-    stated = step.get("value")
-    if stated is None:
-        return np.concatenate([_numbers(step.get(axis, str(neutral)), 1) for axis in "xyz"])
-    values = _numbers(stated)
-    if len(values) not in (1, 3):
-        raise ValueError(f"{len(values)} numbers; give 1 or 3")
-    return np.broadcast_to(values, 3)
-
-
-def _numbers(text: str, count: int | None = None) -> FloatArray:
-    words = text.replace(",", " ").split()
-    values = [number(word) for word in words]
-    if None in values or (count is not None and len(values) != count):
-        raise ValueError(f"{text[:40]!r} is no number" if count == 1 else f"{text[:40]!r} are not the numbers needed")
-    return np.array(values, float)
+    if not steps:
+        return np.eye(4)
+    root = Element("scene", version="3.0.0")
+    SubElement(SubElement(root, "shape", type="rectangle"), "transform", name="to_world").extend(steps)
+    parsed = mi.parser.parse_string(
+        mi.parser.ParserConfig(mi.variant() or ""), ElementTree.tostring(root, encoding="unicode")
+    )
+    (placement,) = [node.props["to_world"] for node in parsed.nodes if "to_world" in node.props.keys()]  # noqa: SIM118
+    return np.array(placement.matrix, float)
 
 
 def read_triangles(part: ShapePart, plugin: str) -> Iterator[ShapePart | Finding]:
     """A part with the triangles of its PLY or OBJ file in the file's frame, and findings about its polygons."""
     file, name = part.file, part.name
-    polygons = _polygons(file, name)
-    if isinstance(polygons, Finding):
-        yield polygons
-        return
-    try:
-        if polygons.sizes.max() > MOST_CORNERS:
-            raise ValueError(f"a polygon of {polygons.sizes.max()} corners; {MOST_CORNERS} at most are cut")
-        triangles, _ = triangles_of(polygons)
-    except ValueError as error:
-        text, _, remedy = one_line(error).rpartition("; ")
-        yield Finding("mesh", file, name, text, remedy)
-        return
-    corners = polygons.vertices[triangles]
-    if _may_differ(polygons, file):
-        by_mitsuba = triangles_by_mitsuba(file, plugin)
-        if not same_triangles(np.asarray(corners, np.float32), by_mitsuba):
-            many = int((polygons.sizes > 3).sum())
-            text = "Sionna RT reads other triangles in it" if len(by_mitsuba) else "Sionna RT refuses the file"
-            text += f", {many} faces have more than three corners" if many else ""
-            yield Finding("polygons", file, name, text, "cut the faces into triangles (--repair does)")
-    yield replace(part, corners_m=corners)
-
-
-def _polygons(file: Path, name: str) -> Polygons | Finding:
-    """Polygons of a PLY or OBJ file, or why it has none."""
     try:
         require_memory(MEMORY.get(file.suffix.lower(), MEMORY_BINARY) * file.stat().st_size, str(file), "divide it")
         polygons = POLYGON_READERS[file.suffix.lower()](file)
+        if len(polygons.sizes) and polygons.sizes.max() > MOST_CORNERS:
+            raise ValueError(f"a polygon of {polygons.sizes.max()} corners; {MOST_CORNERS} at most are cut")
+        triangles, _ = triangles_of(polygons)
     except Exception as error:  # NumPy raises a dozen kinds on damaged files
         text, _, remedy = one_line(error).removeprefix(f"{file}: ").partition("; ")
-        return Finding("mesh", file, name, f"cannot be read: {text}", remedy or RESTORE)
+        yield Finding("mesh", file, name, f"cannot be read: {text}", remedy or RESTORE)
+        return
     if not len(polygons.sizes):
-        return Finding("empty-mesh", file, name, "has no faces", "remove the shape, or restore the file")
+        yield Finding("empty-mesh", file, name, "has no faces", "remove the shape, or restore the file")
+        return
     bad = np.flatnonzero(~np.isfinite(polygons.vertices).all(axis=1))
     if len(bad):
         text = f"{len(bad)} vertices are not finite, first vertex {bad[0] + 1}"
-        return Finding("not-finite", file, name, text, "correct the numbers, or export the mesh anew")
-    return polygons
-
-
-def _may_differ(polygons: Polygons, file: Path) -> bool:
-    """Whether Mitsuba may read other triangles: binary PLY of triangles alone are the same."""
-    if (polygons.sizes != 3).any() or file.suffix.lower() != ".ply":
-        return True
-    with file.open("rb") as stream:
-        return b"format binary_" not in stream.read(100)
+        yield Finding("not-finite", file, name, text, "correct the numbers, or export the mesh anew")
+        return
+    corners = polygons.vertices[triangles]
+    by_mitsuba = triangles_by_mitsuba(file, plugin)
+    if not same_triangles(np.asarray(corners, np.float32), by_mitsuba):
+        many = int((polygons.sizes > 3).sum())
+        text = "Sionna RT reads other triangles in it" if len(by_mitsuba) else "Sionna RT refuses the file"
+        text += f", {many} faces have more than three corners" if many else ""
+        yield Finding("polygons", file, name, text, "cut the faces into triangles (--repair does)")
+    yield replace(part, corners_m=corners)
 
 
 def mesh_file_parts(file: Path) -> Iterator[ShapePart | Finding]:
@@ -274,15 +215,11 @@ def between_parts(parts: list[ShapePart]) -> Iterator[Finding]:
     owner = np.repeat(np.arange(len(parts)), [len(part.corners_m) for part in parts])
     corners = np.concatenate([part.corners_m for part in parts])
     valid = np.flatnonzero(~without_area(corners))
-    inside_part = np.zeros(len(corners), bool)
-    for k in range(len(parts)):
-        rows = valid[owner[valid] == k]
-        inside_part[rows] = copies(corners[rows])
-    doubled = valid[copies(corners[valid])]
-    for k in np.unique(owner[doubled[~inside_part[doubled]]]):
-        count, part = np.count_nonzero(owner[doubled] == k), parts[k]
+    # Of copies within a part `part_findings` are.
+    is_copy = owner[valid][first_copies(corners[valid])] < owner[valid]
+    for k, count in zip(*np.unique(owner[valid][is_copy], return_counts=True), strict=True):
         text = f"{count} faces are copies of those of a shape before it"
-        yield Finding("duplicate-faces", part.file, part.name, text, "remove one of both (--repair does)")
+        yield Finding("duplicate-faces", parts[k].file, parts[k].name, text, "remove one of both (--repair does)")
     yield from _near_sheets(parts, corners, owner)
 
 
@@ -292,7 +229,7 @@ def _near_sheets(parts: list[ShapePart], corners: FloatArray, owner: IntArray) -
     involved = np.unique(owner[pairs])
     flat = np.zeros(len(corners), bool)
     for k in involved:
-        flat[owner == k] = _in_sheets(parts[k])
+        flat[owner == k] = sheet_numbers(parts[k].corners_m) >= 0
     for i, j in np.unique(owner[pairs], axis=0):
         kind = "double-sheet" if flat[pairs[(owner[pairs] == (i, j)).all(axis=1)]].any() else "party-wall"
         other = "" if i == j else f" of {parts[i].name or 'the mesh'}"
@@ -304,11 +241,3 @@ def _near_sheets(parts: list[ShapePart], corners: FloatArray, owner: IntArray) -
 def materials_of(parts: Sequence[ShapePart]) -> IntArray:
     """Number of each part's material [n]."""
     return np.unique([part.material for part in parts], return_inverse=True)[1].reshape(-1)
-
-
-def _in_sheets(part: ShapePart) -> NDArray[np.bool_]:
-    """Which triangles of a part belong to flat bodies."""
-    flat = np.zeros(len(part.corners_m), bool)
-    for body in bodies(part.corners_m):
-        flat[body.faces] = is_flat(body)
-    return flat

@@ -72,10 +72,10 @@ class Repair:
         changed = [f"repaired: {listed(names, NAMED)}: {text}" for text, names in shapes.items()] or [
             "nothing to repair"
         ]
-        left = [f"unrepaired {f.kind}: {f.shape or f.file}: {f.text}; {f.remedy}" for f in self.unrepaired]
+        unrepaired = [f"unrepaired {f.kind}: {f.shape or f.file}: {f.text}; {f.remedy}" for f in self.unrepaired]
         if self.after is None:
-            return [*changed, *left, "nothing was written; correct the source, then repair it"]
-        return [*changed, *left, *self.after.lines(), f"scene: {self.folder}"]
+            return [*changed, *unrepaired, "nothing was written; correct the source, then repair it"]
+        return [*changed, *unrepaired, *self.after.lines(), f"scene: {self.folder}"]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -199,15 +199,15 @@ def _known_material(name: str) -> str:
 
 def _left(parts: Sequence[ShapePart], bsdfs: Sequence[Element | None], path: Path) -> list[Finding]:
     """Repaired parts that still cannot be written."""
-    left = list[Finding]()
+    findings = list[Finding]()
     for part, bsdf in zip(parts, bsdfs, strict=True):
         if bsdf is None:
             text = "has no radio material, and its names mean none"
-            left.append(Finding("no-material", path, part.name, text, f"give one by --material, such as {ITU[1]}"))
+            findings.append(Finding("no-material", path, part.name, text, f"give one by --material, such as {ITU[1]}"))
         if np.abs(part.corners_m).max() >= FARTHEST_M:
             text = "lies kilometres from other shapes"
-            left.append(Finding("far", part.file, part.name, text, "correct its coordinates"))
-    return left if parts else [Finding("no-shapes", path, "", "nothing has an area", "give a scene with surfaces")]
+            findings.append(Finding("far", part.file, part.name, text, "correct its coordinates"))
+    return findings if parts else [Finding("no-shapes", path, "", "nothing has an area", "give a scene with surfaces")]
 
 
 def _names(parts: Sequence[ShapePart], bsdfs: Sequence[Element | None]) -> dict[ShapePart, str]:

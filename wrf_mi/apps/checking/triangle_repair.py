@@ -6,24 +6,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from ...core.angles import FloatArray
-from ...core.types import IntArray
-from ...scene.coordinates import FARTHEST_M
-from ...scene.mesh.surfaces import bodies, without_area
+from ...scene.coordinates import local_origin
+from ...scene.mesh.surfaces import bodies, copies, without_area
 from .scene_geometry import ShapePart, materials_of
-from .triangle_faults import copies, double_sheets, is_flat, wound_both_ways, wound_one_way
-
-ORIGIN_STEP_M = 100.0  # origins are whole multiples, and axes near zero stay
-NEAR_ZERO_M = 1000.0
+from .triangle_faults import double_sheets, sheet_numbers, wound_both_ways, wound_one_way
 
 
 def repaired_triangles(parts: Sequence[ShapePart]) -> tuple[list[ShapePart], FloatArray, list[str]]:
     """Repaired parts, the origin [3] that was subtracted in metres, and what was done to which part."""
     if not parts:
         return [], np.zeros(3), []
-    origin_m, done = _origin(parts), list[str]()
+    origin_m = np.array(local_origin(np.concatenate([part.corners_m for part in parts]).reshape(-1, 3)) or np.zeros(3))
+    done = list[str]()
     stage = [replace(part, corners_m=part.corners_m - origin_m) for part in parts]
     for repair, text in STAGES:
         before, stage = stage, repair(stage)
@@ -37,25 +35,18 @@ def label(part: ShapePart) -> str:
     return part.name or part.file.name
 
 
-def _origin(parts: Sequence[ShapePart]) -> FloatArray:
-    """Origin [3] near which parts are that lie far from zero; else zero."""
-    if all(np.abs(part.corners_m).max(initial=0) < FARTHEST_M for part in parts):
-        return np.zeros(3)
-    low = np.concatenate([part.corners_m.reshape(-1, 3) for part in parts]).min(axis=0)
-    return np.where(np.abs(low) < NEAR_ZERO_M, 0, np.floor(low / ORIGIN_STEP_M) * ORIGIN_STEP_M)
-
-
 def _one_plane(parts: list[ShapePart]) -> list[ShapePart]:
     """Parts whose flat bodies are put into the planes of faces of the same material within millimetres."""
     corners = [part.corners_m.copy() for part in parts]
     owner = np.repeat(np.arange(len(parts)), [len(each) for each in corners])
     row = np.concatenate([np.arange(len(each)) for each in corners])
     pairs = double_sheets(np.concatenate(corners), materials_of(parts)[owner])
-    sheet = [_sheet_numbers(each) for each in corners]
+    sheet = [sheet_numbers(each) for each in corners]
     moved = set[tuple[int, int]]()
     # The later of two sheets moves; where it is a wall of a solid, the other one.
     for fixed, other in [*pairs.tolist(), *pairs[:, ::-1].tolist()]:
         still, mover = ((int(owner[face]), int(sheet[owner[face]][row[face]])) for face in (fixed, other))
+        # A sheet moves once, and none onto one that has moved, or chains of sheets would drift.
         if mover[1] < 0 or {mover, still} & moved:
             continue
         faces = sheet[mover[0]] == mover[1]
@@ -68,18 +59,8 @@ def _one_plane(parts: list[ShapePart]) -> list[ShapePart]:
 
 
 def _in_plane(corners_m: FloatArray, triangle_m: FloatArray) -> FloatArray:
-    normal = np.cross(triangle_m[1] - triangle_m[0], triangle_m[2] - triangle_m[0])
-    normal /= np.linalg.norm(normal)
+    (normal,) = trimesh.triangles.normals(triangle_m[None])[0]
     return np.asarray(corners_m - ((corners_m - triangle_m[0]) @ normal)[..., None] * normal)
-
-
-def _sheet_numbers(corners_m: FloatArray) -> IntArray:
-    """Number of the flat body of each triangle [f, 3, 3]; -1 in others."""
-    numbers = np.full(len(corners_m), -1)
-    for number, body in enumerate(bodies(corners_m)):
-        if is_flat(body):
-            numbers[body.faces] = number
-    return numbers
 
 
 def _with_area(parts: list[ShapePart]) -> list[ShapePart]:

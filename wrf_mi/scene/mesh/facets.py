@@ -12,7 +12,7 @@ import trimesh
 
 from ...core.angles import FloatArray
 from .planes import STOREY_M, THICKEST_M, UPRIGHT, WALL_SHARE, Face, Mask, Plane, kinds, least_level_area, with_axes
-from .surfaces import KINDS, Body, Kind, Surface, bodies, bounds, number_names
+from .surfaces import KINDS, Body, Kind, Surface, bodies, bounds, main_extent, number_names
 
 FLAT_M = 0.01  # largest distance of the vertices of a facet's triangles from its plane
 PARALLEL = np.cos(np.radians(2))
@@ -93,13 +93,10 @@ def _room_facets(mesh_bodies: Sequence[Body]) -> list[_Facet]:
 
 def _slab(body: Body, index: int) -> _Facet | None:
     """A body that is a sheet or slab as one facet in its middle, or None."""
-    cross = trimesh.triangles.cross(body.corners_m)
-    normal = cross[np.argmax(np.linalg.norm(cross, axis=-1))]
-    normal = normal / np.linalg.norm(normal)
-    away = body.corners_m @ normal
-    if np.ptp(away) > THICKEST_M:
+    normal, low, high = main_extent(body.corners_m)
+    if high - low > THICKEST_M:
         return None
-    return _facet(body, np.ones(len(away), bool), normal, float(away.min() + away.max()) / 2, index)
+    return _facet(body, np.ones(len(body.corners_m), bool), normal, (low + high) / 2, index)
 
 
 def _facets(body: Body, index: int) -> Iterator[_Facet]:
@@ -107,17 +104,17 @@ def _facets(body: Body, index: int) -> Iterator[_Facet]:
     cross = trimesh.triangles.cross(body.corners_m)
     size = np.linalg.norm(cross, axis=-1)
     normals = cross / size[:, None]
-    left = np.ones(len(size), bool)
+    unassigned = np.ones(len(size), bool)
     for _ in range(MOST_FACETS):
-        if not left.any():
+        if not unassigned.any():
             return
-        seed = int(np.argmax(np.where(left, size, 0)))
+        seed = int(np.argmax(np.where(unassigned, size, 0)))
         normal = normals[seed]
         offset = float(body.corners_m[seed].mean(axis=0) @ normal)
-        inside = left & (np.abs(normals @ normal) > PARALLEL)
+        inside = unassigned & (np.abs(normals @ normal) > PARALLEL)
         inside[inside] = (np.abs(body.corners_m[inside] @ normal - offset) < FLAT_M).all(axis=-1)
         inside[seed] = True  # rounding may put a large triangle's corners out of its own plane
-        left &= ~inside
+        unassigned &= ~inside
         yield _facet(body, inside, normal, offset, index)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from ..coordinates import FORMATS, UNITS_M, Up, check_extent, require_precise, s
 from .polygon_files import Polygons, read_obj, read_ply
 from .scene_files import USD_SUFFIXES, Beside, bare_gltf, gltf_facts, read_collada, read_usd
 from .sheets import as_sheets
-from .surfaces import Surface, number_names, without_area
+from .surfaces import Surface, copies, number_names, without_area
 
 logger = logging.getLogger(__name__)
 
@@ -34,12 +33,9 @@ SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".gltf", *STATING_READERS)
 POINTS_ELSEWHERE = f"complete it, or give its points as {FORMATS}"
 """Remedy for a mesh of a format that is not read as points."""
 POLYGON_READERS = {".obj": read_obj, ".ply": read_ply}
-STL_HEADER, STL_FACE = 84, 50
-"""Bytes of the header of a binary STL file, whose last four are the number of triangles, and of a triangle."""
 LEVEL, END_SHARE, ROOM_SHARE = 0.99, 0.05, 0.8
 """Cosine of level faces, share of the height that is floor and ceiling, and least share of both in all level faces."""
 HIGHEST_ROOM_M = 12.0  # highest single room whose unit is not asked for: a sports hall has 7 to 12 m
-FLAT_POLYGON = 1e-9  # least ratio of a polygon's second extent to its first; below it has no area
 COLLINEAR = 1e-6  # sine of the angle below which a corner lies in a straight side: rounding of float32
 GRID = 1e-5
 """Distance relative to a polygon's extent at which its corners and sides touch: that rounding some metres away."""
@@ -69,12 +65,12 @@ def mesh_parts(path: str | Path, up: Up | None = None) -> list[trimesh.Trimesh]:
 def _parts(file: Path, up: Up | None) -> tuple[list[trimesh.Trimesh], float | None]:
     """The parts of a mesh file, with z up, and the unit of their coordinates in metres if the file states it."""
     try:
-        parts, unit_m, stated = _stored_parts(file)
+        parts, unit_m, up_in_file = _stored_parts(file)
         for name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
             _check_part(part)
             if len(bad := np.flatnonzero(~np.isfinite(part.vertices).all(axis=1))):
                 raise InputError(f"{file}: vertex {bad[0] + 1} of {name} is not finite; correct the mesh")
-            part.vertices = turned(np.asarray(part.vertices, float), up or stated)
+            part.vertices = turned(np.asarray(part.vertices, float), up or up_in_file)
     except InputError:
         raise
     except Exception as error:  # trimesh's readers raise a dozen kinds on damaged files
@@ -96,16 +92,19 @@ def _stored_parts(file: Path) -> tuple[list[trimesh.Trimesh], float | None, Up]:
 
 
 def _trimesh_parts(file: Path) -> list[trimesh.Trimesh]:
-    _check_size(file)
     options: dict[str, Any] = {"file_type": file.suffix.lower()[1:], "process": False}
     # Without a name no other file is looked for: materials and textures are not used.
-    source: Any = BytesIO(file.read_bytes())
+    content = file.read_bytes()
+    source: Any = BytesIO(content)
     if file.suffix.lower() in (".gltf", ".glb"):
         facts = gltf_facts(file)
         if file.suffix.lower() == ".gltf":
             source, options["resolver"] = BytesIO(bare_gltf(facts)), Beside(file)
     dump: list[Any] = trimesh.load_scene(source, **options).dump()
-    return [part for part in dump if len(getattr(part, "faces", ()))]
+    parts = [part for part in dump if len(getattr(part, "faces", ()))]
+    if file.suffix.lower() == ".stl":
+        _check_stl(content, parts)
+    return parts
 
 
 def _check_part(part: trimesh.Trimesh) -> None:
@@ -126,28 +125,13 @@ def _polygon_parts(polygons: Polygons) -> list[trimesh.Trimesh]:
     return parts
 
 
-def _check_size(file: Path) -> None:
-    """Refuse STL and GLB that are longer or shorter than they state: `ValueError`; trimesh drops what is cut off."""
-    content, suffix = file.read_bytes(), file.suffix.lower()
-    if suffix == ".glb" and len(content) >= 12 and (stated := int.from_bytes(content[8:12], "little")) != len(content):
-        raise ValueError(f"states {stated} bytes and has {len(content)}; it is cut off or damaged")
-    if suffix == ".stl":
-        _check_stl(content)
-
-
-def _check_stl(content: bytes) -> None:
-    count = int.from_bytes(content[80:84], "little")
-    if len(content) == STL_HEADER + STL_FACE * count:
-        return
-    begins, ends = (len(re.findall(rb"(?im)^\s*" + word + rb"\b", content)) for word in (b"solid", b"endsolid"))
+def _check_stl(content: bytes, parts: Sequence[trimesh.Trimesh]) -> None:
+    """Refuse an STL that is cut off (`ValueError`), of which trimesh reads the solids that are whole, or nothing."""
     # Binary files may begin like those of text, but their numbers have zero bytes.
-    if not begins or b"\0" in content:
-        if len(content) < STL_HEADER:
-            raise ValueError(f"{len(content)} bytes, fewer than its header has; it is cut off")
-        faces = (len(content) - STL_HEADER) / STL_FACE
-        raise ValueError(f"states {count} triangles and has bytes for {faces:.6g}; it is cut off or damaged")
-    if begins > ends:
-        raise ValueError("a solid without its endsolid; it is cut off")
+    is_text = b"\0" not in content
+    begins, ends = (len(re.findall(rb"(?im)^\s*" + word + rb"\b", content)) for word in (b"solid", b"endsolid"))
+    if not parts or (is_text and begins > ends):
+        raise ValueError("fewer triangles than it states; it is cut off or damaged")
 
 
 def read_mesh(path: str | Path, units: str | None = None, up: Up | None = None) -> list[Surface]:
@@ -201,15 +185,13 @@ def sound_surfaces(parts: Sequence[trimesh.Trimesh], unit_m: float, name: str | 
     for part_name, part in zip(number_names(["mesh"] * len(parts)), parts, strict=True):
         vertices = np.asarray(part.vertices, float) * unit_m
         faces = np.asarray(part.faces, np.int64)
-        solid = faces[~without_area(vertices[faces])]
-        # Copies may have other vertices: STL has no shared vertices.
-        _, same = np.unique(vertices, axis=0, return_inverse=True)
-        _, first = np.unique(np.sort(same.reshape(-1)[solid], axis=1), axis=0, return_index=True)
-        for count, what in ((len(faces) - len(solid), "degenerate"), (len(solid) - len(first), "doubled")):
-            if count:
+        for find, what in ((without_area, "degenerate"), (copies, "doubled")):
+            left_out = find(vertices[faces])
+            if count := np.count_nonzero(left_out):
                 logger.warning("%s: %d %s faces of %s left out", name, count, what, part_name)
-        if len(first):
-            surfaces.append(Surface(part_name, "other", vertices, solid[np.sort(first)]))
+            faces = faces[~left_out]
+        if len(faces):
+            surfaces.append(Surface(part_name, "other", vertices, faces))
     if not surfaces:
         raise InputError(f"{name}: every face is degenerate (no area); export it anew, or give its --units")
     return surfaces
@@ -222,7 +204,6 @@ def triangles_of(polygons: Polygons) -> tuple[IntArray, IntArray]:
     become Delaunay triangles in their plane, with all corners; a hole that is joined to the outline by an edge there
     and back stays open. `ValueError`, by its place in the file, for one whose edges cross or that covers a place twice.
     """
-    polygons = _without_repeats(polygons)
     first = np.cumsum(polygons.sizes) - polygons.sizes
     faces: list[IntArray] = [np.empty((0, 3), np.int64)]
     owners: list[IntArray] = [np.empty(0, np.int64)]
@@ -242,20 +223,6 @@ def triangles_of(polygons: Polygons) -> tuple[IntArray, IntArray]:
     every, owner = np.concatenate(faces), np.concatenate(owners)
     order = np.argsort(owner, kind="stable")  # that of the file
     return every[order], owner[order]
-
-
-def _without_repeats(polygons: Polygons) -> Polygons:
-    """Polygons without corners that lie where the corner before does, unless fewer than three are left."""
-    owner = np.repeat(np.arange(len(polygons.sizes)), polygons.sizes)
-    first = np.cumsum(polygons.sizes) - polygons.sizes
-    before = np.arange(len(owner)) - 1
-    before[first] = first + polygons.sizes - 1
-    places = polygons.vertices[polygons.corners]
-    repeated = (places == places[before]).all(axis=1)
-    sizes = np.bincount(owner[~repeated], minlength=len(first))
-    repeated &= (sizes >= 3)[owner]
-    sizes = np.bincount(owner[~repeated], minlength=len(first))
-    return replace(polygons, corners=polygons.corners[~repeated], sizes=sizes)
 
 
 def _fan(size: int) -> IntArray:
@@ -290,33 +257,26 @@ def _cut(corners: FloatArray) -> IntArray | None:
     """Corner numbers of triangles [t, 3] that fill a polygon [s, 3]; None if its edges cross."""
     if not np.isfinite(corners).all():
         return _fan(len(corners))  # `mesh_parts` refuses it, with the number of the vertex
-    centred = corners - corners.mean(axis=0)
-    _, extent, axes = np.linalg.svd(centred, full_matrices=False)
-    if extent[1] <= FLAT_POLYGON * extent[0]:
-        return _fan(len(corners))
-    normal, grid = _normal(corners[None])[0], GRID * extent[0]
-    if np.linalg.norm(normal) > grid * extent[0]:
-        # The plane of a polygon that is not quite flat is square to its mean normal.
-        normal = normal / np.linalg.norm(normal)
-        along = axes[0] - normal * (axes[0] @ normal)
-        along = along / np.linalg.norm(along)
-        axes = np.stack([along, np.cross(normal, along)])
-    flat = centred @ axes[:2].T
+    length, width, _ = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
+    grid, normal = GRID * length, _normal(corners[None])[0]
+    if width <= grid:
+        return _fan(len(corners))  # it has no area
+    area = float(np.linalg.norm(normal)) / 2
+    if area <= grid * width:
+        return None  # a bow tie, whose halves go round both ways
+    # The plane of a polygon that is not quite flat is square to its mean normal.
+    to_plane = trimesh.geometry.plane_transform(corners.mean(axis=0), normal)
+    flat = trimesh.transform_points(corners, to_plane)[:, :2]
     # On a grid, corners that lie on another side but for rounding are corners of both.
     sides = shapely.union_all([shapely.linearrings(flat)], grid_size=grid)
-    faces = shapely.polygonize([sides])
-    parts, face = shapely.get_parts(shapely.constrained_delaunay_triangles(shapely.get_parts(faces)), return_index=True)
-    # How often the polygon goes round each face, seen from the middle of a triangle clear of all edges.
-    middle = shapely.centroid(parts)
-    order = np.lexsort((shapely.distance(middle, sides), face))
-    clear = order[np.flatnonzero(np.diff(face[order], append=-1))]
-    spokes = flat - shapely.get_coordinates(middle[clear])[:, None]
-    angle = np.arctan2(spokes[..., 1], spokes[..., 0])
-    step = (np.roll(angle, -1, axis=1) - angle + np.pi) % (2 * np.pi) - np.pi
-    rounds = np.round(step.sum(axis=1) / (2 * np.pi)).astype(int)
-    # Never in a hole; beside a crossing twice, or both ways.
-    if np.ptp([0, *rounds]) > 1:
+    faces = shapely.get_parts(shapely.polygonize([sides]))
+    # Inside are faces from which a ray leaves through an odd number of sides, but for a hole that edges join to the
+    # outline. Newell's area counts a face as often as the outline goes round it, and so is another where sides cross.
+    inside = faces[
+        shapely.contains_xy(shapely.polygons(flat), shapely.get_coordinates(shapely.point_on_surface(faces)))
+    ]
+    if abs(shapely.area(inside).sum() - area) > grid * sides.length:
         return None
-    inside = parts[(rounds != 0)[face]]
-    _, cut = cKDTree(flat).query(shapely.get_coordinates(inside).reshape(-1, 4, 2)[:, :3])
+    parts = shapely.get_parts(shapely.constrained_delaunay_triangles(inside))
+    _, cut = cKDTree(flat).query(shapely.get_coordinates(parts).reshape(-1, 4, 2)[:, :3])
     return np.asarray(cut, np.int64).reshape(-1, 3)

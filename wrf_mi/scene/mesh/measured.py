@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from scipy import sparse
 
-from .surfaces import Surface, shared_edges
+from .surfaces import Surface, welded
 
 SHARP_RAD = np.radians(
     40
@@ -30,12 +30,7 @@ def is_measured(surfaces: Sequence[Surface]) -> bool:
     area = trimesh.triangles.area(corners)
     cross = trimesh.triangles.cross(corners)
     normals = cross / np.linalg.norm(cross, axis=-1, keepdims=True)
-    edge, _ = shared_edges(corners)
-    # Faces of an edge that two of them share, one after the other.
-    order = np.argsort(edge, kind="stable")
-    single = np.flatnonzero(np.bincount(edge) == 2)
-    first = order[np.searchsorted(edge[order], single)] // 3
-    second = order[np.searchsorted(edge[order], single) + 1] // 3
+    first, second = welded(corners).face_adjacency.T  # of edges that two faces share
     cosine = (normals[first] * normals[second]).sum(axis=-1)
     smooth = np.abs(cosine) > np.cos(SHARP_RAD)  # whichever way the normals point
     first, second, sign = first[smooth], second[smooth], np.sign(cosine[smooth])
@@ -44,6 +39,8 @@ def is_measured(surfaces: Sequence[Surface]) -> bool:
     count = len(area)
     ends = (np.concatenate([first, second]), np.concatenate([second, first]))
     links = sparse.csr_array((np.concatenate([sign, sign]), ends), shape=(count, count))
+    # Diffusion over neighbours, their normals turned to the side of the face; weighted by area, as noise turns small
+    # faces most. Only directions matter, and scaling keeps the sums in range.
     mean = normals * area[:, None]
     for _ in range(RINGS):
         mean = mean + links @ mean

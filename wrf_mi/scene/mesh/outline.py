@@ -44,6 +44,7 @@ RASTER_M, MOST_CELLS = 0.1, 400_000  # side of the cells in which it is told wha
 LEAST_ADDED_M2 = 0.2  # least area by which another one grows
 LARGEST_BLIND_M2 = 12.0  # a scanner 2 m high that sees down to 45 degrees is blind below it on as much
 GRID_M = 1e-5
+SEAM_M = 1e-3  # half-width of the slits that rounding leaves between an area and its complement
 PASSES = 2  # number of passes over all pairs of planes; the second pass closes the corner of three planes
 
 
@@ -252,6 +253,17 @@ def _box(t0: float, t1: float, s0: float, s1: float) -> Any:
 def _transformed(area: Any, matrix: FloatArray, shift: FloatArray) -> Any:
     """A transformed area on a fine grid: rounding would let edges that touch cross."""
     return shapely.set_precision(shapely.make_valid(affinity.affine_transform(area, [*matrix.ravel(), *shift])), GRID_M)
+
+
+def opened(area: Any, half_m: float) -> Any:
+    """An area (shapely) without parts narrower than twice a half-width."""
+    return shapely.buffer(shapely.buffer(area, -half_m, join_style="mitre"), half_m, join_style="mitre")
+
+
+def merged(areas: Sequence[Any]) -> Any:
+    """Union of areas (shapely) that touch, without slits between them."""
+    widened = shapely.union_all([shapely.buffer(area, SEAM_M, join_style="mitre") for area in areas])
+    return shapely.buffer(widened, -SEAM_M, join_style="mitre")
 
 
 def triangulated(area: Any) -> tuple[FloatArray, IntArray]:

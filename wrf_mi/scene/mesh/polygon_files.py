@@ -197,56 +197,43 @@ def _ply_elements(content: bytes) -> dict[str, dict[str, Any]]:
 
 def _ply_columns(body: bytes, at: int, element: PlyElement, order: str) -> tuple[dict[str, Any], int]:
     """Values [n] of an element's properties by name, of lists with their lengths [n]; where the next element begins."""
-    if not element.count:
-        return {}, at
+    rows = list[NDArray[Any]]()
     try:
-        table = _ply_table(body, at, element, order)
-        if table is not None:
-            columns = {
-                name: (table[f"{k}"].reshape(-1), table[f"count {k}"]) if count else table[f"{k}"]
-                for k, (name, _, count) in enumerate(element.properties)
-            }
-            return columns, at + table.nbytes
-        rows = []
-        for _ in range(element.count):
-            row, at = _ply_row(body, at, element, order)
-            rows.append(row)
+        row, count = _row_type(body, at, element, order), element.count
+        if count and at + row.itemsize * count <= len(body):
+            # Lists mostly have the length of the first row's.
+            table = np.frombuffer(body, row, count, at)
+            lengths = [name for name in row.names or () if name.startswith("count")]
+            if all((table[name] == table[name][0]).all() for name in lengths):
+                rows, at = [table], at + table.nbytes
+        for _ in range(0 if rows else count):
+            row = _row_type(body, at, element, order)
+            rows.append(np.frombuffer(body, row, 1, at))
+            at += row.itemsize
     except ValueError:
         text = f"states {element.count} of {element.name} and ends before the last; it is cut off"
         raise ValueError(text) from None
     columns = {}
-    for (name, _, count), column in zip(element.properties, zip(*rows, strict=True), strict=True):
-        joined = np.concatenate(column)
-        columns[name] = (joined, np.array([len(entries) for entries in column])) if count else joined
+    for k, (name, _, has_length) in enumerate(element.properties if rows else ()):
+        values = np.concatenate([part[f"{k}"].reshape(-1) for part in rows])
+        columns[name] = (values, np.concatenate([part[f"count {k}"] for part in rows])) if has_length else values
     return columns, at
 
 
-def _ply_table(body: bytes, at: int, element: PlyElement, order: str) -> NDArray[Any] | None:
-    """Rows of an element whose lists all have the length of the first row's, as most have; else None."""
-    first, _ = _ply_row(body, at, element, order)
-    fields: list[tuple[Any, ...]] = []  # by number: names may come twice
-    for k, (entries, (_, kind, count)) in enumerate(zip(first, element.properties, strict=True)):
-        fields += [(f"count {k}", order + count)] if count else []
-        fields.append((f"{k}", order + kind, (len(entries),) if count else ()))
-    row = np.dtype(fields)
-    if at + row.itemsize * element.count > len(body):
-        return None
-    table = np.frombuffer(body, row, element.count, at)
-    lists = [k for k, (_, _, count) in enumerate(element.properties) if count]
-    return table if all((table[f"count {k}"] == len(first[k])).all() for k in lists) else None
+def _row_type(body: bytes, at: int, element: PlyElement, order: str) -> np.dtype[Any]:
+    """Type of the row of an element at a place, with the lengths that its lists have there; `ValueError`: past the end.
 
-
-def _ply_row(body: bytes, at: int, element: PlyElement, order: str) -> tuple[list[NDArray[Any]], int]:
-    """Entries of each property in the row at a place, and where the next row begins; `ValueError` past the end."""
-    row = []
-    for _, kind, count in element.properties:
+    Fields have numbers, as names of properties may come twice.
+    """
+    fields, end = list[tuple[Any, ...]](), at
+    for k, (_, kind, count) in enumerate(element.properties if element.count else ()):
         length = 1
         if count:
-            length = int(np.frombuffer(body, order + count, 1, at)[0])
-            at += np.dtype(count).itemsize
-        if length < 0:
+            length = int(np.frombuffer(body, order + count, 1, end)[0])
+            end += np.dtype(count).itemsize
+            fields.append((f"count {k}", order + count))
+        if length < 0 or end + length * np.dtype(kind).itemsize > len(body):
             raise ValueError
-        entries = np.frombuffer(body, order + kind, length, at) if length else np.empty(0, order + kind)
-        at += entries.nbytes
-        row.append(entries)
-    return row, at
+        end += length * np.dtype(kind).itemsize
+        fields.append((f"{k}", order + kind, (length,)))
+    return np.dtype(fields)

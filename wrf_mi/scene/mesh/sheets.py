@@ -12,7 +12,7 @@ import trimesh
 
 from ...core.angles import FloatArray
 from .planes import Mask, Plane, with_axes
-from .surfaces import Surface, bodies
+from .surfaces import Surface, bodies, main_extent
 
 logger = logging.getLogger(__name__)
 
@@ -65,15 +65,12 @@ def as_sheets(surfaces: Sequence[Surface], name: str | Path) -> list[Surface]:
 
 def _middle(corners_m: FloatArray) -> FloatArray | None:
     """One face of a thin closed body, moved to its middle; None for a thicker one."""
-    cross = trimesh.triangles.cross(corners_m)
-    normal = cross[np.argmax(np.linalg.norm(cross, axis=-1))]
-    normal = normal / np.linalg.norm(normal)
-    away = corners_m @ normal
-    if np.ptp(away) > PANEL_M:
+    normal, low, high = main_extent(corners_m)
+    if high - low > PANEL_M:
         return None
+    cross = trimesh.triangles.cross(corners_m)
     front = corners_m[cross @ normal > np.linalg.norm(cross, axis=-1) / 2]
-    middle = (away.min() + away.max()) / 2
-    return np.asarray(front + (middle - front @ normal)[..., None] * normal)
+    return np.asarray(front + ((low + high) / 2 - front @ normal)[..., None] * normal)
 
 
 def _copies(corners_m: FloatArray) -> Mask:
@@ -83,6 +80,7 @@ def _copies(corners_m: FloatArray) -> Mask:
         plane = with_axes(Plane(normal, float(corners_m[rows[0], 0] @ normal), corners_m[:1], np.zeros(3), 0.0))
         flat = shapely.polygons(plane.flat(corners_m[rows]))
         area = shapely.area(flat)
+        # The larger side stays: the other one may be a copy of a part of it.
         larger = area[facing].sum() >= area[~facing].sum()
         behind = facing != larger
         front = shapely.union_all(shapely.make_valid(flat[~behind]), grid_size=0.1 * SAME_PLANE_M)
@@ -95,6 +93,7 @@ def _planes(corners_m: FloatArray) -> Iterator[tuple[FloatArray, np.ndarray, Mas
     """Planes with faces of both directions: normal, numbers of their triangles, and which look along the normal."""
     cross = trimesh.triangles.cross(corners_m)
     normals = cross / np.linalg.norm(cross, axis=-1, keepdims=True)
+    # Rounded normals and offsets are keys: comparing all pairs of faces would grow with their square.
     leading = np.take_along_axis(normals, np.abs(normals).argmax(axis=1)[:, None], axis=1)
     upward = normals * np.sign(leading)  # one direction for both sides of a plane
     offset = np.einsum("fk,fk->f", corners_m.mean(axis=1), upward)

@@ -23,6 +23,7 @@ Kind = Literal["floor", "ceiling", "wall", "other"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 SAME_CORNER_M = 1e-4
 """Distance within which corners of faces coincide: STL has no shared vertices, and meshes that meet leave a gap."""
+COPY_M = 1e-8  # the same for copies of a face: equal but for rounding of a unit
 SMALLEST_FACE_M2 = 1e-10  # smaller faces are degenerate: nothing reflects from them, and their normals are noise
 
 
@@ -128,17 +129,39 @@ def cut_lines(surface: Surface, height_m: float) -> FloatArray:
     return np.asarray(cut, float).reshape(-1, 2, 3)[..., :2]
 
 
+def welded(corners_m: FloatArray, same_m: float = SAME_CORNER_M) -> trimesh.Trimesh:
+    """Triangles [f, 3, 3] in their order as a mesh that has one vertex where corners coincide."""
+    mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners_m), process=False)
+    mesh.merge_vertices(digits_vertex=trimesh.util.decimal_to_digits(same_m))
+    return mesh
+
+
+def first_copies(corners_m: FloatArray) -> IntArray:
+    """Number of the first of triangles [f, 3, 3] that has the corners of each, in any order [f]."""
+    first, group = trimesh.grouping.unique_rows(np.sort(welded(corners_m, COPY_M).faces, axis=1))
+    return np.asarray(first[group])
+
+
+def copies(corners_m: FloatArray) -> NDArray[np.bool_]:
+    """Which triangles [f, 3, 3] have the corners of an earlier one, in any order."""
+    return first_copies(corners_m) != np.arange(len(corners_m))
+
+
 def shared_edges(corners_m: FloatArray) -> tuple[IntArray, IntArray]:
     """Edges of triangles [f, 3, 3], the same for faces whose corners coincide.
 
     Returns the number of the edge from each corner of each face to its next [3 f], and both ends' vertices [3 f, 2].
     """
-    _, vertex = np.unique(np.round(corners_m.reshape(-1, 3) / SAME_CORNER_M), axis=0, return_inverse=True)
-    vertex = vertex.reshape(-1, 3)
-    ends = trimesh.geometry.faces_to_edges(vertex)
-    # Numbers of both vertices in one integer: NumPy's unique rows take ten times as long.
-    both = np.sort(ends, axis=1) @ [len(ends), 1]
-    return np.unique(both, return_inverse=True)[1].reshape(-1), ends
+    mesh = welded(corners_m)
+    return np.asarray(mesh.edges_unique_inverse), np.asarray(mesh.edges)
+
+
+def main_extent(corners_m: FloatArray) -> tuple[FloatArray, float, float]:
+    """Unit normal [3] of the largest of triangles [f, 3, 3], and their least and largest coordinate along it."""
+    cross = trimesh.triangles.cross(corners_m)
+    normal = trimesh.unitize(cross[np.argmax(np.linalg.norm(cross, axis=-1))])
+    along = corners_m @ normal
+    return normal, float(along.min()), float(along.max())
 
 
 def sampled(triangles: FloatArray, count: int = 20_000) -> FloatArray:

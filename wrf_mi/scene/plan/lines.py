@@ -75,6 +75,7 @@ def dominant_direction(occupied: Mask) -> float:
     quarter = np.arange(0, np.pi / 2, DIRECTION_STEP_RAD)
     normals = np.concatenate([quarter, quarter - np.pi / 2])
     votes, _, _ = hough_line(occupied, theta=normals)
+    # Squares: votes of one offset of a wall's direction are its length, while other directions spread them evenly.
     sharp = np.square(votes.astype(float)).sum(axis=0).reshape(2, -1).sum(axis=0)
     # The middle of the peak: its top is uncertain by degrees in smeared plans.
     middle = len(quarter) // 2
@@ -96,10 +97,8 @@ def turned(grid: PlanGrid, angle: float) -> PlanGrid:
     width, height = np.ceil((high - low) / step).astype(int)
     # Each new cell takes the value of the old one that its centre lies in.
     new = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1) * step + low
-    column, row = np.moveaxis(np.floor((new @ rotation.T - grid.origin_m) / step).astype(int), -1, 0)
-    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    row, column = np.where(inside, row, 0), np.where(inside, column, 0)
-    return PlanGrid(grid.occupied[row, column] & inside, grid.free[row, column] & inside, step, low)
+    cells, within = grid.cell_indices(new @ rotation.T)
+    return PlanGrid(grid.occupied[cells] & within, grid.free[cells] & within, step, low)
 
 
 def rotation_2d(angle: float) -> FloatArray:
@@ -112,25 +111,28 @@ def find_runs(grid: PlanGrid, shortest_m: float = SHORTEST_RUN_M) -> list[WallRu
     """Axis-parallel runs of occupied cells of a turned grid, the best supported first."""
     step = grid.resolution_m
     half, rim, hole = (max(0, round(m / step)) for m in (HALF_WIDTH_M, CLEARED_M, LARGEST_HOLE_M))
-    whole, thickest = np.pad(grid.occupied, half), THICKEST_WALL_M / step
-    left = whole.copy()
+    occupied, thickest = np.pad(grid.occupied, half), THICKEST_WALL_M / step
+    unexplained = occupied.copy()
     low = grid.origin_m - half * step
     runs: list[WallRun] = []
     while True:
-        best = [(_best(image, half, hole, shortest_m / step), axis) for axis, image in enumerate((left, left.T))]
+        images = unexplained, unexplained.T
+        best = [(_best(image, half, hole, shortest_m / step), axis) for axis, image in enumerate(images)]
+        # Greedily: the best supported run of both directions first, so that its cells support no worse one.
         (score, row, begin, end), axis = max(best, key=lambda run: run[0][0])
         if score <= 0:
             return runs
-        image = left if axis == 0 else left.T
+        image = images[axis]
         first = max(0, row - half)
         across, along = np.nonzero(image[first : row + half + 1, begin:end])
+        # Slope of the line through the run's cells, as a rise over its length.
         rise = np.polyfit(along, across, 1)[0] * (end - begin) * step
         if abs(rise) > LARGEST_RISE_M:
             # The next direction may explain it.
             image[first : row + half + 1, begin:end] = False
             continue
         middle, thick = float(np.median(across)) + first, 0.0
-        low_row, high_row = _solid_rows((whole if axis == 0 else whole.T)[:, begin:end], round(middle))
+        low_row, high_row = _solid_rows((occupied if axis == 0 else occupied.T)[:, begin:end], round(middle))
         if thickest >= high_row - low_row > 2 * half + 1:
             # The window saw a part of a thick wall.
             middle, thick = (low_row + high_row - 1) / 2, (high_row - low_row) / 2 - half

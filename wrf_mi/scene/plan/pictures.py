@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Literal
 
 import numpy as np
 from PIL import Image, ImageOps
@@ -16,6 +16,7 @@ from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.files import one_line
 from ...core.pictures import PICTURE_ERRORS, open_picture
+from ...core.settings import CheckedSettings, Inside, Positive, names_of, settings_from
 from ...core.yaml_files import read_yaml
 
 PICTURE_SUFFIXES = (".png", ".pgm", ".jpg", ".jpeg")
@@ -29,74 +30,56 @@ RAW_PERCENT = (
     100.0  # a pixel of mode raw is a probability in percent; larger values, such as -1 as a byte, are unmapped
 )
 
+OCCUPIED_PROBABILITY = 0.65
+"""A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
+FREE_PROBABILITY = 0.196  # a cell less likely than this is free (``free_thresh`` there)
+
 Mode = Literal["trinary", "scale", "raw"]
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """Content of the YAML of a ROS map.
+class Sheet(CheckedSettings):
+    """Content of the YAML of a ROS map, by the names that map_server gives it.
 
     Attributes:
-        image: name of the picture, as it is stated.
-        resolution_m: side of a cell.
-        origin_m: lower left corner [2].
-        thresholds: probabilities below which a cell is free and above which it is occupied.
-        negate: whether light pixels are occupied.
+        origin: lower left corner x, y in metres, and the yaw of the map in radians, which has to be zero.
+        resolution: side of a cell, metres.
+        image: name of the picture.
+        free_thresh: probability below which a cell is free.
+        occupied_thresh: probability above which a cell is occupied.
+        negate: 1 where light pixels are occupied.
         mode: what a pixel means.
     """
 
-    image: object
-    resolution_m: float
-    origin_m: FloatArray
-    thresholds: tuple[float, float]
-    negate: bool
-    mode: Mode
+    origin: tuple[float, float, float]
+    resolution: Positive
+    image: str = ""
+    free_thresh: Inside = FREE_PROBABILITY
+    occupied_thresh: Inside = OCCUPIED_PROBABILITY
+    negate: Literal[0, 1] = 0
+    mode: Mode = "trinary"
 
 
-def read_sheet(file: Path, resolution_m: float | None, thresholds: tuple[float, float]) -> Sheet:
-    """The YAML of a ROS map, of which a resolution may be given; thresholds where it has none.
+def read_sheet(file: Path, resolution_m: float | None) -> Sheet:
+    """The YAML of a ROS map, whose resolution a stated one overrides.
 
     `InputError`: a missing or unusable value, by its name, or a map that is turned.
     """
-    facts = read_yaml(file)
-    required = ["origin", *(["resolution"] if resolution_m is None else [])]
-    if missing := [name for name in required if facts.get(name) is None]:
+    facts = {name: value for name, value in read_yaml(file).items() if name in names_of(Sheet)}
+    facts |= {} if resolution_m is None else {"resolution": resolution_m}
+    if missing := [name for name in ("origin", "resolution") if facts.get(name) is None]:
         raise InputError(f"{file}: not the YAML of a ROS map: it needs {', '.join(missing)}")
-    x, y, yaw = _numbers(file, "origin", facts["origin"], 3, "x, y in metres and the yaw in rad")
-    if yaw:
-        raise InputError(f"{file}: the map is turned by {yaw:g} rad; set the yaw to 0 and register the scene")
-    if resolution_m is None:
-        (resolution_m,) = _numbers(file, "resolution", facts["resolution"], 1, "the side of a cell in metres")
-        if resolution_m <= 0:
-            raise InputError(f"{file}: resolution is {resolution_m:g}; give the side of a cell in metres, above zero")
-    names = ("free_thresh", "occupied_thresh")
-    stated = [
-        _numbers(file, name, facts.get(name, usual), 1, "a probability")[0]
-        for name, usual in zip(names, thresholds, strict=True)
-    ]
-    if not 0 < stated[0] < stated[1] < 1:
-        text = f"free_thresh is {stated[0]:g} and occupied_thresh {stated[1]:g}"
-        raise InputError(f"{file}: {text}; give probabilities above 0 and below 1, that of free cells first")
-    if (negate := facts.get("negate", 0)) not in (0, 1):
-        raise InputError(f"{file}: negate is {one_line(negate)[:40]}; give 0, or 1 if light pixels are occupied")
-    if (mode := facts.get("mode", "trinary")) not in get_args(Mode):
-        raise InputError(f"{file}: mode is {one_line(mode)[:40]}; give {', '.join(get_args(Mode))}")
-    return Sheet(
-        facts.get("image"), resolution_m, np.array([x, y]), (stated[0], stated[1]), bool(negate), cast(Mode, mode)
-    )
-
-
-def _numbers(file: Path, name: str, value: object, count: int, what: str) -> list[float]:
-    """The finite numbers of a value of a YAML."""
-    words: list[Any] = value if isinstance(value, list) else [value]
     try:
-        numbers = [float(word) for word in words if not isinstance(word, bool)]
-    except (TypeError, ValueError, OverflowError):
-        numbers = []
-    if len(numbers) != count or len(words) != count or not np.isfinite(numbers).all():
-        numbers_text = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise InputError(f"{file}: {name} is {one_line(value)[:60]}; give {numbers_text}: {what}")
-    return numbers
+        sheet = settings_from(Sheet, facts, str(file))
+    except InputError as error:  # ranges are those of any settings, whose file is not known there
+        raise InputError(f"{file}, {str(error).removeprefix(f'{file}, ')}") from None
+    if not np.isfinite(sheet.origin).all() or sheet.origin[2]:
+        text = f"origin is {list(sheet.origin)}; give finite x and y in metres and a yaw of 0, and register the scene"
+        raise InputError(f"{file}: {text}")
+    if sheet.free_thresh >= sheet.occupied_thresh:
+        text = f"free_thresh is {sheet.free_thresh:g} and occupied_thresh {sheet.occupied_thresh:g}"
+        raise InputError(f"{file}: {text}; give that of free cells first, the lower one")
+    return sheet
 
 
 @dataclass(frozen=True)

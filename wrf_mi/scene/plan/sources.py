@@ -20,8 +20,17 @@ from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.array_files import stored_arrays
 from ...core.files import inside, listed, one_line, text_lines
+from ...core.types import IntArray
 from ...datasets.folder_files import read_columns
-from .pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES, WHITE, read_pixels, read_sheet
+from .pictures import (
+    FREE_PROBABILITY,
+    OCCUPIED_PROBABILITY,
+    PICTURE_SUFFIXES,
+    SHEET_SUFFIXES,
+    WHITE,
+    read_pixels,
+    read_sheet,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -29,10 +38,7 @@ Mask = NDArray[np.bool_]
 Row0 = Literal["top", "bottom"]
 """Side of a plan where the first row of a grid lies: top is the largest y, bottom the smallest."""
 
-NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m", "time_s")  # arrays of numbers in an NPZ file
-OCCUPIED_PROBABILITY = 0.65
-"""A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
-FREE_PROBABILITY = 0.196  # a cell less likely than this is free (``free_thresh`` there)
+NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m")  # arrays of numbers in an NPZ file
 POINT_CELL_M = 0.05  # side of the cells that points are counted in, as usual for maps of indoor robots
 LARGEST_GRID_CELLS = 4_000_000  # 100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away
 THINNEST_WALL_M = 0.05  # thinner lines of a drawing are door leaves, dimensions and letters
@@ -61,25 +67,17 @@ class PlanGrid:
         """Cells of which it is not known what is there [rows, columns]."""
         return ~(self.occupied | self.free)
 
-    def occupied_at(self, xy_m: FloatArray) -> Mask:
-        """Whether the cells of points [..., 2] are occupied; those outside the grid are not."""
+    def cell_indices(self, xy_m: FloatArray) -> tuple[tuple[IntArray, IntArray], Mask]:
+        """Row and column [...] of the cells of points [..., 2], and whether they lie in the grid; (0, 0) outside it."""
         column, row = np.moveaxis(np.floor((xy_m - self.origin_m) / self.resolution_m).astype(int), -1, 0)
         rows, columns = self.occupied.shape
-        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        return np.asarray(self.occupied[np.where(inside, row, 0), np.where(inside, column, 0)] & inside)
+        within = np.asarray((row >= 0) & (row < rows) & (column >= 0) & (column < columns))
+        return (np.where(within, row, 0), np.where(within, column, 0)), within
 
     def centres_m(self, mask: Mask) -> FloatArray:
         """Centres [n, 2] of the cells of a mask."""
         row, column = np.nonzero(mask)
         return self.origin_m + self.resolution_m * (np.stack([column, row], axis=-1) + 0.5)
-
-
-@dataclass(frozen=True)
-class PlanPoints:
-    """LiDAR returns [n, 2] in a horizontal plane and the times [n] of their scans, equal within a scan, or None."""
-
-    xy_m: FloatArray
-    time_s: FloatArray | None = None
 
 
 def grid_from_probability(
@@ -137,15 +135,13 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None) -> Plan
     return PlanGrid(occupied, np.zeros_like(occupied), cell, low)
 
 
-def read_plan(
-    path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None
-) -> PlanGrid | PlanPoints | FloatArray:
+def read_plan(path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None) -> PlanGrid | FloatArray:
     """Any file that shows a plan, recognised by its ending and its content.
 
     - ``.npz`` with ``log_odds`` [rows, columns], ``row_0`` ("top" or "bottom"), ``resolution_m``, and optionally
       ``origin_m`` [2] of the lower left corner, zero by default. Values that all lie in 0..1 are taken as probabilities
       (log odds of free cells are negative).
-    - ``.npz`` with points ``xy_m`` [n, 2] and optionally ``time_s`` [n], equal for all returns of a scan.
+    - ``.npz`` with points ``xy_m`` [n, 2], LiDAR returns in a horizontal plane.
     - ``.png``, ``.pgm``, ``.jpg``: a picture, dark where occupied, transparent pixels on white, with or without the
       ``.yaml`` of a ROS map beside it, which may be given in its place (`wrf_mi.scene.plan.pictures.read_sheet`); its
       yaw has to be zero. Without a YAML, and with other greys than those of map_saver, lines thinner than
@@ -159,10 +155,11 @@ def read_plan(
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
 
     Returns:
-        A grid, points, or wall vertices [n, 2].
+        A grid, whose cells are nowhere free where the file holds points, or wall vertices [n, 2].
 
     Raises:
-        InputError: missing, unreadable or incomplete, or ``row_0`` for a file whose format fixes it.
+        InputError: missing, unreadable or incomplete, points with the times of their scans, or ``row_0`` for a file
+            whose format fixes it.
     """
     path = Path(path)
     if not path.is_file():
@@ -179,7 +176,7 @@ def read_plan(
         case ".csv":
             return read_layout(path)
         case ".xyz" | ".txt":
-            return _read_text(path)
+            return _grid_of_points(path, _read_text(path), resolution_m)
     raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .jpg, .yaml, .csv or .xyz")
 
 
@@ -194,7 +191,7 @@ def read_layout(path: str | Path) -> FloatArray:
     return vertices
 
 
-def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> PlanGrid | PlanPoints:
+def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> PlanGrid:
     try:
         content = stored_arrays(path)
     except Exception as error:  # numpy and zipfile raise a dozen kinds on damaged files
@@ -211,15 +208,17 @@ def _read_arrays(path: Path, resolution_m: float | None, row_0: Row0 | None) -> 
         raise InputError(f"{text}; give one of them")
     if row_0 is not None:
         raise _no_rows(path, "it holds points, which have no rows")
-    return _points_of_arrays(path, numbers["xy_m"], numbers.get("time_s"))
+    if "time_s" in content:
+        text = f"{path}: time_s: scans from several places are not aligned"
+        raise InputError(f"{text}; give the map of a SLAM program, or leave out time_s if their poses are exact")
+    return _grid_of_points(path, numbers["xy_m"], resolution_m)
 
 
-def _points_of_arrays(path: Path, xy: FloatArray, time: FloatArray | None) -> PlanPoints:
-    if xy.shape[1:] != (2,):
-        raise InputError(f"{path}: xy_m has shape {xy.shape}; expected [n, 2]")
-    if time is not None and time.shape != xy.shape[:1]:
-        raise InputError(f"{path}: time_s has shape {time.shape}; expected [{len(xy)}] as xy_m has points")
-    return PlanPoints(xy, time)
+def _grid_of_points(path: Path, xy_m: FloatArray, resolution_m: float | None) -> PlanGrid:
+    try:
+        return grid_from_points(xy_m, resolution_m)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def _grid_of_arrays(
@@ -233,8 +232,8 @@ def _grid_of_arrays(
     if origin.shape != (2,) or not np.isfinite(origin).all():
         raise InputError(f"{path}: origin_m is {origin.tolist()}; give x and y of the lower left corner in metres")
     values = content["log_odds"]
-    known = values[~np.isnan(values)]
-    if known.size and (known.min() < 0 or known.max() > 1):  # else they are probabilities
+    measured = values[~np.isnan(values)]
+    if measured.size and (measured.min() < 0 or measured.max() > 1):  # else they are probabilities
         values = 1 / (1 + np.exp(-np.clip(values, -50, 50)))
     row_0 = row_0 or _stated_side(path, content.get("row_0"))
     return grid_from_probability(values, resolution_m, row_0, origin, str(path))
@@ -259,16 +258,15 @@ def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
     is_sheet = path.suffix.lower() in SHEET_SUFFIXES
     file, sheet = path if is_sheet else path.with_suffix(".yaml"), None
     if file.is_file():
-        sheet = read_sheet(file, resolution_m, (FREE_PROBABILITY, OCCUPIED_PROBABILITY))
-        path, resolution_m = inside(path.parent, sheet.image, path) if is_sheet else path, sheet.resolution_m
+        sheet = read_sheet(file, resolution_m)
+        path, resolution_m = inside(path.parent, sheet.image, path) if is_sheet else path, sheet.resolution
     if resolution_m is None:
         raise InputError(f"{path}: a picture has no resolution; give the side of a pixel in metres (--resolution)")
     pixels = read_pixels(path, LARGEST_PICTURE)
     probability = pixels.probability(sheet)
     if sheet is not None:
-        return grid_from_probability(
-            probability, resolution_m, "top", sheet.origin_m, str(path), thresholds=sheet.thresholds
-        )
+        thresholds = sheet.free_thresh, sheet.occupied_thresh
+        return grid_from_probability(probability, resolution_m, "top", sheet.origin[:2], str(path), thresholds)
     if pixels.coloured:  # a drawing: what is no line is ground, of whatever colour
         probability = np.where(probability > OCCUPIED_PROBABILITY, 1.0, 0.0)
     grid = grid_from_probability(probability, resolution_m, "top", name=str(path))
@@ -305,7 +303,8 @@ def without_thin_lines(grid: PlanGrid, name: str = "plan") -> PlanGrid:
     return replace(grid, occupied=grid.occupied & ~lines, free=grid.free | lines)
 
 
-def _read_text(path: Path) -> PlanPoints:
+def _read_text(path: Path) -> FloatArray:
+    """Points [n, 2] of a text of two columns."""
     rows = []
     for number, line in enumerate(text_lines(path), 1):
         words = line.split("#")[0].replace(",", " ").split()
@@ -319,4 +318,4 @@ def _read_text(path: Path) -> PlanPoints:
             raise InputError(f"{path}: line {number}: expected two numbers x, y, found {' '.join(words)!r}")
     if not rows:
         raise InputError(f"{path}: no points; give rows x y in metres")
-    return PlanPoints(np.array(rows))
+    return np.array(rows)

@@ -9,11 +9,10 @@ from shapely.geometry.base import BaseGeometry
 
 from ...core import InputError
 from ...core.angles import FloatArray
-from ..mesh.outline import triangulated
+from ..mesh.outline import merged, opened, triangulated
 from ..mesh.surfaces import Surface, number_names
-from .alignment import grid_from_scans
 from .lines import HALF_WIDTH_M, THICKEST_WALL_M
-from .sources import PlanGrid, PlanPoints, grid_from_points
+from .sources import PlanGrid
 from .walked import NARROWEST_ROOM_M, mapped_part
 from .walls import find_walls, joined
 
@@ -65,34 +64,17 @@ def _with_open_rooms(area: BaseGeometry, lines: BaseGeometry) -> BaseGeometry:
     """An area with the rooms whose walls are at its edge, so that it covers all walls without them."""
     added = shapely.difference(_closed(lines, LARGEST_GAP_M / 2), area)
     # Opened by the width of a door, without which the space between both faces of a wall counts as a room.
-    opened = shapely.buffer(added, -NARROWEST_ROOM_M / 2, join_style="mitre")
-    rooms = shapely.get_parts(shapely.buffer(opened, NARROWEST_ROOM_M / 2, join_style="mitre"))
+    rooms = shapely.get_parts(opened(added, NARROWEST_ROOM_M / 2))
     near = shapely.buffer(lines, EDGE_M)
     walled = shapely.length(shapely.intersection(shapely.boundary(rooms), near)) >= WALLED * shapely.length(rooms)
     rooms = rooms[walled & (shapely.area(rooms) >= SMALLEST_FLOOR_M2)]
-    # Widened by a millimetre, because rounding leaves slits between an area and its complement.
-    joined = shapely.union_all([shapely.buffer(part, 1e-3, join_style="mitre") for part in (area, *rooms)])
-    return _filled(shapely.buffer(joined, -1e-3, join_style="mitre")) if len(rooms) else area
+    return _filled(merged([area, *rooms])) if len(rooms) else area
 
 
 def _filled(area: BaseGeometry) -> BaseGeometry:
     """Polygons without their holes."""
     outlines = [Polygon(part.exterior) for part in shapely.get_parts(area) if isinstance(part, Polygon)]
     return shapely.unary_union(outlines) if outlines else Polygon()
-
-
-def walls_of_plan(source: PlanGrid | PlanPoints | FloatArray, resolution_m: float | None = None) -> FloatArray:
-    """Straight walls [n, 2, 2] of a grid, points, or wall vertices [n, 2] in metres; `InputError`: it has none.
-
-    Points whose scans are known by their times are aligned with one another first, and free space is found from the
-    places of the sensor (`wrf_mi.scene.plan.alignment`).
-    """
-    if isinstance(source, PlanPoints):
-        if source.time_s is None:
-            source = grid_from_points(source.xy_m, resolution_m)
-        else:
-            source = grid_from_scans(source.xy_m, source.time_s)
-    return find_walls(source) if isinstance(source, PlanGrid) else layout_walls(np.asarray(source, float))
 
 
 def at_inner_faces(walls_m: FloatArray, grid: PlanGrid) -> FloatArray:
@@ -105,12 +87,13 @@ def at_inner_faces(walls_m: FloatArray, grid: PlanGrid) -> FloatArray:
         length = np.linalg.norm(end - begin)
         along = (end - begin) / length
         on_wall = begin + np.arange(0, length, step)[:, None] * along
-        left = np.array([-along[1], along[0]])
-        inside = [np.mean(shapely.contains_xy(area, on_wall + side * EDGE_M * left)) > 0.5 for side in (1, -1)]
+        to_left = np.array([-along[1], along[0]])
+        inside = [np.mean(shapely.contains_xy(area, on_wall + side * EDGE_M * to_left)) > 0.5 for side in (1, -1)]
         if inside[0] == inside[1]:
             continue
-        inwards = left if inside[0] else -left
-        occupied = grid.occupied_at(on_wall[:, None] + depth[:, None] * inwards)
+        inwards = to_left if inside[0] else -to_left
+        cells, within = grid.cell_indices(on_wall[:, None] + depth[:, None] * inwards)
+        occupied = grid.occupied[cells] & within
         # At most places no other wall meets this one.
         half_m = float(np.median(depth[0] * (np.argmin(occupied, axis=1) + 0.5)))
         if HALF_WIDTH_M < half_m <= THICKEST_WALL_M / 2:
@@ -119,11 +102,10 @@ def at_inner_faces(walls_m: FloatArray, grid: PlanGrid) -> FloatArray:
 
 
 def plan_surfaces(
-    source: PlanGrid | PlanPoints | FloatArray,
+    source: PlanGrid | FloatArray,
     *,
     height_m: float,
     floor_m: float = 0.0,
-    resolution_m: float | None = None,
     name: str = "plan",
 ) -> list[Surface]:
     """Surfaces of a storey: walls extruded from floor to ceiling, and both of these.
@@ -132,7 +114,6 @@ def plan_surfaces(
         source: the plan, as `wrf_mi.scene.plan.sources.read_plan` returns it.
         height_m: height from floor to ceiling, above zero.
         floor_m: z of the floor.
-        resolution_m: side of a cell to count points in.
         name: name of the source, for errors.
 
     Returns:
@@ -144,11 +125,15 @@ def plan_surfaces(
     if not (np.isfinite(height_m) and height_m > 0 and np.isfinite(floor_m)):
         raise InputError(f"height {height_m} m above {floor_m} m: give a height above zero (--wall-height, metres)")
     try:
-        walls_m = walls_of_plan(source, resolution_m)
         if isinstance(source, PlanGrid):
-            walls_m = at_inner_faces(walls_m, source)
-        area = floor_of(walls_m)
-        flat, faces = triangulated(mapped_part(area, source, name) if isinstance(source, PlanGrid) else area)
+            walls_m = find_walls(source)
+            # Points show no thickness: the cells of a noisy wall are on both sides of its face.
+            walls_m = at_inner_faces(walls_m, source) if source.free.any() else walls_m
+            area = mapped_part(floor_of(walls_m), source, name)
+        else:
+            walls_m = layout_walls(np.asarray(source, float))
+            area = floor_of(walls_m)
+        flat, faces = triangulated(area)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
     top_m, halves = floor_m + height_m, np.array([[0, 1, 2], [0, 2, 3]])

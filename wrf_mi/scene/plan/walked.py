@@ -14,7 +14,7 @@ from scipy import ndimage
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..mesh.outline import boxes, large_parts, polygons, triangulated
+from ..mesh.outline import boxes, large_parts, merged, opened, polygons, triangulated
 from ..mesh.surfaces import Surface, level_area
 from .lines import SMALLEST_ROOM_M2
 from .sources import PlanGrid
@@ -25,7 +25,6 @@ logger = logging.getLogger(__name__)
 NARROWEST_ROOM_M = 0.6  # as wide as the narrowest door
 BLUR_M = 0.2  # largest distance of a place from free cells that the blur of a robot's map explains
 NAMED_ROWS = 3
-SEAM_M = 1e-3  # rounding leaves slits between an area and its complement
 FREE, UNMAPPED, WALL, OUTSIDE = range(4)
 
 
@@ -41,7 +40,7 @@ def mapped_part(area: Any, grid: PlanGrid, name: str) -> Any:
     blind = boxes((to_unmapped < to_free).T, grid.origin_m, grid.resolution_m)
     blind = [
         part
-        for part in polygons(_opened(shapely.intersection(area, blind), FURNITURE_DEPTH_M / 2))
+        for part in polygons(opened(shapely.intersection(area, blind), FURNITURE_DEPTH_M / 2))
         if part.area >= SMALLEST_ROOM_M2
     ]
     if not blind:
@@ -49,15 +48,10 @@ def mapped_part(area: Any, grid: PlanGrid, name: str) -> Any:
     blind_area = shapely.simplify(shapely.union_all(blind), grid.resolution_m)
     text = "%s: %.1f m2 within the walls are unmapped, and are no floor"
     logger.warning(text, name, shapely.intersection(area, blind_area).area)
-    mapped = _opened(shapely.difference(area, blind_area), grid.resolution_m)  # slits of a cell remain along walls
+    mapped = opened(shapely.difference(area, blind_area), grid.resolution_m)  # slits of a cell remain along walls
     if mapped.is_empty:
         raise InputError("no cell within its walls is known to be free; give a map with free cells, or its thresholds")
     return mapped
-
-
-def _opened(area: Any, half_m: float) -> Any:
-    """An area without parts narrower than twice a half-width."""
-    return shapely.buffer(shapely.buffer(area, -half_m, join_style="mitre"), half_m, join_style="mitre")
 
 
 def with_walked_floor(
@@ -78,9 +72,7 @@ def with_walked_floor(
         )
     if not added:
         return list(surfaces)
-    parts = [shapely.buffer(part, SEAM_M, join_style="mitre") for part in (floor, *added)]
-    extended = shapely.buffer(shapely.union_all(parts), -SEAM_M, join_style="mitre")
-    flat, faces = triangulated(extended)
+    flat, faces = triangulated(merged([floor, *added]))
     return [
         replace(surface, vertices_m=np.insert(flat, 2, surface.vertices_m[0, 2], axis=1), faces=faces)
         if surface.kind in ("floor", "ceiling")
@@ -96,7 +88,7 @@ def _free_space(grid: PlanGrid, floor: Any, places_m: FloatArray) -> list[Any]:
     free = boxes(~solid.T, grid.origin_m, grid.resolution_m)
     points = shapely.points(places_m)
     about = shapely.buffer(points, NARROWEST_ROOM_M / 2, cap_style="square")
-    walkable = _opened(shapely.difference(free, floor), NARROWEST_ROOM_M / 2)
+    walkable = opened(shapely.difference(free, floor), NARROWEST_ROOM_M / 2)
     spaces = [part for part in polygons(walkable) if shapely.intersects(part, shapely.multipoints(points))]
     return [*shapely.intersection(about, free), *(shapely.simplify(part, grid.resolution_m) for part in spaces)]
 
@@ -106,10 +98,7 @@ def cells_at(grid: PlanGrid, places_m: FloatArray) -> IntArray:
 
     Places within `BLUR_M` of free cells count as free where a wall is drawn, within a cell where nothing was mapped.
     """
-    column, row = np.floor((places_m - grid.origin_m) / grid.resolution_m).astype(int).T
-    rows, columns = grid.free.shape
-    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-    at = np.where(inside, row, 0), np.where(inside, column, 0)
+    at, inside = grid.cell_indices(places_m)
     away_m = ndimage.distance_transform_edt(~grid.free)[at] * grid.resolution_m
     wall = grid.occupied[at]
     free = away_m <= np.where(wall, BLUR_M, np.sqrt(2) * grid.resolution_m)

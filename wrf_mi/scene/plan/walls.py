@@ -48,12 +48,12 @@ def find_walls(grid: PlanGrid) -> FloatArray:
     Walls along and across the main direction are taken first; the remaining cells may show further directions.
     """
     grid = without_specks(grid)
-    left, walls = grid, list[FloatArray]()
+    unexplained, walls = grid, list[FloatArray]()
     for pass_ in range(MOST_DIRECTIONS):
-        if not left.occupied.any():
+        if not unexplained.occupied.any():
             break
-        angle = dominant_direction(left.occupied)
-        view = turned(left, angle)
+        angle = dominant_direction(unexplained.occupied)
+        view = turned(unexplained, angle)
         runs = find_runs(view) if pass_ == 0 else find_runs(view, SHORTEST_OBLIQUE_M)
         if not runs:
             break
@@ -62,14 +62,14 @@ def find_walls(grid: PlanGrid) -> FloatArray:
         pieces = [run.ends_m @ rotation_2d(angle).T for run in (*runs, *tidy)]
         walls += pieces[len(runs) :]
         # The occupied cells that lie at these walls are explained.
-        cells = shapely.points(left.centres_m(left.occupied))
+        cells = shapely.points(unexplained.centres_m(unexplained.occupied))
         reach = [CLEARED_M + run.thick_m for run in (*runs, *tidy)]
         lines = shapely.linestrings(np.array(pieces))
         near = shapely.STRtree(cells).query(lines, predicate="dwithin", distance=reach)[1]
-        occupied = left.occupied.copy()
+        occupied = unexplained.occupied.copy()
         row, column = np.nonzero(occupied)
         occupied[row[near], column[near]] = False
-        left = without_specks(replace(left, occupied=occupied))
+        unexplained = without_specks(replace(unexplained, occupied=occupied))
     if not walls:
         raise InputError("no straight wall was found; is the resolution right, and is it a plan of walls?")
     walls_m = _without_clutter(joined(np.array(walls)))
@@ -181,12 +181,14 @@ def _tidy(runs: Sequence[WallRun], grid: PlanGrid) -> list[WallRun]:
 def _merged(runs: Sequence[WallRun], strips: _Strips) -> list[WallRun]:
     """Parallel runs of the same smear merged, at the offset of the longest."""
     walls: list[WallRun] = []
+    # The longest first: its offset has the least error, and shorter runs of its smear take it.
     for run in sorted(runs, key=lambda r: -r.length):
         for i, wall in enumerate(walls):
             apart = abs(wall.offset - run.offset)
             begin, end = max(wall.start, run.start), min(wall.end, run.end)
             if wall.axis != run.axis or apart > SAME_WALL_M or end - begin < run.length / 2:
                 continue
+            # Two faces of a partition have no free cells between them; two sides of a corridor do.
             if strips.free_between(wall, run, (begin, end)) > FREE_SHARE:
                 continue
             walls[i] = replace(wall, start=min(wall.start, run.start), end=max(wall.end, run.end))
@@ -206,10 +208,11 @@ def _bridged(runs: Sequence[WallRun], strips: _Strips) -> list[WallRun]:
             i += 1
             continue
         a = walls[i]
+        # Errors of an offset fall with the number of its cells.
         offset = (a.offset * a.length + partner.offset * partner.length) / (a.length + partner.length)
         walls[i] = WallRun(a.axis, offset, min(a.start, partner.start), max(a.end, partner.end))
         walls.remove(partner)
-        i = 0
+        i = 0  # the longer wall may bridge gaps that its pieces did not
     return walls
 
 
@@ -230,6 +233,7 @@ def _without_fronts(runs: Sequence[WallRun], strips: _Strips) -> list[WallRun]:
     """Runs without those that stand before a longer parallel run with nothing free between them."""
     walls = sorted(runs, key=lambda run: run.length)
     for run in tuple(walls):
+        # Share of the run, cell by cell, behind which some longer wall stands: several may share the back.
         covered = np.zeros(max(1, round(run.length / strips.grid.resolution_m)), bool)
         for wall in walls:
             near = 0 < abs(wall.offset - run.offset) <= FURNITURE_DEPTH_M

@@ -18,7 +18,7 @@ from ..mesh.outline import Raster, fill_blind, fill_shadows, join, outline, tria
 from ..mesh.planes import UPRIGHT, WALL_HEIGHT_M, Face, Mask, Plane, kinds, near, over, storey, with_axes
 from ..mesh.surfaces import KINDS, Kind, Surface, number_names
 from .planes import BAND, Thinned, find_planes, fit, layers, thin
-from .sight import Sight, seen, sights_of, sparse_walls
+from .sight import Sight, returns_and_shadows, sights_of, sparse_walls
 
 logger = logging.getLogger(__name__)
 
@@ -186,7 +186,7 @@ class _Scan:
         if not self.sights or not len(in_plane):
             return area
         raster = Raster.around(plane.flat(self.points_m[in_plane]).astype(float))
-        row, _ = seen(self.sights, plane, plane.lift(raster.centres_m), walls, band_m, free)
+        row, _ = returns_and_shadows(self.sights, plane, plane.lift(raster.centres_m), walls, band_m, free)
         on = raster.image((row >= 0) & free[row])
         # Where another surface crosses the plane, a strip as wide as the band lies in it.
         strip = int(np.ceil(2 * band_m / raster.cell_m)) + 1
@@ -226,7 +226,9 @@ class _Scan:
             return area
         within = shapely.envelope(area) if within is None else within
         raster = Raster.around(shapely.get_coordinates(within))
-        _, hidden = seen(self.sights, plane, plane.lift(raster.centres_m), walls, BAND * self.noise_m, things)
+        _, hidden = returns_and_shadows(
+            self.sights, plane, plane.lift(raster.centres_m), walls, BAND * self.noise_m, things
+        )
         return raster.grown(area, raster.image(hidden) & raster.covered(within) & ~raster.covered(area))
 
     def outside(self, walls: Sequence[Face]) -> Mask:

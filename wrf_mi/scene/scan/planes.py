@@ -176,19 +176,19 @@ def _fit_near(cloud: Thinned, chosen: Mask, start: Plane, noise_m: float) -> Pla
 def _merge(cloud: Thinned, planes: Sequence[Plane], noise_m: float) -> list[Plane]:
     """Coplanar neighbours merged and fitted anew, the plane with the most points first."""
     weight = [cloud.count[near(plane, cloud.points_m, 2 * noise_m)].sum() for plane in planes]
-    left = [planes[i] for i in np.argsort(weight)[::-1]]
+    remaining = [planes[i] for i in np.argsort(weight)[::-1]]
     merged: list[Plane] = []
-    while left:
-        plane = left.pop(0)
-        is_same = [_coplanar(plane, other, noise_m) for other in left]
+    while remaining:
+        plane = remaining.pop(0)
+        is_same = [_coplanar(plane, other, noise_m) for other in remaining]
         if not any(is_same):
             merged.append(plane)
             continue
-        patches = [other.patches_m for other in compress(left, is_same)]
-        left = [other for other, same in zip(left, is_same, strict=True) if not same]
+        patches = [other.patches_m for other in compress(remaining, is_same)]
+        remaining = [other for other, same in zip(remaining, is_same, strict=True) if not same]
         plane = replace(plane, patches_m=np.concatenate([plane.patches_m, *patches]))
         # The grown plane goes back to the front: it may meet further pieces.
-        left.insert(0, _fit_near(cloud, near(plane, cloud.points_m, BAND * noise_m), plane, noise_m))
+        remaining.insert(0, _fit_near(cloud, near(plane, cloud.points_m, BAND * noise_m), plane, noise_m))
     return merged
 
 
@@ -208,8 +208,8 @@ def _coplanar(a: Plane, b: Plane, noise_m: float) -> bool:
 def repeats(plane: Plane, others: Sequence[Plane], least_m: float) -> bool:
     """Whether a plane consists of strays of another plane: nearly parallel and nearer than ``least_m``."""
     parallel = [other for other in others if abs(plane.normal @ other.normal) >= np.cos(np.radians(10))]
-    near_ones = [other for other in parallel if abs(other.distance(plane.centre_m)) <= least_m]
-    return any(shapely.contains_xy(other.region(), *other.flat(plane.centre_m)) for other in near_ones)
+    near_planes = [other for other in parallel if abs(other.distance(plane.centre_m)) <= least_m]
+    return any(shapely.contains_xy(other.region(), *other.flat(plane.centre_m)) for other in near_planes)
 
 
 def _patches(cloud: Thinned, free: Mask, spread_deg: float) -> list[Any]:

@@ -186,8 +186,8 @@ def _read_text(file: Path) -> list[Part]:
         return [(table, None)]
     if len(table) and table.shape[1] < 3:
         raise ValueError(f"{table.shape[1]} {'columns' if table.shape[1] > 1 else 'column'}; x y z wanted")
-    whole = (table == np.round(table)).all(axis=0)
-    if whole.size and whole[0] and np.count_nonzero(~whole) >= 3:
+    is_whole = (table == np.round(table)).all(axis=0)
+    if is_whole.size and is_whole[0] and np.count_nonzero(~is_whole) >= 3:
         raise ValueError(
             f"column 1 has whole numbers alone, such as {table[0, 0]:g}, as labels, colours and indices are; "
             "name the columns in a first line, as in: label x y z"

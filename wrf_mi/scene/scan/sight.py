@@ -118,13 +118,13 @@ def sights_of(points_m: FloatArray, viewpoints_m: FloatArray, viewpoint: IntArra
     """
     if len(viewpoints_m):
         rows = [np.flatnonzero(viewpoint == k) for k in range(len(viewpoints_m))]
-        stated = [Sight(place, points_m[part], part) for place, part in zip(viewpoints_m, rows, strict=True)]
-        return [sight for sight in stated if sight.fits()]
+        scanners = [Sight(place, points_m[part], part) for place, part in zip(viewpoints_m, rows, strict=True)]
+        return [sight for sight in scanners if sight.fits()]
     origin = Sight(origin_m, points_m, np.arange(len(points_m)))
     return [origin] if origin.fits(LEAST_SEEN) else []
 
 
-def seen(
+def returns_and_shadows(
     sights: Sequence[Sight], plane: Plane, targets_m: FloatArray, walls: Sequence[Face], band_m: float, before: Mask
 ) -> tuple[IntArray, Mask]:
     """What scanners saw of points [n, 3] of a plane.
