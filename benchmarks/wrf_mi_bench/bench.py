@@ -105,10 +105,6 @@ _OWN: Mapping[str, Check] = {
     "operator": _here("prediction by operator", "operator:main", table="page_tables:operator"),
     "training": _here("training", "training:main", RFID, table="page_tables:training"),
     "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="page_tables:stages"),
-    "intervals": _here(
-        "intervals of three models", "stages:intervals", RFID, FLAT, resumes=True, table="stages:interval_table"
-    ),
-    "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
     "new-carriers": _here("carriers without measurements", "unmeasured:carriers", table="unmeasured:table", **_STORED),
     "new-receivers": _here(
         "receivers without measurements, and with few",

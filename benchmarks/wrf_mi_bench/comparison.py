@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 from wrf_mi.core import InputError
 from wrf_mi.core.files import write_atomically
 from wrf_mi.datasets.registry import locate
+from wrf_mi.tracing import open_scene
 
 from .bench import modules_of, provenance
 
@@ -72,3 +74,11 @@ def data_folder(name: str) -> Path:
 def room_file(name: str) -> Path:
     """File ``<room>.npz`` of a NeWRF room; `InputError` where it is not on this machine."""
     return data_folder(f"newrf-{name}") / f"{name}.npz"
+
+
+def opened(mesh: Any, frequency_hz: float, material: str) -> Any:
+    """Scene (``sionna.rt.Scene``) of one ``trimesh.Trimesh``."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "mesh.ply"
+        mesh.export(file, vertex_normal=False)
+        return open_scene(file, frequency_hz, material=material)
