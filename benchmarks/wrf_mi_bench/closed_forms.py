@@ -21,13 +21,13 @@ from wrf_mi.core import Antenna, Receiver
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.types import FloatArray, IntArray
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tracing import TraceOptions, set_frequency, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.sionna.scattering import scattering_materials
 
 from .comparison import opened
+from .declared import pivoted
 from .sionna_reference import sionna_paths
 from .wave_formulas import ComplexArray, free_space, half_plane, knife_edge, lambertian_power, slab, wedge
 
@@ -350,9 +350,8 @@ def shown_error(value: float) -> str:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table: greatest error, with the median in brackets, of each solver, and the bound of this project's."""
-    ways = list(dict.fromkeys(way for row in rows for way in row["errors"]))
-    cells = ([row["what"], *(row["errors"].get(way, "") for way in ways), row["asked"]] for row in rows)
-    return markdown_table(["case", *ways, "asked"], cells)
+    pairs = [{**row, "way": way, "error": error} for row in rows for way, error in row["errors"].items()]
+    return pivoted("| case | ... | asked |", "| {what} | ... | {asked} |", "what", "way", "{error}")(pairs)
 
 
 def picture(cases: Sequence[Errors]) -> Figure:

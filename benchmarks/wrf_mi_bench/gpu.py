@@ -11,7 +11,7 @@ measures what is missing.
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,12 @@ from wrf_mi.backend import BackendError, choose
 from wrf_mi.core import InputError
 from wrf_mi.parallel import run_module
 from wrf_mi.runs.folder import METRICS
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.stored import SCAN
 
 from .bench import RFID, BenchFailed
 from .comparison import kept_work, say
+from .declared import lined
 from .sources import fit_key, source_files
 
 JOB = "wrf_mi_bench.gpu_job"
@@ -133,7 +133,9 @@ def _measured(backend: str, threads: int, folder: Path) -> dict[str, Any]:
     return dict(json.loads(file.read_text()))
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table: a column for the GPU, two cores and all cores."""
-    lines = ([row["what"], *(row.get(name, "") for name in BACKENDS), row["asked"]] for row in rows)
-    return markdown_table(["what", *BACKENDS, "asked of the GPU"], lines)
+table = lined(
+    f"| what | {' | '.join(BACKENDS)} | asked of the GPU |",
+    f"| {{what}} | {' | '.join(f'{{{name}}}' for name in BACKENDS)} | {{asked}} |",
+    lambda row: {**dict.fromkeys(BACKENDS, ""), **row},
+)
+"""A column for the GPU, two cores and all cores."""

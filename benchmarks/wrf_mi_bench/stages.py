@@ -29,6 +29,7 @@ from wrf_mi_bench.random_room import random_room_record
 
 from .bench import FLAT, RFID
 from .comparison import data_folder, line, measured_on, say, stored_part
+from .declared import lined
 from .sources import fit_key, source_files
 from .tables import scene_of_data
 
@@ -224,3 +225,24 @@ def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         text = f"clearly worse than a part alone in {len(worse)} of {len(pairs)} comparisons"
         counts["failed"] = f"{text}, by more than the limit in {len(beyond)}"
     return counts
+
+
+SAME = 1e-6  # difference of mean scores below which two models predict the same
+
+
+def _with_best_part(row: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    best = min(parts, key=lambda part: part["gain"])
+    inside = "" if row["inside_90"] is None else f"{row['inside_90']:.0%}"
+    kept = ", ".join(stage["stage"] for stage in row["stages"] if stage["kept"])
+    return {"title": row["what"].rpartition(":")[0], "row": row, "best": best, "inside": inside, "kept": kept}
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The hybrid, its kept stages and its best part by mean score; without rows on which both predict the same."""
+    cells = [[row for row in rows if row["cell"] == cell] for cell in dict.fromkeys(row["cell"] for row in rows)]
+    return lined(
+        "| data | hybrid | inside | kept stages | best part alone | gain over it |",
+        "| {title} | **{row[score][median]:.3g}** | {inside} | {kept} | {best[model]} {best[score][median]:.3g} "
+        "| {best[gain]:.2g} ({best[gain_low]:.2g} to {best[gain_high]:.2g}) |",
+        lambda shown: shown if abs(shown["best"]["gain"]) >= SAME else None,
+    )([_with_best_part(hybrid, parts) for hybrid, *parts in cells])

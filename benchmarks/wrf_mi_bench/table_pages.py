@@ -16,6 +16,7 @@ from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks import TASKS
 
 from .comparison import Row, line
+from .declared import lined
 from .table_plan import MADE_HERE, PARTS, SHARES, TablePart, plan
 
 
@@ -242,11 +243,12 @@ def fronts(by_part: Mapping[TablePart, Points]) -> list[Row]:
     return rows
 
 
-def front_table(rows: Sequence[Row]) -> str:
-    """Markdown table of the fronts of `fronts` in the time of a prediction."""
-    title, _ = COSTS["ms_per_sample"]
-    lines = [[row["what"].removesuffix(f", {title}"), row["value"]] for row in rows if row["what"].endswith(title)]
-    return markdown_table(["data, score", f"Pareto-optimal methods: score ({title})"], lines)
+front_table = lined(
+    f"| data, score | Pareto-optimal methods: score ({COSTS['ms_per_sample'][0]}) |",
+    "| {part} | {value} |",
+    lambda row: {**row, "part": row["what"].rpartition(", ")[0]} if row["what"].endswith("sample") else None,
+)
+"""Fronts of `fronts` in the time of a prediction."""
 
 
 def pareto_figure(by_part: Mapping[TablePart, Points]) -> Figure:

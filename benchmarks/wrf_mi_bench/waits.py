@@ -31,6 +31,7 @@ from wrf_mi.tracing.tracer import RayTracer
 
 from .bench import FLAT, RFID, BenchFailed
 from .comparison import Row, data_folder, kept_work, line
+from .declared import lined
 from .sources import fit_key, source_files
 from .workloads import record
 
@@ -204,3 +205,7 @@ def main() -> dict[str, Any]:
     text = f"{of('demo', demo)['seconds']:.0f} s"
     rows.append(line("demo, without set-up", text, "150 s"))
     return {"rows": rows}
+
+
+table = lined("| what | measured | bound |", "| {what} | {value} | {asked} |")
+"""Measured durations and their bounds."""

@@ -1,10 +1,10 @@
-"""Benchmarks of models: stages and intervals of the hybrid, rows saved, positions, new receivers, stored parts."""
+"""Benchmarks of models: the hybrid and its parts, positions, new receivers, reception, stored parts."""
 
 from typing import Any
 
 import numpy as np
 import pytest
-from wrf_mi_bench import bench, page_tables, reception
+from wrf_mi_bench import bench, reception, stages
 from wrf_mi_bench.comparison import MEASURED, STORED, measured_on, stored_part
 from wrf_mi_bench.locate import CELLS as LOCATE_CELLS
 from wrf_mi_bench.locate import STRETCH, stretches, summary
@@ -54,10 +54,10 @@ def test_table_names_the_kept_stages_and_the_best_part():
         measured(JOINT, 0.91, (-0.01, -0.03, 0.01)),
     ]
     rows = rows_of(CELLS[0], results)
-    assert page_tables.stages(rows).splitlines()[2:] == [
+    assert stages.table(rows).splitlines()[2:] == [
         "| rfid-lab, official, 5 rows | **0.9** | 88% | mean, field | kriging 0.92 | -0.02 (-0.03 to -0.01) |"
     ]
-    assert len(page_tables.stages([{**row, "gain": 0.0} if "gain" in row else row for row in rows]).splitlines()) == 2
+    assert len(stages.table([{**row, "gain": 0.0} if "gain" in row else row for row in rows]).splitlines()) == 2
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_weakest_values_are_missing_and_reception_is_tabulated(monkeypatch):
     row = reception.row_of(cell, "idw", {"reception": block, "gain": [], "score": {"median": 3.0}})
     rows = [row, {**row, "model": "kriging", "log_loss": [0.2, 0.25, 0.25]}]
     cells = "flat-ble, blocked, 400 rows, a third missing (67% received) | 0.250 | **0.200** | 0.250 | 0.250"
-    assert page_tables.reception(rows).splitlines()[2] == f"| {cells} |"
+    assert reception.table(rows).splitlines()[2] == f"| {cells} |"
 
 
 def strengths(observed: np.ndarray) -> Record:
