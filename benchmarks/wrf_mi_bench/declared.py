@@ -26,7 +26,7 @@ def pivoted(
     key: str,
     column: str,
     cell: str,
-    titles: Mapping[str, str] | None = None,
+    titles: Mapping[Any, str] | None = None,
     best: Callable[[Sequence[str]], str] | None = None,
 ) -> Table:
     """Table with a line for each value of the entry ``key``, and a column for each value of the entry ``column``.
