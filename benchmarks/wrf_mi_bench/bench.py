@@ -66,7 +66,7 @@ class Check:
         quick: ``module:function`` with few cases, which raises `BenchFailed` beyond a bound; "": none.
         data: data sets that it reads where they are on this machine.
         resumes: whether the function keeps its results and is called every time.
-        table: ``module:function`` that makes a table of ``rows``; "": `check_table`.
+        table: ``module:name`` of a table of ``rows`` (`wrf_mi_bench.declared`); "": `check_table`.
         gpu: whether it needs a GPU.
     """
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import psutil
 
+from wrf_mi.core import Record
 from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.runs.folder import METRICS
@@ -50,11 +51,10 @@ def fit(model: str) -> dict[str, Any]:
     return {"seconds": metrics["train_seconds"], "processor_seconds": processor_s() - before, **figures}
 
 
-def trainer(model: str, gaussians: int, batch: int) -> Trainer:
-    """Trainer with a number of Gaussians and transmitters a step, otherwise default, without end."""
-    record = load_record(DATA)
-    settings = (*QUIET, f"initial.gaussians={gaussians}", f"batch={batch}", "steps=1000000")
-    return Trainer(record, make_splits(record, "official")[0], with_settings(TrainConfig(model=model), settings))
+def trainer(record: Record, model: str, *options: str) -> Trainer:
+    """Trainer with further settings, otherwise default, without end, on the official split or else a random one."""
+    settings = with_settings(TrainConfig(model=model), (*QUIET, "steps=1000000", *options))
+    return Trainer(record, make_splits(record, "official" if record.official else "random")[0], settings)
 
 
 def some_steps(of: Trainer, steps: int = STEPS) -> Callable[[], None]:
@@ -90,10 +90,12 @@ def shares(call: Callable[[], Any]) -> dict[str, float]:
 
 def main() -> dict[str, Any]:
     """Fits of all models, and times of their steps."""
-    load_record(DATA)  # missing data are reported first
+    record = load_record(DATA)  # missing data are reported first
     fits = {model: fit(model) for model in TITLES}
     trainers = {
-        f"{TITLES[model]}, {batch}": trainer(model, fits[model]["gaussians"], batch)
+        f"{TITLES[model]}, {batch}": trainer(
+            record, model, f"initial.gaussians={fits[model]['gaussians']}", f"batch={batch}"
+        )
         for model in TITLES
         if model != "kriging"
         for batch in BATCHES
