@@ -111,7 +111,7 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
     for part in PARTS:
         groups = grouped(part, stored, quick) if part.table == name else {}
         task, newest = TASKS[part.task], newest_data(groups) if groups else None
-        of_part = [
+        of_part: list[dict[str, Any]] = [
             {"median": _mean(of_method, "median"), "method": method, "former": is_former(part, of_method, newest)}
             for (share, method), of_method in groups.items()
             if quick or share == SHARES[0]
