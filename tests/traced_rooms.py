@@ -63,8 +63,8 @@ def inside(count: int, seed: int = 0) -> np.ndarray:
     return rng.uniform([0.3, 0.3, 0.3], [LENGTH - 0.3, WIDTH - 0.3, HEIGHT - 0.3], (count, 3))
 
 
-def image_lengths(tx: np.ndarray, rx: np.ndarray, depth: int) -> np.ndarray:
-    """Unfolded lengths of all paths of up to ``depth`` reflections in the shoebox, sorted: the mirror images.
+def image_lengths(tx: np.ndarray, rx: np.ndarray, depth: int, size: Any = (LENGTH, WIDTH, HEIGHT)) -> np.ndarray:
+    """Unfolded lengths of all paths of up to ``depth`` reflections in a box, sorted: the mirror images.
 
     Source: Allen and Berkley, "Image method for efficiently simulating small-room acoustics" (1979), JASA 65(4).
     """
@@ -73,8 +73,7 @@ def image_lengths(tx: np.ndarray, rx: np.ndarray, depth: int) -> np.ndarray:
     for n in np.array(np.meshgrid(span, span, span)).reshape(3, -1).T:
         if np.abs(n).sum() > depth:
             continue
-        size = np.array([LENGTH, WIDTH, HEIGHT])
         # After |n| reflections along an axis the image is at n size + x or, for odd n, at (n + 1) size - x.
-        image = np.where(n % 2 == 0, n * size + tx, (n + 1) * size - tx)
+        image = np.where(n % 2 == 0, n * size + tx, (n + 1) * np.array(size) - tx)
         found.append(np.linalg.norm(image - rx))
     return np.sort(found)

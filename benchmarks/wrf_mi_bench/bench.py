@@ -22,8 +22,9 @@ from wrf_mi.core.files import write_atomically
 from wrf_mi.core.registry import Registry, resolve
 from wrf_mi.parallel import Scheduler, run_module, worker_threads
 from wrf_mi.runs.folder import CONFIG, METRICS, is_finished, versions
-from wrf_mi.runs.sweep import dataset_files, markdown_table
+from wrf_mi.runs.sweep import dataset_files
 
+from .declared import lined
 from .sources import SOURCE, fit_key, modules_of_benchmark, modules_of_command, source_digests
 
 RFID, FLAT, CONFERENCE, OFFICE = "rfid-lab", "flat-ble", "newrf-conference", "newrf-office"
@@ -65,7 +66,7 @@ class Check:
         quick: ``module:function`` with few cases, which raises `BenchFailed` beyond a bound; "": none.
         data: data sets that it reads where they are on this machine.
         resumes: whether the function keeps its results and is called every time.
-        table: ``module:function`` that makes a table of ``rows``; "": `check_table`.
+        table: ``module:name`` of a table of ``rows`` (`wrf_mi_bench.declared`); "": `check_table`.
         gpu: whether it needs a GPU.
     """
 
@@ -102,13 +103,9 @@ _OWN: Mapping[str, Check] = {
     "stress": _here("numbers under stress", "stress:main", quick="stress:quick"),
     "pareto": _here("run time against error", "table_pages:pareto", resumes=True, table="table_pages:front_table"),
     "scaling": _here("cost against work", "scaling:main"),
-    "operator": _here("prediction by operator", "operator:main", table="page_tables:operator"),
-    "training": _here("training", "training:main", RFID, table="page_tables:training"),
-    "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="page_tables:stages"),
-    "intervals": _here(
-        "intervals of three models", "stages:intervals", RFID, FLAT, resumes=True, table="stages:interval_table"
-    ),
-    "rows-saved": _here("training rows", "rows_saved:main", FLAT, resumes=True),
+    "operator": _here("prediction by operator", "operator:main", table="operator:table"),
+    "training": _here("training", "training:main", RFID),
+    "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="stages:table"),
     "new-carriers": _here("carriers without measurements", "unmeasured:carriers", table="unmeasured:table", **_STORED),
     "new-receivers": _here(
         "receivers without measurements, and with few",
@@ -117,18 +114,18 @@ _OWN: Mapping[str, Check] = {
         table="unmeasured:table",
         **_STORED,
     ),
-    "rooms": _here("random rooms", "rooms:main", resumes=True, table="page_tables:rooms"),
+    "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "fdtd": _here("Maxwell's equations in a toy scene", "fdtd:main", table="fdtd:table"),
     "far-scans": _here("scans off by wavelengths", "far_scans:main", resumes=True, table="far_scans:table"),
     "locate": _here("positions from strengths", "locate:main", FLAT, resumes=True, table="locate:table"),
-    "reception": _here("reception", "reception:main", FLAT, resumes=True, table="page_tables:reception"),
+    "reception": _here("reception", "reception:main", FLAT, resumes=True, table="reception:table"),
     "moved": _here("furniture moved", "moved:main", resumes=True, table="moved:table"),
     "phase-error": _here("spectra from scans", "rooms:phase_errors", resumes=True, table="rooms:phase_table"),
     "closed-forms": _here("traced channels against closed forms", "closed_forms:main", table="closed_forms:table"),
     "elsewhere": _here("the same elsewhere", "elsewhere:main", table="elsewhere:table"),
     "gpu": _here("a GPU beside the CPU", "gpu:main", table="gpu:table", gpu=True),
     "plan": _here("where to measure next", "planning:main", FLAT, resumes=True, table="planning:table"),
-    "waits": _here("what a person waits for", "waits:main", RFID, FLAT, resumes=True, table="page_tables:waits"),
+    "waits": _here("what a person waits for", "waits:main", RFID, FLAT, resumes=True, table="waits:table"),
     "sentinels": _here(
         "figures kept", "sentinels:main", RFID, FLAT, CONFERENCE, OFFICE, resumes=True, table="sentinels:table"
     ),
@@ -288,16 +285,13 @@ NOTE = (
 )
 
 
-def table(results: Sequence[Mapping[str, Any]]) -> str:
-    head = ("what", "SSIM median", "mean", "p10", "p90", "IDW median")
-    rows = []
-    for result in results:
-        m = result["metrics"]
-        scores = [f"**{m['ssim']['median']:.3f}**", *(f"{m['ssim'][key]:.3f}" for key in ("mean", "p10", "p90"))]
-        costs = f"{m['steps']:,}", f"{m['train_seconds'] / 60:.1f} min", f"{m['ms_per_sample']:.1f}"
-        idw, memory = f"{m['reference']['idw4']['median']:.3f}", f"{m['peak_memory_mb']:.0f} MB"
-        rows.append([result["title"], *scores, idw, *costs, memory])
-    return markdown_table([*head, "steps", "training", "ms per spectrum", "peak memory"], rows)
+table = lined(
+    "| what | SSIM median | mean | p10 | p90 | IDW median | steps | training | ms per spectrum | peak memory |",
+    "| {title} | **{ssim[median]:.3f}** | {ssim[mean]:.3f} | {ssim[p10]:.3f} | {ssim[p90]:.3f} "
+    "| {reference[idw4][median]:.3f} | {steps:,} | {minutes:.1f} min | {ms_per_sample:.1f} | {peak_memory_mb:.0f} MB |",
+    lambda row: {"title": row["title"], **row["metrics"], "minutes": row["metrics"]["train_seconds"] / 60},
+)
+"""Scores and costs of `CASES`."""
 
 
 def own_table(result: Mapping[str, Any]) -> str:
@@ -307,6 +301,6 @@ def own_table(result: Mapping[str, Any]) -> str:
 
 
 def check_table(results: Sequence[Mapping[str, Any]]) -> str:
-    pairs = [(result["title"], row) for result in results for row in result["figures"]["rows"]]
-    cells = ([f"{title}: {row['what']}", f"**{row['value']}**", row["asked"]] for title, row in pairs)
-    return markdown_table(["what", "measured", "asked"], cells)
+    """Markdown table of the rows of checks."""
+    rows = [{"title": result["title"], **row} for result in results for row in result["figures"]["rows"]]
+    return lined("| what | measured | asked |", "| {title}: {what} | **{value}** | {asked} |")(rows)

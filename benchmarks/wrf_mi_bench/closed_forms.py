@@ -10,6 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import trimesh
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.constants import epsilon_0, speed_of_light
@@ -20,16 +21,15 @@ from wrf_mi.core import Antenna, Receiver
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.types import FloatArray, IntArray
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tracing import TraceOptions, set_frequency, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.sionna.scattering import scattering_materials
 
-from .limits import opened, room
+from .comparison import opened
+from .declared import pivoted
 from .sionna_reference import sionna_paths
-from .stress_oracle import slab
-from .wave_formulas import ComplexArray, free_space, half_plane, knife_edge, lambertian_power, wedge
+from .wave_formulas import ComplexArray, free_space, half_plane, knife_edge, lambertian_power, slab, wedge
 
 CARRIERS_HZ = 0.299e9, 2.4e9, 28e9, 140e9
 TRACED, FIELD, SIONNA = "`trace_paths`", "`TracedField`", f"Sionna RT {version('sionna-rt')}"
@@ -44,6 +44,7 @@ GROUND: Constants = (15.0, 0.5, 2.0)  # so lossy that nothing returns from its l
 ANGLES_DEG = np.concatenate([np.arange(0, 80, 2), np.arange(80, 89.5, 0.5), [89.8]])
 NEAR_M, FAR_M, INCIDENCE = 20.0, 10.0, np.radians(60)  # of an edge: receiver, transmitters, receiver's angle
 AROUND_DEG = np.arange(2.3, 358, 5)  # angles of transmitters about an edge, off the boundaries of shadows
+HZ = 2.44e9  # carrier at which scenes are opened
 ROUNDING = 1e-5  # bound of relative errors by single precision: some tens of roundings of 6e-8
 SLAB = 1e-3
 """The same of slabs, whose phase of up to 1,700 rad at 140 GHz is rounded, and of whose reflection little is left where
@@ -119,7 +120,7 @@ SIGN = {"V": 1, "H": -1}
 
 def free_space_errors() -> Iterator[Errors]:
     """Isotropic antennas, 1 m to 10 km apart, amplitude and channel."""
-    scene, distance_m = opened(sheet(0, 0.0, (-1.0, 1.0), (-1.0, 1.0)), PERFECT), np.geomspace(1, 1e4, 60)
+    scene, distance_m = opened(sheet(0, 0.0, (-1.0, 1.0), (-1.0, 1.0)), HZ, PERFECT), np.geomspace(1, 1e4, 60)
     tx_m = np.stack([1 + 0.6 * distance_m, 0.8 * distance_m, 0 * distance_m], axis=1)
     for hz in CARRIERS_HZ:
         at_carrier(scene, hz, MIRROR)
@@ -134,7 +135,7 @@ def free_space_errors() -> Iterator[Errors]:
 
 def two_ray_errors() -> Iterator[Errors]:
     """Antennas 10 m and 1.5 m above a lossy ground, 5 m to 2 km apart, relative to free space."""
-    scene, apart_m = opened(sheet(2, 0.0, (-20.0, 2020.0), (-50.0, 50.0)), PERFECT), np.geomspace(5, 2000, 60)
+    scene, apart_m = opened(sheet(2, 0.0, (-20.0, 2020.0), (-50.0, 50.0)), HZ, PERFECT), np.geomspace(5, 2000, 60)
     tx_m = np.stack([apart_m, 0 * apart_m, np.full_like(apart_m, 10.0)], axis=1)
     direct_m, reflected_m = np.hypot(apart_m, 8.5), np.hypot(apart_m, 11.5)
     for hz in CARRIERS_HZ:
@@ -151,7 +152,7 @@ def two_ray_errors() -> Iterator[Errors]:
 
 def wall_errors() -> Iterator[Errors]:
     """Reflection at and transmission through walls at angles of incidence up to 89.8 degrees, both polarisations."""
-    scene, rx_m = opened(sheet(0, 0.0, (-200.0, 200.0), (-50.0, 50.0)), PERFECT), np.array([0.25, 0.0, 0.0])
+    scene, rx_m = opened(sheet(0, 0.0, (-200.0, 200.0), (-50.0, 50.0)), HZ, PERFECT), np.array([0.25, 0.0, 0.0])
     along_m = 0.5 * np.tan(np.radians(ANGLES_DEG))
     length_m = np.hypot(0.5, along_m)
     for hz, constants in ((hz, constants) for hz in CARRIERS_HZ for constants in (MIRROR, *SLABS)):
@@ -179,7 +180,7 @@ def about_edge(radius_m: float, angle_rad: Any) -> FloatArray:
 
 def screen() -> Any:
     """Scene of a conducting half plane at x = 0, y < 0, with other edges far away."""
-    return opened(sheet(0, 0.0, (-30.0, 0.0), (-20.0, 20.0)), PERFECT)
+    return opened(sheet(0, 0.0, (-30.0, 0.0), (-20.0, 20.0)), HZ, PERFECT)
 
 
 def edge_field(way: str, scene: Any, tx_m: FloatArray, rx_m: FloatArray, hz: float, polarization: str) -> ComplexArray:
@@ -225,7 +226,7 @@ def half_plane_errors() -> Iterator[Errors]:
 
 def wedge_errors() -> Iterator[Errors]:
     """Waves diffracted by the edge of a conducting block, relative to free space over the edge."""
-    scene = opened(box((-20.0, -20.0, -20.0), (0.0, 0.0, 20.0)), PERFECT)
+    scene = opened(box((-20.0, -20.0, -20.0), (0.0, 0.0, 20.0)), HZ, PERFECT)
     angle = np.radians(AROUND_DEG[AROUND_DEG < 269])
     rx_m, tx_m = about_edge(NEAR_M, INCIDENCE), about_edge(FAR_M, angle)
     options = replace(DIFFRACTED, line_of_sight=False, reflection=False)
@@ -245,7 +246,7 @@ def wedge_errors() -> Iterator[Errors]:
 def scattering_errors() -> Iterator[Errors]:
     """Power that a conducting wall of 10 m x 10 m scatters diffusely, relative."""
     size, share = ((-5.0, -5.0), (5.0, 5.0)), 0.5
-    scene = opened(sheet(0, 0.0, (-5.0, 5.0), (-5.0, 5.0)), PERFECT)
+    scene = opened(sheet(0, 0.0, (-5.0, 5.0), (-5.0, 5.0)), HZ, PERFECT)
     tx_m, rx_m = np.array([[2.0, 0, 0], [1, 4, 1], [6, -3, 2], [12, 8, -3]]), np.array([3.0, 1, -0.5])
     options = replace(SPECULAR, line_of_sight=False, reflection=False, transmission=False, rays=1 << 16)
     options = replace(options, scattering=True, scattering_coefficient=share)
@@ -258,6 +259,19 @@ def scattering_errors() -> Iterator[Errors]:
             power = np.bincount(found.row, np.abs(found.gain) ** 2, len(tx_m))
             errors[way] = np.abs(power / truth - 1)
         yield "wall that scatters, power", "", hz, SAMPLED, errors
+
+
+def room() -> tuple[Any, FloatArray, FloatArray]:
+    """A closed concrete room of 6 x 5 x 2.5 m with three boxes in it, and 60 pairs of free positions [60, 3] each."""
+    rng = np.random.default_rng(0)
+    walls = np.array([(0, 0, 0), (6, 5, 2.5)])
+    low_m = np.array([(1.5, 1.7, 0), (3.7, 2.5, 0), (2.9, 0.6, 0)])
+    pieces = np.stack([low_m, [(2.5, 2.3, 1.2), (4.3, 3.5, 2), (4.1, 1.4, 0.8)]], axis=1)
+    ends = rng.uniform([0.3, 0.3, 0.3], [5.7, 4.7, 2.3], (400, 3))
+    solid = np.any([((ends > piece[0]) & (ends < piece[1])).all(axis=1) for piece in pieces], axis=0)
+    boxes: Any = trimesh.util.concatenate([trimesh.creation.box(bounds=corners) for corners in (walls, *pieces)])
+    tx_pos_m, rx_pos_m = np.split(ends[~solid][:120], 2)
+    return opened(boxes, HZ, "concrete"), tx_pos_m, rx_pos_m
 
 
 def consistency_errors() -> Iterator[Errors]:
@@ -336,9 +350,8 @@ def shown_error(value: float) -> str:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table: greatest error, with the median in brackets, of each solver, and the bound of this project's."""
-    ways = list(dict.fromkeys(way for row in rows for way in row["errors"]))
-    cells = ([row["what"], *(row["errors"].get(way, "") for way in ways), row["asked"]] for row in rows)
-    return markdown_table(["case", *ways, "asked"], cells)
+    pairs = [{**row, "way": way, "error": error} for row in rows for way, error in row["errors"].items()]
+    return pivoted("| case | ... | asked |", "| {what} | ... | {asked} |", "what", "way", "{error}")(pairs)
 
 
 def picture(cases: Sequence[Errors]) -> Figure:

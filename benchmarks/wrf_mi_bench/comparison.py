@@ -2,8 +2,11 @@
 
 import json
 import shutil
+import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,8 +14,9 @@ from typing import Any
 from wrf_mi.core import InputError
 from wrf_mi.core.files import write_atomically
 from wrf_mi.datasets.registry import locate
+from wrf_mi.tracing import open_scene
 
-from .bench import modules_of, provenance
+from .bench import BenchFailed, modules_of, provenance
 
 Row = dict[str, str]
 STORED = Path("benchmarks/results")  # stored results, in a checkout
@@ -72,3 +76,25 @@ def data_folder(name: str) -> Path:
 def room_file(name: str) -> Path:
     """File ``<room>.npz`` of a NeWRF room; `InputError` where it is not on this machine."""
     return data_folder(f"newrf-{name}") / f"{name}.npz"
+
+
+def opened(mesh: Any, frequency_hz: float, material: str) -> Any:
+    """Scene (``sionna.rt.Scene``) of one ``trimesh.Trimesh``."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "mesh.ply"
+        mesh.export(file, vertex_normal=False)
+        return open_scene(file, frequency_hz, material=material)
+
+
+def command(*arguments: str | Path, beside: Sequence[Sequence[str | Path]] = ()) -> float:
+    """Seconds of a command, with others that start at the same time; `BenchFailed` unless all end well."""
+    calls = [[sys.executable, "-m", "wrf_mi.apps.commands", *map(str, each)] for each in (arguments, *beside)]
+    start = time.perf_counter()
+    with tempfile.TemporaryFile("w+") as errors:
+        started = [subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=errors) for call in calls]
+        status = [process.wait() for process in started]
+        seconds = time.perf_counter() - start
+        errors.seek(0)
+        if any(status):
+            raise BenchFailed(f"bench: `wrf-mi {' '.join(calls[0][3:])}`: {errors.read().strip().splitlines()[-1:]}")
+    return seconds

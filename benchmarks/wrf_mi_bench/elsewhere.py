@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from wrf_mi.backend import choose, find_cuda, find_llvm
 from wrf_mi.backend.libraries import LLVM_VARIABLE
 from wrf_mi.backend.probe import try_cuda, try_llvm
-from wrf_mi.runs.sweep import markdown_table
 
 from .bench import BenchFailed
+from .declared import pivoted
 
 NUMPY_FOLDERS = "WRF_MI_NUMPY_FOLDERS"
 THREADS = (1, 2, 4, 8)
@@ -123,10 +123,12 @@ def main(threads: Sequence[int] = THREADS, small: bool = False) -> dict[str, Any
     return {"rows": rows} | ({"failed": f"beyond its bound: {'; '.join(above)}"} if above else {})
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table: a line for each variant, difference and promise of each quantity."""
-    lines = []
-    for name in dict.fromkeys(row["variant"] for row in rows):
-        cells = {row["quantity"]: f"**{row['value']}** ({row['asked']})" for row in rows if row["variant"] == name}
-        lines.append([name, *(cells.get(quantity, "") for quantity in HEADS)])
-    return markdown_table([f"against {rows[0]['compared_with']}", *HEADS.values()], lines)
+table = pivoted(
+    "| against {compared_with} | ... |",
+    "| {variant} | ... |",
+    "variant",
+    "quantity",
+    "**{value}** ({asked})",
+    titles=HEADS,
+)
+"""A line for each variant, difference and promise of each quantity."""

@@ -5,7 +5,6 @@ training rows and eight subcarriers over 400 MHz. A room's error is that of the 
 in dB against that in the true room: it has no phase.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,13 +17,13 @@ from wrf_mi.correction import default_options, write_page
 from wrf_mi.correction.options import PHASES
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.channel import rssi_dbm
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi_bench.random_room import OPTIONS, Survey, random_room_record
 
 from .comparison import kept_work, line
+from .declared import lined
 from .rooms import clipped_cea_db
 from .sources import fit_key, source_files
 
@@ -69,15 +68,10 @@ def main() -> dict[str, Any]:
     return {"rows": [kept_work(place, str(seed), partial(measure_room, seed)) for seed in SEEDS]}
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of median errors of powers by scene, mean errors in parentheses."""
-    scenes = SCAN, WITHOUT, WITH
-    lines = [
-        [
-            row["what"],
-            *(f"{row['median_db'][name]:.2f} ({row['mean_db'][name]:.2f})" for name in scenes),
-            row["kept"][WITH],
-        ]
-        for row in rows
-    ]
-    return markdown_table(["room", *scenes, "kept"], lines)
+table = lined(
+    f"| room | {SCAN} | {WITHOUT} | {WITH} | kept |",
+    "| {what} | "
+    + " | ".join(f"{{median_db[{name}]:.2f}} ({{mean_db[{name}]:.2f}})" for name in (SCAN, WITHOUT, WITH))
+    + f" | {{kept[{WITH}]}} |",
+)
+"""Median errors of powers by scene, mean errors in parentheses."""

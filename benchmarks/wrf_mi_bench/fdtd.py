@@ -6,7 +6,7 @@ slab of 83 cells between absorbing layers above, below and at the sides, so that
 amplitudes of single reflections fall as 1 / r, to 0.6 dB.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,7 +28,6 @@ from wrf_mi.correction.uncertain_phases import UncertainPhases
 from wrf_mi.datasets.registry import data_home
 from wrf_mi.receivers.channel import rssi_dbm
 from wrf_mi.receivers.instruments import Instrument
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import Materials
 from wrf_mi.scene.mesh.files import mesh_parts
@@ -41,6 +40,7 @@ from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.tracer import RayTracer
 
 from .comparison import line, say
+from .declared import lined
 from .von_mises import calibrated
 
 Complex = NDArray[np.complex128]
@@ -276,7 +276,5 @@ def _corrections(
         yield f"one material, {what}", scene_of(model, place / "phases", constants), constants
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of what is not explained and of errors of power at the receiver that no calibration knows."""
-    lines = [[row["what"], f"{row['unexplained_db'][-1]:.1f}", f"{row['power_db'][-1]:+.1f}"] for row in rows]
-    return markdown_table(["scene", "unexplained (dB)", "power (dB)"], lines)
+table = lined("| scene | unexplained (dB) | power (dB) |", "| {what} | {unexplained_db[2]:.1f} | {power_db[2]:+.1f} |")
+"""What is not explained, and errors of power, at the receiver that no calibration knows."""

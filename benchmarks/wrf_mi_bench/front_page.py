@@ -28,7 +28,6 @@ from wrf_mi.datasets.ble_folder import CARRIER_HZ
 from wrf_mi.receivers.channel import received_power
 from wrf_mi.receivers.reports import strength_db
 from wrf_mi.runs.folder import load_rows
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic.floor_receivers import DEFAULT, NAME
 from wrf_mi.synthetic.searches import SCATTERING, set_scattering
 from wrf_mi.synthetic.stored import SCAN
@@ -37,6 +36,7 @@ from wrf_mi.tasks.scores import inside_interval
 from wrf_mi.tracing import open_scene, trace_paths
 
 from .comparison import STORED, data_folder
+from .declared import pivoted
 from .sources import fit_key, source_files
 from .stages import CALIBRATED, HYBRID, JOINT, MATERIALS, Cell, run_of_cell
 from .stages import CORRECTED as IN_CORRECTED
@@ -48,7 +48,7 @@ from .unmeasured import CORRECTED, IDW, KRIGING, LAW, TRACED, gains
 COLUMNS = ("hybrid", "ray tracing", "WRF-GS+", "WRF-GS+", "kriging", "IDW")
 SCENE = 3
 """Number of columns whose methods have a scene; the others have none."""
-HEAD = ("question", "data", *(f"{name}, {'scan' if k < SCENE else 'no scan'}" for k, name in enumerate(COLUMNS)))
+HEAD = [f"{name}, {'scan' if k < SCENE else 'no scan'}" for k, name in enumerate(COLUMNS)]
 TRACING, ALONE, INTERPOLATION = 1, 3, 5
 """Columns by number: ray tracing, WRF-GS+ without a scene, IDW."""
 OF_STAGES = {HYBRID: 0, "ray-tracing": TRACING, CALIBRATED: TRACING, MATERIALS: TRACING, IN_CORRECTED: TRACING}
@@ -160,7 +160,7 @@ def question_table(results: Path = STORED) -> str:
 
     Ray tracing is the better of the paths in the scene as stated, and calibrated or corrected by the measurements.
     """
-    lines = []
+    rows = []
     for question in QUESTIONS:
         task, columns = TASKS[question.task], dict[int, tuple[float, str]]()
         better = max if task.higher_is_better else min
@@ -169,13 +169,19 @@ def question_table(results: Path = STORED) -> str:
                 prefix = "MRI " if method == LAW else ""
                 columns[column] = better(columns.get(column, (median, prefix)), (median, prefix))
         best = better(columns.values())
-        cells = [""] * len(COLUMNS)
+        text = f"{question.text}, {task.label}{f' {FORMER}' if question.former else ''}"
         for column, (median, prefix) in columns.items():
-            text = f"{prefix}{median:.{task.digits}f}"
-            cells[column] = f"**{text}**" if median == best[0] else text
-        mark = f" {FORMER}" if question.former else ""
-        lines.append([f"{question.text}, {task.label}{mark}", question.data, *cells])
-    return markdown_table(HEAD, lines)
+            cell = f"{prefix}{median:.{task.digits}f}"
+            cell = f"**{cell}**" if median == best[0] else cell
+            rows.append({"question": text, "data": question.data, "column": column, "cell": cell})
+    return pivoted(
+        "| question | data | ... |",
+        "| {question} | {data} | ... |",
+        "question",
+        "column",
+        "{cell}",
+        dict(enumerate(HEAD)),
+    )(rows)
 
 
 RUNS, PICTURE = Path("runs/bench/front-page"), Path("docs/images/front-page.png")

@@ -11,7 +11,7 @@ measures what is missing.
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,12 @@ from wrf_mi.backend import BackendError, choose
 from wrf_mi.core import InputError
 from wrf_mi.parallel import run_module
 from wrf_mi.runs.folder import METRICS
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.stored import SCAN
 
 from .bench import RFID, BenchFailed
-from .comparison import kept_work, say
+from .comparison import command, kept_work, say
+from .declared import lined
 from .sources import fit_key, source_files
 
 JOB = "wrf_mi_bench.gpu_job"
@@ -105,23 +105,16 @@ def fits(place: Path) -> list[dict[str, Any]]:
 
 def _fit(what: str, folder: Path) -> str:
     """Time and score of a fit."""
-    command, scene, out = FITS[what], str(folder / "scene"), folder / "run"
-    if "SCENE" in command:
-        _run("mesh", str(Path(load_record("laboratory").source) / SCAN), "--out", scene)
-    few = () if DEVICE == "cuda" else FEW["hybrid" if what.startswith("hybrid") else command[0]]
-    start = time.perf_counter()
-    _run(*(scene if word == "SCENE" else word for word in command), *few, "--out", str(out))
-    text = f"{time.perf_counter() - start:.1f} s"
+    words, scene, out = FITS[what], str(folder / "scene"), folder / "run"
+    if "SCENE" in words:
+        command("mesh", Path(load_record("laboratory").source) / SCAN, "--out", scene)
+    few = () if DEVICE == "cuda" else FEW["hybrid" if what.startswith("hybrid") else words[0]]
+    seconds = command(*(scene if word == "SCENE" else word for word in words), *few, "--out", out)
+    text = f"{seconds:.1f} s"
     if (out / METRICS).exists():
         metrics = json.loads((out / METRICS).read_text())
         text = f"{metrics['train_seconds']:.1f} s to median SSIM {metrics['ssim']['median']:.4f}"
     return text
-
-
-def _run(*arguments: str) -> None:
-    status, message = run_module("wrf_mi.apps.commands", arguments)
-    if status != 0:
-        raise BenchFailed(f"bench gpu: `wrf-mi {' '.join(arguments)}` ended with status {status} {message}".rstrip())
 
 
 def _measured(backend: str, threads: int, folder: Path) -> dict[str, Any]:
@@ -133,7 +126,9 @@ def _measured(backend: str, threads: int, folder: Path) -> dict[str, Any]:
     return dict(json.loads(file.read_text()))
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table: a column for the GPU, two cores and all cores."""
-    lines = ([row["what"], *(row.get(name, "") for name in BACKENDS), row["asked"]] for row in rows)
-    return markdown_table(["what", *BACKENDS, "asked of the GPU"], lines)
+table = lined(
+    f"| what | {' | '.join(BACKENDS)} | asked of the GPU |",
+    f"| {{what}} | {' | '.join(f'{{{name}}}' for name in BACKENDS)} | {{asked}} |",
+    lambda row: {**dict.fromkeys(BACKENDS, ""), **row},
+)
+"""A column for the GPU, two cores and all cores."""

@@ -52,18 +52,11 @@ def job(file: str, backend: str, threads: str = "0") -> None:
 
 def step(model: str, gaussians: int) -> Any:
     """A training step on random spectra, with the default batch."""
-    from wrf_mi.core.settings import with_settings
-    from wrf_mi.datasets import make_splits
-    from wrf_mi.training.config import TrainConfig
-    from wrf_mi.training.trainer import Trainer
-
-    from .training import QUIET, some_steps
+    from .training import some_steps, trainer
     from .workloads import record, size_deg
 
-    spectra = record(ROWS)
-    options = (*QUIET, f"initial.gaussians={gaussians}", f"initial.size_deg={size_deg(gaussians):.3g}", "steps=1000000")
-    of = Trainer(spectra, make_splits(spectra, "random")[0], with_settings(TrainConfig(model=model), options))
-    return some_steps(of, 1)
+    options = f"initial.gaussians={gaussians}", f"initial.size_deg={size_deg(gaussians):.3g}"
+    return some_steps(trainer(record(ROWS), model, *options), 1)
 
 
 def kernels_of(call: Any) -> dict[str, float]:

@@ -6,7 +6,7 @@ of a run share their errors, so that intervals resample stretches of the run.
 """
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,11 +21,11 @@ from wrf_mi.core.angles import FloatArray
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.folder import METRICS as FINISHED
 from wrf_mi.runs.folder import load_rows
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
 from .comparison import data_folder, kept, line, say
+from .declared import lined
 from .sources import fit_key, source_files
 from .tables import scene_of_data
 
@@ -168,15 +168,12 @@ def summary(measured: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
     return {"rows": rows, **verdict}
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of pooled draws: error, gain over nearest neighbours with its 95 % interval, and regions."""
-    columns: dict[str, Callable[[Mapping[str, Any]], str]] = {
-        "training rows, model": lambda row: row["what"],
-        "error, median (mean), m": lambda row: f"**{row['median_m']:.2f}** ({row['mean_m']:.2f})",
-        "kNN, median (mean), m": lambda row: f"{row['neighbours_median_m']:.2f} ({row['neighbours_mean_m']:.2f})",
-        "gain on kNN, m": lambda row: "{:.2f} ({:.2f} to {:.2f})".format(*row["gain_m"]),
-        "inside 90 % regions": lambda row: "{:.0%} ({:.0%} to {:.0%})".format(*row["inside"]),
-        "radius, m": lambda row: f"{row['radius_m']:.1f}",
-    }
-    shown = [row for row in rows if row["what"].endswith(POOLED) or row["what"].startswith("all")]
-    return markdown_table(list(columns), ([cell(row) for cell in columns.values()] for row in shown))
+table = lined(
+    "| training rows, model | error, median (mean), m | kNN, median (mean), m | gain on kNN, m | inside 90 % regions "
+    "| radius, m |",
+    "| {what} | **{median_m:.2f}** ({mean_m:.2f}) | {neighbours_median_m:.2f} ({neighbours_mean_m:.2f}) "
+    "| {gain_m[0]:.2f} ({gain_m[1]:.2f} to {gain_m[2]:.2f}) | {inside[0]:.0%} ({inside[1]:.0%} to {inside[2]:.0%}) "
+    "| {radius_m:.1f} |",
+    lambda row: row if row["what"].endswith(POOLED) or row["what"].startswith("all") else None,
+)
+"""Pooled draws: error, gain over nearest neighbours with its 95 % interval, and regions."""

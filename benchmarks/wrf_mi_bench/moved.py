@@ -24,7 +24,6 @@ from wrf_mi.core import Record
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.runs.run import Run
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.scene.edit import Move, edit_scene, parts_within
 from wrf_mi.synthetic.searches import free_positions
 from wrf_mi.tasks import SPECTRUM, TASKS, instrument_of
@@ -33,6 +32,7 @@ from wrf_mi.tracing.sionna.scenes import open_scene
 from wrf_mi.tracing.tracer import RayTracer
 
 from .comparison import line, measured_on, say, stored_part
+from .declared import lined
 from .random_room import CLEAR_M, FROM_STATION_M, HIGH_M, LOW_M, OPTIONS, Survey, random_room_record
 from .rooms import PREDICTION, array_at
 from .sources import fit_key, source_files
@@ -201,10 +201,9 @@ def saved(rows: Sequence[Mapping[str, Any]]) -> dict[str, int | None]:
     }
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of the mean SSIM of each prediction, and of what the hybrid in the edited scene gains over it."""
-    lines = []
-    for row in rows:
-        gain = "" if row["what"] == OURS else "{:.3f} ({:.3f} to {:.3f})".format(*row["gain"])
-        lines.append([row["what"], f"{row['mean'][0]:.3f}", gain])
-    return markdown_table(["prediction", "mean SSIM", "gain of the hybrid in the edited scene"], lines)
+table = lined(
+    "| prediction | mean SSIM | gain of the hybrid in the edited scene |",
+    "| {what} | {mean[0]:.3f} | {shown} |",
+    lambda row: {**row, "shown": "" if row["what"] == OURS else "{:.3f} ({:.3f} to {:.3f})".format(*row["gain"])},
+)
+"""Mean SSIM of each prediction, and what the hybrid in the edited scene gains over it."""

@@ -25,7 +25,6 @@ from wrf_mi.datasets import make_splits
 from wrf_mi.estimators.interpolation.kriging import Kriging
 from wrf_mi.estimators.interpolation.strengths import fit_strengths
 from wrf_mi.models import Inputs
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.scene.make import make_scene
 from wrf_mi.stages.strengths import SMOOTH_M, SPACING_M, TRACE
 from wrf_mi.synthetic.stored import SCAN
@@ -36,6 +35,7 @@ from wrf_mi.tracing.sionna.scenes import open_scene
 
 from .bench import FLAT
 from .comparison import data_folder, line, measured_on, say, stored_part
+from .declared import lined
 from .random_room import random_room_record
 
 PICTURE = Path("docs/images/planned-rows.png")  # written only in a checkout of the project
@@ -198,12 +198,12 @@ def main() -> dict[str, Any]:
     return result | ({"failed": f"clearly worse than random rows: {', '.join(worse)}"} if worse else {})
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table of the gains of planned rows; `picture` shows the scores."""
-    head = ["place", "gain over random", "planned rows as good as 60 random"]
-    gains = ["{:.3f} ({:.3f} to {:.3f})".format(*row["gain"]) for row in rows]
-    lines = [[row["what"], gain, str(row["equal"] or "more than 60")] for row, gain in zip(rows, gains, strict=True)]
-    return markdown_table(head, lines)
+table = lined(
+    "| place | gain over random | planned rows as good as 60 random |",
+    "| {what} | {gain[0]:.3f} ({gain[1]:.3f} to {gain[2]:.3f}) | {shown} |",
+    lambda row: {**row, "shown": row["equal"] or "more than 60"},
+)
+"""Gains of planned rows; `picture` shows the scores."""
 
 
 def picture(rows: Sequence[Mapping[str, Any]]) -> Figure:

@@ -31,7 +31,6 @@ from wrf_mi.core.settings import with_settings
 from wrf_mi.datasets import make_splits
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.graph import Batch
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tasks.scores import Interval
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
@@ -40,6 +39,7 @@ from wrf_mi.training.step import TrainingData, device_pose
 from wrf_mi.training.trainer import Trainer
 
 from .bench import BenchFailed, provenance
+from .declared import lined
 from .timing import Call, Within, interleaved, ratio
 from .traced import StockRenderer, rgb_variant
 from .workloads import HEIGHT, WIDTH, field, integrator, record, splatting, tracer
@@ -268,9 +268,8 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
 
 
 def ratio_table(ratios: Mapping[str, Mapping[str, float]]) -> str:
+    """Markdown table of ratios by the names of their pairs."""
     titles = {known.name: known.title for known in PAIRS}
-    lines = []
-    for name, pair in ratios.items():
-        interval = f"**{pair['value']:.2g}** ({pair['low']:.2g} to {pair['high']:.2g})"
-        lines.append([titles[name], interval, f"{pair['ours_ms']:.3g} ms, {pair['theirs_ms']:.3g} ms"])
-    return markdown_table(["ratio", "measured (95 % interval)", "medians"], lines)
+    line = "| {title} | **{value:.2g}** ({low:.2g} to {high:.2g}) | {ours_ms:.3g} ms, {theirs_ms:.3g} ms |"
+    rows = [{"title": titles[name], **pair} for name, pair in ratios.items()]
+    return lined("| ratio | measured (95 % interval) | medians |", line)(rows)

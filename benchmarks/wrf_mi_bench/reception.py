@@ -6,7 +6,7 @@ its fits in a scene take minutes. Each run is stored when it is measured
 (`wrf_mi_bench.comparison.stored_part`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
 from .comparison import data_folder, line, measured_on, say, stored_part
+from .declared import pivoted
 from .sources import fit_key, source_files
 from .stages import ALONE, HYBRID, Alone, run_of_cell
 from .stages import Cell as Rows
@@ -121,3 +122,16 @@ def main() -> dict[str, Any]:
     result: dict[str, Any] = {"rows": rows, "measured": measured_on(parts)}
     worse = [row["what"] for row in rows if any(gain < -WORSE and high < 0 for gain, _, high in row["gain"])]
     return result | ({"failed": f"clearly worse than a reference: {', '.join(worse)}"} if worse else {})
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Log loss of the models, of the rate and of the nearest rows, by data set; the smallest is bold."""
+    names = "model", "rate", "nearest"
+    losses = [
+        {**row, "by": row.get(name, name), "loss": loss}
+        for row in rows
+        for name, loss in zip(names, row["log_loss"], strict=True)
+    ]
+    titles = {name: name for name in [*dict.fromkeys(row["model"] for row in rows), *names[1:]]}
+    line = "| {cell} ({received:.0%} received) | ... |"
+    return pivoted("| data, split, rows | ... |", line, "cell", "by", "{loss:.3f}", titles, best=min)(losses)

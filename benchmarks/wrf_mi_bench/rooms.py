@@ -25,7 +25,6 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.correction import write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.instruments import Instrument
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tasks import TASKS, instrument_of
 from wrf_mi.tracing import TraceResult
@@ -35,6 +34,7 @@ from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi_bench.random_room import CARRIER_HZ, DEFAULT, OPTIONS, Survey, random_room_record
 
 from .comparison import kept_work, line
+from .declared import lined, pivoted
 from .scene import match
 from .sources import fit_key, source_files
 
@@ -115,6 +115,18 @@ def main() -> dict[str, Any]:
     return {"rows": [*rows, {**median, "cea_db": medians}]}
 
 
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Smallest, median and largest accuracy over the rooms, and duration of the correction."""
+    measured = [row for row in rows if "correction" in row]
+    values = {name: [row["cea_db"][name] for row in measured] for name in measured[0]["cea_db"] if name != "true"}
+    cells = " | ".join(f"{{{name}:.1f}}" for name in values)
+    head = f"| mean CEA, dB | {' | '.join(values)} | duration of the correction |"
+    values["seconds"] = [row["correction"]["seconds"] for row in measured]
+    shown = ("smallest", np.min), ("median", np.median), ("largest", np.max)
+    statistics = [{"what": what, **{name: of(each) for name, each in values.items()}} for what, of in shown]
+    return lined(head, f"| {{what}} of {len(measured)} rooms | {cells} | {{seconds:.0f}} s |")(statistics)
+
+
 PHASE_SEEDS = range(101, 105)
 CARRIERS_HZ = 0.92e9, 2.4e9, 5.0e9
 PHASE_ERRORS_RAD = 0.0, 0.5, 0.75, 1.0, 1.25, 1.5, 2.5
@@ -171,8 +183,9 @@ def phase_errors() -> dict[str, Any]:
 
 def phase_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Markdown table of the mean SSIM by phase error; the best of each carrier is bold."""
-    lines = []
-    for row in rows:
-        cells = (f"**{ssim:.3f}**" if ssim == max(row["ssim"]) else f"{ssim:.3f}" for ssim in row["ssim"])
-        lines.append([row["what"], *cells])
-    return markdown_table(["phase error, rad", *(f"{rad:g}" for rad in PHASE_ERRORS_RAD)], lines)
+    pairs = [
+        {"what": row["what"], "rad": f"{rad:g}", "ssim": ssim}
+        for row in rows
+        for rad, ssim in zip(PHASE_ERRORS_RAD, row["ssim"], strict=True)
+    ]
+    return pivoted("| phase error, rad | ... |", "| {what} | ... |", "what", "rad", "{ssim:.3f}", best=max)(pairs)

@@ -2,12 +2,10 @@
 
 import gc
 import logging
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +25,7 @@ from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.fields import make_field
 from wrf_mi.training.predictor import Predictor
 
-from .comparison import line
+from .comparison import line, opened
 from .timing import Call, exponent, interleaved, larger_half, memory_mb, n_log_n
 from .workloads import HEIGHT, WIDTH, field, integrator, parameters, size_deg, splatting, tracer
 
@@ -111,10 +109,7 @@ def _bartlett(elements: int, height: int = HEIGHT, width: int = WIDTH) -> Call:
 def _opened(kind: str, triangles: int) -> Any:
     near = np.concatenate([transmitter_path(1), RECEIVER.position_m[None]])
     mesh = divided_room(triangles) if kind == "walls" else cluttered_room(triangles, near)
-    with tempfile.TemporaryDirectory() as work:
-        file = Path(work) / "room.ply"
-        mesh.export(file, vertex_normal=False)
-        return open_scene(file, FREQUENCY_HZ, material="concrete")
+    return opened(mesh, FREQUENCY_HZ, "concrete")
 
 
 def _trace(kind: str, triangles: int) -> Call:

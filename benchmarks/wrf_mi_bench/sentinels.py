@@ -24,11 +24,12 @@ from scipy.stats import binomtest, quantile_test
 
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically
-from wrf_mi.runs.sweep import dataset_files, markdown_table
+from wrf_mi.runs.sweep import dataset_files
 from wrf_mi.tasks import TASKS
 
 from .bench import FLAT, RFID, BenchFailed
 from .comparison import STORED, say
+from .declared import lined
 from .sources import fit_key, source_files
 from .stress_rows import stages
 from .table_plan import Row, available, plan
@@ -216,10 +217,8 @@ def _failure(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     return {"failed": f"{len(lost)} of {len(rows)} figures got worse or were not measured, first {first}"}
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    lines = []
-    for row in rows:
-        measured = "" if row["measured"] is None else f"{row['measured']:.4g}"
-        interval = f"{row['low']:.4g} to {row['high']:.4g}"
-        lines.append([row["what"], f"{row['stored']:.4g}", interval, measured, row["verdict"]])
-    return markdown_table(["figure", "stored", "equal within", "measured", "verdict"], lines)
+table = lined(
+    "| figure | stored | equal within | measured | verdict |",
+    "| {what} | {stored:.4g} | {low:.4g} to {high:.4g} | {shown} | {verdict} |",
+    lambda row: {**row, "shown": "" if row["measured"] is None else f"{row['measured']:.4g}"},
+)

@@ -3,10 +3,6 @@
 Each cell is a run of the hybrid and one of each part on the same rows. Scores are compared row by row; a part is
 *clearly better* where the 95 % bootstrap interval of the mean difference lies above zero. Each cell is stored when it
 is measured (`wrf_mi_bench.comparison.stored_part`).
-
-The benchmark of intervals counts test values inside the 90 % intervals of three models. Standard deviations are those
-of errors on training rows that are held out in space: the hybrid has its own, other models are fitted once more, as
-``wrf-mi train --intervals`` does.
 """
 
 import shutil
@@ -25,16 +21,15 @@ from wrf_mi.datasets import make_splits
 from wrf_mi.runs.api import resume, train
 from wrf_mi.runs.folder import CONFIG, is_finished
 from wrf_mi.runs.results import Results, read_run
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.stages.correct import correct_scene
 from wrf_mi.synthetic import load_record
-from wrf_mi.synthetic.furnished_room import NAME as ROOM
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import bootstrap
 from wrf_mi_bench.random_room import random_room_record
 
 from .bench import FLAT, RFID
 from .comparison import data_folder, line, measured_on, say, stored_part
+from .declared import lined
 from .sources import fit_key, source_files
 from .tables import scene_of_data
 
@@ -101,13 +96,6 @@ class Cell:
 
 
 CELLS = tuple(Cell(*key, count) for key, counts in ROWS.items() for count in counts)
-INTERVAL_CELLS = tuple(
-    Cell(dataset, split, n_train)
-    for dataset, n_train in {RFID: None, LAB: None, ROOM: 400, FLAT: 400, CHANNELS: None}.items()
-    for split in ("official", "blocked")
-)
-INTERVAL_MODELS = ("kriging", JOINT, HYBRID)
-"""Models; Gaussians are trained jointly with the paths of the scene where there is one."""
 
 
 def data_of(cell: Cell, folder: Path) -> tuple[str | Record, str | None]:
@@ -152,14 +140,11 @@ def run_of_cell(cell: Cell, data: str | Record, place: Path, model: str, **more:
     return read_run(place)
 
 
-def run_alone(
-    cell: Cell, data: str | Record, folder: Path, name: str, scene: str | None, intervals: bool = False
-) -> Results:
-    """Run of a part by itself, as `run_of_cell`, with intervals of its own or without."""
+def run_alone(cell: Cell, data: str | Record, folder: Path, name: str, scene: str | None) -> Results:
+    """Run of a part by itself, as `run_of_cell`."""
     part = ALONE[name]
-    place = folder / (f"{name}-intervals" if intervals else name).replace(", ", "-")
     more: dict[str, Any] = {"scene": scene if part.scene else None, "settings": part.settings}
-    return run_of_cell(cell, data, place, part.model, intervals=intervals, **more)
+    return run_of_cell(cell, data, folder / name.replace(", ", "-"), part.model, **more)
 
 
 def run_in_corrected(cell: Cell, data: str | Record, scene: str, folder: Path) -> Results:
@@ -242,45 +227,22 @@ def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return counts
 
 
-def measured_intervals(cell: Cell, name: str, folder: Path) -> dict[str, Any]:
-    """Score, share inside the 90 % intervals, CRPS and time of training of a model, as they are stored."""
-    data, scene = data_of(cell, folder)
-    if name == HYBRID:
-        run = run_of_cell(cell, data, folder / HYBRID, HYBRID, scene=scene)
-    else:
-        run = run_alone(cell, data, folder, name, scene, intervals=True)
-    block, keys = TASKS[run.task].block, ("inside_90", "crps", "train_seconds")
-    return {"block": block, "score": run.metrics[block], **{key: run.metrics[key] for key in keys}}
+SAME = 1e-6  # difference of mean scores below which two models predict the same
 
 
-def intervals() -> dict[str, Any]:
-    """Measure all runs that are not stored; `InputError` where data are not on this machine.
-
-    ``inside`` is the number of runs whose intervals cover 85 to 95 %, of ``runs``; ``failed`` states where some do not.
-    """
-    place, rows, parts = _place(), list[dict[str, Any]](), list[dict[str, Any]]()
-    for cell in INTERVAL_CELLS:
-        for name in INTERVAL_MODELS:
-            say("intervals", f"{cell.title}: {name}")
-            work = partial(measured_intervals, cell, name, place / cell.name)
-            part = stored_part("intervals", f"{cell.name}-{name}", work)
-            parts.append(part)
-            value = f"{part['inside_90']:.1%} inside, CRPS {part['crps']:.3g}"
-            known = {key: part[key] for key in ("inside_90", "crps", "score")}
-            row = line(f"{cell.title}: {name}", value, "85 to 95 % inside")
-            rows.append({**row, **known, "cell": cell.title, "model": name})
-            say("intervals", f"{row['what']}: {value}")
-    inside = sum(INSIDE[0] <= row["inside_90"] <= INSIDE[1] for row in rows)
-    result = {"rows": rows, "measured": measured_on(parts), "inside": inside, "runs": len(rows)}
-    if inside < len(rows):
-        result["failed"] = f"intervals cover 85 to 95 % in {inside} of {len(rows)} runs"
-    return result
+def _with_best_part(row: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    best = min(parts, key=lambda part: part["gain"])
+    inside = "" if row["inside_90"] is None else f"{row['inside_90']:.0%}"
+    kept = ", ".join(stage["stage"] for stage in row["stages"] if stage["kept"])
+    return {"title": row["what"].rpartition(":")[0], "row": row, "best": best, "inside": inside, "kept": kept}
 
 
-def interval_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table, a line for each data set and split: share inside and CRPS of each model."""
-    lines = []
-    for cell in dict.fromkeys(row["cell"] for row in rows):
-        known = {row["model"]: f"{row['inside_90']:.0%}, {row['crps']:.3g}" for row in rows if row["cell"] == cell}
-        lines.append([cell, *(known.get(name, "") for name in INTERVAL_MODELS)])
-    return markdown_table(["data", *INTERVAL_MODELS], lines)
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The hybrid, its kept stages and its best part by mean score; without rows on which both predict the same."""
+    cells = [[row for row in rows if row["cell"] == cell] for cell in dict.fromkeys(row["cell"] for row in rows)]
+    return lined(
+        "| data | hybrid | inside | kept stages | best part alone | gain over it |",
+        "| {title} | **{row[score][median]:.3g}** | {inside} | {kept} | {best[model]} {best[score][median]:.3g} "
+        "| {best[gain]:.2g} ({best[gain_low]:.2g} to {best[gain_high]:.2g}) |",
+        lambda shown: shown if abs(shown["best"]["gain"]) >= SAME else None,
+    )([_with_best_part(hybrid, parts) for hybrid, *parts in cells])

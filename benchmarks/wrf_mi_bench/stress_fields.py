@@ -1,30 +1,31 @@
-"""Random and ill-conditioned fields of Gaussians, their images and derivatives in float32 and float64, and rows of
-comparisons.
+"""Random and ill-conditioned fields of Gaussians, their images in float64, and derivatives in float32 and float64.
 
 All parameters are exactly representable in float32, so that differences come from the arithmetic alone.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from wrf_mi.backend import init
 from wrf_mi.backend.device import on_device as to_device
 from wrf_mi.backend.vectors import Pose
-from wrf_mi.core import Receiver, pixel_directions, unit_vectors
+from wrf_mi.core import Receiver, pixel_directions, rotation_matrix, unit_vectors
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.gaussians import Gaussians
-from wrf_mi.gaussians.blend import splat
-from wrf_mi.gaussians.footprint import CUTOFF, MIN_COSINE
-from wrf_mi.gaussians.tiles import perception_plane
-from wrf_mi.training.step import device_pose
+from wrf_mi.gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE
 
 from . import field_oracle
-from .stress_rows import DOUBLE, IMAGE, GradientWorst, Row, Worst, relative
+
+init()
+
+import drjit as dr  # noqa: E402
+import mitsuba as mi  # noqa: E402
+
+DOUBLE: Any = dr.float64_array_t(mi.Float)
 
 ComplexArray = NDArray[np.complex128]
 Size = tuple[int, int]
@@ -140,55 +141,53 @@ def layers(rng: Rng, count: int = 50_000, **replaced: Any) -> StressField:
     return made(count, rng, position_m=position_m, scale_m=np.tile(0.1 * distance[:, None], 3), **replaced)
 
 
-def image(field: StressField, blending: str, size: Size) -> ComplexArray:
-    """Image [height, width] splatted in float32."""
-    plane = perception_plane(*size, mi.Float)
-    re, im = splat(on_device(field, blending, mi.Float)[0], device_pose(RECEIVER), plane)
-    return (re.numpy().astype(float) + 1j * im.numpy()).reshape(size)
-
-
-def off_edges(squared: FloatArray, cosine: FloatArray) -> NDArray[np.bool_]:
-    """Mask of directions off the edge of a footprint, where float32 may fall on the other side of the jump."""
-    inside = (np.abs(np.sqrt(squared) - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
-    return np.asarray(inside & (np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE))
-
-
-def reference(
-    field: StressField, blending: str, size: Size, sphere: bool = False
+def truth(
+    field: StressField, blending: str, size: Size, on_rays: bool = False, sphere: bool = False
 ) -> tuple[ComplexArray, NDArray[np.bool_]]:
-    """Image [height, width] by `field_oracle` in float64, and a mask of pixels off all footprints' edges.
+    """Image [height, width] in float64, and a mask of pixels off all footprints' edges, where the image jumps.
 
-    With ``sphere`` the lower hemisphere is appended: [2 * height, width].
+    Splatting takes a Gaussian's response in the tangent plane (`field_oracle`), the Mitsuba plugin the largest one on a
+    ray (``on_rays``); both agree in the limit of small angles. With ``sphere`` the lower hemisphere is appended:
+    [2 * height, width].
     """
     directions = pixel_directions(*size)
     if sphere:
         directions = np.concatenate([directions, directions * [1, -1, -1]])
-    parts = (field.position_m, field.scale_m, field.rotation)
-    last = {"opacity": field.opacity} if blending == "alpha" else {"attenuation": field.attenuation}
-    projection = field_oracle.project(*parts, RECEIVER)
-    clear = np.ones(directions.shape[:2], bool)
-    for i in projection.order:
-        clear &= off_edges(*field_oracle.reach(projection, i, directions))
-    return field_oracle.render(*parts, field.signal, RECEIVER, directions, **last), clear
+    view = field_oracle.project(field.position_m, field.scale_m, field.rotation, RECEIVER)
+    responses, clear = np.zeros((len(view.order), *directions.shape[:2])), np.ones(directions.shape[:2], bool)
+    for response, i in zip(responses, view.order, strict=True):
+        reach = _on_rays(field, i, directions) if on_rays else field_oracle.reach(view, i, directions)
+        squared, cosine = reach
+        response[:] = np.where((squared < CUTOFF**2) & (cosine > MIN_COSINE), np.exp(-squared / 2), 0)
+        off = (np.abs(np.sqrt(squared) - CUTOFF) > ON_THE_EDGE * CUTOFF) | (cosine < MIN_COSINE / 2)
+        clear &= off & (np.abs(cosine - MIN_COSINE) > ON_THE_EDGE * MIN_COSINE)
+    signal = field.signal[view.order]
+    if blending == "alpha":
+        return field_oracle.blend_alpha(responses, signal, field.opacity[view.order]), clear
+    return field_oracle.blend_product(responses, signal, field.attenuation[view.order]), clear
+
+
+def _on_rays(field: StressField, index: int, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least squared Mahalanobis distance of a Gaussian on each ray, and cosines to its direction."""
+    offset = field.position_m[index] - RECEIVER.position_m
+    depth = np.linalg.norm(offset)
+    rays = directions @ RECEIVER.to_world.T
+    scale = np.sqrt(field.scale_m[index] ** 2 + (LOW_PASS_RAD * depth) ** 2)
+    whiten = rotation_matrix(field.rotation[index]).T / scale[:, None]
+    centre, along = whiten @ offset, rays @ whiten.T
+    t = np.maximum((along @ centre) / (along**2).sum(-1), 0)
+    return ((t[..., None] * along - centre) ** 2).sum(-1), rays @ (offset / depth)
 
 
 Report = Callable[[Gaussians, Pose], Sequence[Any]]  # differentiable real arrays computed from a field
-Slope = Callable[["StressField", str, int], dict[str, FloatArray]]
-"""Derivatives by group of parameters for a field, a blending and a seed."""
 
 
-def gradient(
-    field: StressField, blending: str, float_type: Any, seed: int, report: Report | None = None
-) -> dict[str, FloatArray]:
-    """Derivative [n, k] of a random linear functional of a report by each group of parameters.
-
-    The default report is the real and imaginary part of the image.
-    """
+def gradient(field: StressField, blending: str, float_type: Any, seed: int, report: Report) -> dict[str, FloatArray]:
+    """Derivative [n, k] of a random linear functional of a report by each group of parameters."""
     gaussians, parts = on_device(field, blending, float_type)
     for array in (a for part in parts.values() for a in part):
         dr.enable_grad(array)
-    of = report or (lambda gaussians, pose: splat(gaussians, pose, perception_plane(*SIZE, float_type)))
-    reported = of(gaussians, pose(float_type))
+    reported = report(gaussians, pose(float_type))
     rng = np.random.default_rng(seed)
     weights = [rng.normal(size=dr.width(part)).astype(np.float32) for part in reported]
     total: Any = 0
@@ -228,44 +227,3 @@ def cases(families: Mapping[str, Family], count: int) -> Iterator[tuple[str, Str
             field = family(np.random.default_rng(seed))
             for blending in BLENDINGS:
                 yield name, field, blending, seed
-
-
-def image_row(
-    what: str,
-    families: Mapping[str, Family],
-    count: int,
-    size: Size = SIZE,
-    render: Callable[[StressField, str, Size], ComplexArray] = image,
-    truth: Callable[[StressField, str, Size], tuple[ComplexArray, NDArray[np.bool_]]] = reference,
-) -> Row:
-    """Row of float32 images of ``count`` fields of each family, compared with float64 off the footprints' edges."""
-    worst, edge, pixels, number = Worst(), 0, 0, 0
-    for name, field, blending, _ in cases(families, count):
-        expected, clear = truth(field, blending, size)
-        rendered = render(field, blending, size)
-        error = relative((rendered - expected)[clear], expected) if np.isfinite(rendered).all() else np.nan
-        worst.add(error, name)
-        number, edge, pixels = number + 1, edge + int((~clear).sum()), pixels + clear.size
-    more = f"; {edge / pixels:.1%} of the pixels lie on an edge and are left out"
-    return worst.row(f"{what}, {number} cases", IMAGE, more)
-
-
-def gradient_row(
-    what: str,
-    tried: Iterable[tuple[str, StressField, str, int]],
-    report: Report | None = None,
-    single: Slope | None = None,
-    least: int = 1,
-) -> Row:
-    """Row of derivatives in float32, by ``single`` or else `gradient`, compared with float64.
-
-    Arrays of ``report`` are differentiated, see `gradient`; cases with fewer than ``least`` Gaussians are skipped.
-    """
-    worst, number = GradientWorst(), 0
-    for name, field, blending, seed in tried:
-        if len(field.signal) >= least:
-            slopes = single(field, blending, seed) if single else gradient(field, blending, mi.Float, seed, report)
-            double = gradient(field, blending, DOUBLE, seed, report)
-            worst.add(slopes, double, felt_values(field, blending), name)
-            number += 1
-    return worst.row(f"{what}, {number} cases")

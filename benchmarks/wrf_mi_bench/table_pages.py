@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically, write_figure
 from wrf_mi.runs.figures import score_cdf
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.tasks import TASKS
 
 from .comparison import Row, line
+from .declared import lined, pivoted
 from .table_plan import MADE_HERE, PARTS, SHARES, TablePart, plan
 
 
@@ -107,46 +107,39 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
 
     With several seeds a median is their mean. Best mean rank first. "" where nothing is stored.
     """
-    columns, former = _medians(name, stored, quick)
-    if not columns:
-        return ""
-    task = TASKS[next(iter(columns)).task]
-    sign = -1 if task.higher_is_better else 1
-    ranks: dict[str, list[float]] = {}
-    for medians in columns.values():
-        for rank, method in enumerate(sorted(medians, key=lambda method: sign * medians[method])):
-            ranks.setdefault(method, []).append(rank / max(len(medians) - 1, 1))
-    entries = {method: [part.entries[method] for part in columns if method in part.entries] for method in ranks}
-    lines = []
-    best = {part: min(medians.values(), key=lambda median: sign * median) for part, medians in columns.items()}
-    for method in sorted(ranks, key=lambda method: float(np.mean(ranks[method]))):
-        cells = []
-        for part, medians in columns.items():
-            cell = f"{medians[method]:.{task.digits}f}" if method in medians else ""
-            cell = f"**{cell}**" if cell and medians[method] == best[part] else cell
-            cells.append(f"{cell} {FORMER}" if (part, method) in former else cell)
-        # Where labels differ between columns, as the inputs do, the plain name is shown.
-        labels = {entry.label for entry in entries[method]}
-        label = labels.pop() if len(labels) == 1 else entries[method][0].label.split(",")[0]
-        lines.append([label, *cells, entries[method][0].published])
-    return markdown_table([task.label, *(title_of(part) for part in columns), "paper, other data"], lines)
-
-
-def _medians(
-    name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool
-) -> tuple[dict[TablePart, dict[str, float]], set[tuple[TablePart, str]]]:
-    """Medians of each method by part of an overview, and those measured on former data."""
-    columns: dict[TablePart, dict[str, float]] = {}
-    former = set[tuple[TablePart, str]]()
+    rows, ranks, labels = list[dict[str, Any]](), dict[str, list[float]](), dict[str, list[str]]()
     for part in PARTS:
         groups = grouped(part, stored, quick) if part.table == name else {}
-        newest = newest_data(groups) if groups else None
-        for (share, method), rows in groups.items():
-            if quick or share == SHARES[0]:
-                columns.setdefault(part, {})[method] = float(np.mean([row["score"]["median"] for row in rows]))
-                if is_former(part, rows, newest):
-                    former.add((part, method))
-    return columns, former
+        task, newest = TASKS[part.task], newest_data(groups) if groups else None
+        of_part: list[dict[str, Any]] = [
+            {"median": _mean(of_method, "median"), "method": method, "former": is_former(part, of_method, newest)}
+            for (share, method), of_method in groups.items()
+            if quick or share == SHARES[0]
+        ]
+        of_part.sort(key=lambda row: row["median"], reverse=task.higher_is_better)
+        for rank, row in enumerate(of_part):
+            ranks.setdefault(row["method"], []).append(rank / max(len(of_part) - 1, 1))
+            text = f"{row['median']:.{task.digits}f}"
+            text = f"**{text}**" if row["median"] == of_part[0]["median"] else text
+            entry = part.entries[row["method"]]
+            labels.setdefault(row["method"], []).append(entry.label)
+            row |= {"title": title_of(part), "text": f"{text} {FORMER}" if row["former"] else text}
+            rows.append({**row, "task": task, "published": entry.published})
+    if not rows:
+        return ""
+    titles = {row["title"]: row["title"] for row in rows}
+    rows.sort(key=lambda row: float(np.mean(ranks[row["method"]])))
+    for row in rows:
+        # Where labels differ between columns, as the inputs do, the plain name is shown.
+        first, *others = labels[row["method"]]
+        row["label"] = first if {first} >= {*others} else first.split(",")[0]
+    head, line = "| {task.label} | ... | paper, other data |", "| {label} | ... | {published} |"
+    return pivoted(head, line, "method", "title", "{text}", titles)(rows)
+
+
+def _mean(rows: Sequence[Mapping[str, Any]], key: str) -> float:
+    """Mean of a score over rows."""
+    return float(np.mean([row["score"][key] for row in rows]))
 
 
 def title_of(part: TablePart) -> str:
@@ -155,42 +148,35 @@ def title_of(part: TablePart) -> str:
 
 
 def part_table(part: TablePart, groups: Groups) -> str:
-    """Markdown table of a data set and split: best median first, fewer rows below."""
+    """Markdown table of a data set and split: best median first, fewer rows below, references last."""
     task = TASKS[part.task]
-    sign = -1 if task.higher_is_better else 1
-
-    def median(key: tuple[float, str]) -> float:
-        return float(np.mean([row["score"]["median"] for row in groups[key]]))
-
-    head = ("rows", "method", f"median {task.label}", "mean", "p10", "p90", "training", "a sample", "memory")
-    lines = []
+    sign, rows = -1 if task.higher_is_better else 1, list[dict[str, Any]]()
     digits, newest, most = task.digits, newest_data(groups), max(share for share, _ in groups)
-    for share, method in sorted(groups, key=lambda key: (-key[0], sign * median(key))):
-        rows = groups[share, method]
-        each = {key: float(np.mean([row["score"][key] for row in rows])) for key in ("median", "mean", "p10", "p90")}
-        medians = [row["score"]["median"] for row in rows]
-        spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(rows) > 1 else ""
-        label = part.entries[method].label + (f" {FORMER}" if is_former(part, rows, newest) else "")
-        cells = [str(rows[0]["n_train"]), label, f"**{each['median']:.{digits}f}**{spread}"]
-        cells += [f"{each[key]:.{digits}f}" for key in ("mean", "p10", "p90")]
-        cells.append(f"{np.median([row['train_seconds'] for row in rows]):.0f} s")
-        cells.append(f"{np.median([row['ms_per_sample'] for row in rows]):.2g} ms")
-        cells.append(f"{max(row['peak_memory_mb'] for row in rows):.0f} MB")
-        lines.append([*cells, part.entries[method].published if share == most else ""])
-    return markdown_table([*head, "paper, other data"], [*lines, *_reference_rows(part, groups)])
-
-
-def _reference_rows(part: TablePart, groups: Groups) -> list[list[str]]:
-    """Lines of the references that every run states, where the part has no row of interpolation."""
-    if "idw" in part.entries:
-        return []
-    digits, share = 2, max(share for share, _ in groups)
-    row = next(rows[0] for (rows_share, _), rows in groups.items() if rows_share == share)
-    words, lines = TASKS[part.task].references, []
-    for key, block in row["reference"].items():
-        scores = (f"{block[name]:.{digits}f}" for name in ("mean", "p10", "p90"))
-        lines.append([str(row["n_train"]), words[key], f"**{block['median']:.{digits}f}**", *scores, *[""] * 4])
-    return lines
+    for share, method in sorted(groups, key=lambda key: (-key[0], sign * _mean(groups[key], "median"))):
+        of_method, entry = groups[share, method], part.entries[method]
+        medians = [row["score"]["median"] for row in of_method]
+        spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(medians) > 1 else ""
+        figures: dict[str, Any] = {key: _mean(of_method, key) for key in ("median", "mean", "p10", "p90")}
+        figures |= {"label": entry.label + (f" {FORMER}" if is_former(part, of_method, newest) else "")}
+        figures |= {"training": f"{np.median([row['train_seconds'] for row in of_method]):.0f} s"}
+        figures |= {"sample": f"{np.median([row['ms_per_sample'] for row in of_method]):.2g} ms"}
+        figures |= {"memory": f"{max(row['peak_memory_mb'] for row in of_method):.0f} MB"}
+        figures |= {"spread": spread, "published": entry.published if share == most else "", "digits": digits}
+        rows.append({"n_train": of_method[0]["n_train"], **figures})
+    if "idw" not in part.entries:  # references that every run states, where interpolation has no row
+        first = next(of_method[0] for (share, _), of_method in groups.items() if share == most)
+        empty = dict.fromkeys(("spread", "training", "sample", "memory", "published"), "")
+        for key, block in first["reference"].items():
+            label = {"n_train": first["n_train"], "label": task.references[key], "digits": 2}
+            rows.append({**block, **label, **empty})
+    head = (
+        f"| rows | method | median {task.label} | mean | p10 | p90 | training | a sample | memory | paper, other data |"
+    )
+    line = (
+        "| {n_train} | {label} | **{median:.{digits}f}**{spread} | {mean:.{digits}f} | {p10:.{digits}f} "
+        "| {p90:.{digits}f} | {training} | {sample} | {memory} | {published} |"
+    )
+    return lined(head, line)(rows)
 
 
 STORED, PICTURE = Path("benchmarks/results/tables"), Path("docs/images/pareto.png")
@@ -210,7 +196,7 @@ def points_of(part: TablePart, stored: Mapping[str, Mapping[str, Any]]) -> Point
     """Mean over seeds of the median score, and median costs, of each method of a part with all training rows."""
     groups = grouped(part, stored)
     return {
-        method: {"score": float(np.mean([row["score"]["median"] for row in rows]))}
+        method: {"score": _mean(rows, "median")}
         | {cost: float(np.median([row[cost] for row in rows])) for cost in COSTS}
         for (share, method), rows in groups.items()
         if share == SHARES[0]
@@ -242,11 +228,12 @@ def fronts(by_part: Mapping[TablePart, Points]) -> list[Row]:
     return rows
 
 
-def front_table(rows: Sequence[Row]) -> str:
-    """Markdown table of the fronts of `fronts` in the time of a prediction."""
-    title, _ = COSTS["ms_per_sample"]
-    lines = [[row["what"].removesuffix(f", {title}"), row["value"]] for row in rows if row["what"].endswith(title)]
-    return markdown_table(["data, score", f"Pareto-optimal methods: score ({title})"], lines)
+front_table = lined(
+    f"| data, score | Pareto-optimal methods: score ({COSTS['ms_per_sample'][0]}) |",
+    "| {part} | {value} |",
+    lambda row: {**row, "part": row["what"].rpartition(", ")[0]} if row["what"].endswith("sample") else None,
+)
+"""Fronts of `fronts` in the time of a prediction."""
 
 
 def pareto_figure(by_part: Mapping[TablePart, Points]) -> Figure:

@@ -136,23 +136,6 @@ def worst(differences: Sequence[Mapping[str, float]]) -> dict[str, float]:
     }
 
 
-def by_size(sizes_deg: tuple[float, ...] = (1, 2, 3, 5, 10, 15, 20), fields: int = 3) -> list[dict[str, float]]:
-    """Mean `difference` by angular size, for round Gaussians and for axes of 2 : 1.
-
-    Projection neglects the tilt against the line of sight, of first order in the size and zero for round Gaussians, and
-    the extent in depth, of second order (`wrf_mi_plugins.ray_response`).
-    """
-    rows = []
-    for size in sizes_deg:
-        for axes in (1.0, 2.0):
-            # The overlap is that of 300 Gaussians of 2 degrees, except at the largest sizes.
-            count = max(30, int(300 * (2 / size) ** 2))
-            differences = against_splatted(fields, size_deg=size, ratio=axes, count=min(count, 1000))
-            means = {name: float(np.mean([f[name] for f in differences])) for name in differences[0]}
-            rows.append({"size_deg": float(size), "ratio": axes} | means)
-    return rows
-
-
 @contextmanager
 def rgb_variant() -> Iterator[None]:
     """Context in Mitsuba's rgb variant of the present backend.
@@ -290,7 +273,6 @@ def main() -> dict[str, Any]:
     small = against_splatted()
     figures: dict[str, Any] = {
         "small": {"fields": len(small), **worst(small)},
-        "by_size": by_size(),
         "pace": [pace(size) for size in (1.0, 2.0, 7.0)],
     }
     least, most = figures["small"]["lowest_ssim"], 100 * figures["small"]["largest_complex_error"]

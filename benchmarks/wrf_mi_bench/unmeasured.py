@@ -20,7 +20,6 @@ from wrf_mi.correction import CorrectionOptions, default_options, write_page
 from wrf_mi.datasets import make_splits
 from wrf_mi.runs.api import train
 from wrf_mi.runs.results import Observations, Results, read_run
-from wrf_mi.runs.sweep import markdown_table
 from wrf_mi.stages.correct import correct_scene
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_receivers import NAME as FLOOR
@@ -30,6 +29,7 @@ from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
 from .comparison import MEASURED, data_folder, line, measured_on, stored_part
+from .declared import pivoted
 from .sources import fit_key, source_files
 from .stages import TRANSMISSION
 from .table_plan import SEEDS
@@ -183,30 +183,14 @@ def _rows(what: str, measurements: Sequence[Mapping[str, Any]]) -> list[dict[str
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown table: median (mean) score of each method, and the hybrid's mean gain with its 95 % interval.
-
-    Methods have a column each, or share one where they are not the same throughout.
-    """
-    places = dict.fromkeys(row["at"] for row in rows)
-    by_place = [[row for row in rows if row["at"] == at] for at in places]
-    methods = [row["method"] for row in by_place[0]][1:]
-    shared = any([row["method"] for row in of_place][1:] != methods for of_place in by_place)
-    columns = ["held out", HYBRID, "inside", *(["others"] if shared else methods)]
-    lines = []
-    for at, (hybrid, *others) in zip(places, by_place, strict=True):
-        cells = [f"{row['method']} {_with_gain(row)}" if shared else _with_gain(row) for row in others]
-        first = [at, f"**{_score(hybrid)}**", f"{hybrid['inside']:.0%}"]
-        lines.append([*first, *(["; ".join(cells)] if shared else cells)])
-    return markdown_table(columns, lines)
-
-
-def _score(row: Mapping[str, Any]) -> str:
-    return f"{row['median']:.{row['digits']}f} ({row['mean']:.{row['digits']}f})"
-
-
-def _with_gain(row: Mapping[str, Any]) -> str:
-    value, low, high = (f"{part:.{row['digits']}f}" for part in row["gain"])
-    return f"{_score(row)} [{value}: {low} to {high}]"
+    """Markdown table: median (mean) score of each method, and the hybrid's mean gain with its 95 % interval."""
+    shown = []
+    for row in rows:
+        score = f"{row['median']:.{row['digits']}f} ({row['mean']:.{row['digits']}f})"
+        if row["gain"]:
+            score += " [{}: {} to {}]".format(*(f"{part:.{row['digits']}f}" for part in row["gain"]))
+        shown.append({**row, "score": score})
+    return pivoted("| held out | inside | ... |", "| {at} | {inside:.0%} | ... |", "at", "method", "{score}")(shown)
 
 
 def carriers() -> dict[str, Any]:

@@ -5,10 +5,6 @@ is fast and worse is not fast. Rows are kept by the content of the packages' fil
 """
 
 import json
-import subprocess
-import sys
-import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -29,8 +25,9 @@ from wrf_mi.tasks import TASKS, instrument_of
 from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.tracer import RayTracer
 
-from .bench import FLAT, RFID, BenchFailed
-from .comparison import Row, data_folder, kept_work, line
+from .bench import FLAT, RFID
+from .comparison import Row, command, data_folder, kept_work, line
+from .declared import lined
 from .sources import fit_key, source_files
 from .workloads import record
 
@@ -42,20 +39,6 @@ MAP_POSITIONS = 100_000
 SIDE_STEPS = 2000  # steps of a fit beside another one, half a minute
 Figures = dict[str, Any]
 Measure = Callable[[Path], Figures]
-
-
-def command(*arguments: str | Path, beside: Sequence[Sequence[str | Path]] = ()) -> float:
-    """Seconds of a command, with others that start at the same time; `BenchFailed` unless all end well."""
-    calls = [[sys.executable, "-m", "wrf_mi.apps.commands", *map(str, each)] for each in (arguments, *beside)]
-    start = time.perf_counter()
-    with tempfile.TemporaryFile("w+") as errors:
-        started = [subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=errors) for call in calls]
-        status = [process.wait() for process in started]
-        seconds = time.perf_counter() - start
-        errors.seek(0)
-        if any(status):
-            raise BenchFailed(f"bench waits: `{' '.join(calls[0][2:])}`: {errors.read().strip().splitlines()[-1:]}")
-    return seconds
 
 
 def scored(folder: Path, task: str = "spectrum") -> Figures:
@@ -82,10 +65,10 @@ def _scan_scene(name: str, folder: Path) -> Path:
     return folder / "scene"
 
 
-def joint(folder: Path) -> Figures:
+def joint(name: str, folder: Path) -> Figures:
     """Paths and Gaussians on the spectra of a room with its scan."""
-    scene, run = _scan_scene("laboratory", folder), folder / "joint"
-    seconds = command("train", "laboratory", "--model", "wrf-gs+", "--scene", scene, "--out", run)
+    scene, run = _scan_scene(name, folder), folder / "joint"
+    seconds = command("train", name, "--model", "wrf-gs+", "--scene", scene, "--out", run)
     return {"seconds": seconds, **scored(run)}
 
 
@@ -113,13 +96,6 @@ def correction(folder: Path) -> Figures:
     seconds = command("correct", "traced-room", "--scene", scene, "--n-train", "400", "--out", folder / "corrected")
     page = json.loads((folder / "corrected" / "correction.json").read_text())
     return {"seconds": seconds, "kept": page["kept"]}
-
-
-def memory(folder: Path) -> Figures:
-    """Paths and Gaussians on 1,600 spectra."""
-    scene, run = _scan_scene("traced-room", folder), folder / "joint"
-    seconds = command("train", "traced-room", "--model", "wrf-gs+", "--scene", scene, "--out", run)
-    return {"seconds": seconds, **scored(run)}
 
 
 def strength_map(folder: Path) -> Figures:
@@ -185,13 +161,13 @@ def main() -> dict[str, Any]:
         _field_row(preset, asked, of(f"field-{preset}", partial(field, preset)))
         for preset, asked in (("fast", "45 s to 0.965"), ("default", "90 s to 0.970"))
     ]
-    fit = of("joint", joint)
+    fit = of("joint", partial(joint, "laboratory"))
     rows.append(line("joint fit, 160 spectra of a scan", f"{fit['train_seconds']:.0f} s to {fit['score']:.4f}", "60 s"))
     rows.append(line("single joint prediction in a scan", f"{fit['ms_per_sample']:.1f} ms", "7 ms"))
     ms = of("cad", cad)["ms_per_sample"]
     rows.append(line(f"single joint prediction, {CAD_TRIANGLES:,} triangles", f"{ms:.1f} ms", "50 ms"))
     rows.append(line("correct, 400 spectra", f"{of('correction', correction)['seconds']:.0f} s", "100 s"))
-    fit = of("memory", memory)
+    fit = of("memory", partial(joint, "traced-room"))
     text = f"{fit['peak_memory_mb'] / 1000:.1f} GB, {fit['seconds']:.0f} s to {fit['score']:.4f}"
     rows.append(line("joint fit, 1,600 spectra: memory", text, "2.5 GB"))
     text = f"{of('map', strength_map)['seconds']:.0f} s"
@@ -204,3 +180,7 @@ def main() -> dict[str, Any]:
     text = f"{of('demo', demo)['seconds']:.0f} s"
     rows.append(line("demo, without set-up", text, "150 s"))
     return {"rows": rows}
+
+
+table = lined("| what | measured | bound |", "| {what} | {value} | {asked} |")
+"""Measured durations and their bounds."""

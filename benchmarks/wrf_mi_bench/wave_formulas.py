@@ -1,6 +1,6 @@
 """Closed forms of wave propagation in float64, for the time factor exp(+j omega t).
 
-Coefficients of a slab are in `wrf_mi_bench.stress_oracle.slab`. Fields of diffraction are those of a point source in
+Fields of diffraction are those of a point source in
 the plane across the edge, soft (electric field along the edge, zero on a conductor) and hard (across it), relative to
 exp(-j k) at a distance of 1 m from the source.
 """
@@ -21,6 +21,25 @@ def free_space(distance_m: ArrayLike, frequency_hz: float) -> ComplexArray:
     """Channel of isotropic antennas [...]: Friis' lambda / (4 pi d) with the phase exp(-j k d)."""
     wavelength, distance = speed_of_light / frequency_hz, np.asarray(distance_m, float)
     return np.asarray(wavelength / (4 * np.pi * distance) * np.exp(-2j * np.pi * distance / wavelength))
+
+
+def slab(
+    cosine: FloatArray, eta: ArrayLike, thickness_m: ArrayLike, frequency_hz: float
+) -> tuple[tuple[ComplexArray, ComplexArray], tuple[ComplexArray, ComplexArray]]:
+    """Reflected and transmitted share [p] of TE, then of TM waves: an Airy sum over both interfaces of a slab in air.
+
+    ``eta`` is the complex relative permittivity. Source: Born and Wolf, "Principles of Optics" (1999), section 1.6.4;
+    the sign of TM is that of ITU-R P.2040.
+    """
+    inside = np.sqrt(np.asarray(eta) - 1 + cosine**2)
+    phase = np.exp(-2j * np.pi * frequency_hz / speed_of_light * np.asarray(thickness_m) * inside)
+    result = []
+    for first, second in ((cosine, inside), (cosine, inside / np.asarray(eta))):
+        into, out = 2 * first / (first + second), 2 * second / (first + second)
+        back = (first - second) / (first + second)
+        series = 1 / (1 - (back * phase) ** 2)
+        result.append((back - into * out * back * phase**2 * series, into * out * phase * series))
+    return result[0], result[1]
 
 
 def transition(x: FloatArray) -> ComplexArray:

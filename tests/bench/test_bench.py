@@ -12,7 +12,7 @@ from wrf_mi_bench import scene as bench_scene
 from wrf_mi_bench import sources
 from wrf_mi_bench.bench import CASES, CHECKS, BenchFailed, bench, case_folder, check_table, read_results
 from wrf_mi_bench.check import main
-from wrf_mi_bench.stress_rows import FITS, STAGES, stages
+from wrf_mi_bench.stress_rows import stages
 from wrf_mi_bench.table_pages import IN_RESULTS
 
 from wrf_mi.core import InputError
@@ -26,7 +26,7 @@ NEEDS_NO_DATA = {
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
     **dict.fromkeys(("operator", "waits"), "speed.md"),
-    **dict.fromkeys(("stages", "intervals"), "hybrid.md"),
+    "stages": "hybrid.md",
     **{"rooms": "correction.md", "locate": "locate.md", "moved": "scenes.md"},
     **dict.fromkeys(("fdtd", "far-scans"), "correction.md"),
     **{"reception": "maps.md", "plan": "maps.md", "closed-forms": "numerics.md"},
@@ -145,24 +145,17 @@ def test_documents_show_no_check_without_a_stored_result():
 
 
 def summary_table(rows: Sequence[Mapping[str, str]]) -> str:
-    """Markdown table of the worst error of each stage and its bound, and of the outcome of the fits."""
+    """Markdown table of the worst error of each stage and its bound."""
     lines = ["| what | cases | worst | bound |", "| --- | --- | --- | --- |"]
-    for title, cases, worst, bound in stages(rows):
-        lines.append(f"| {title} | {cases or ''} | **{worst:.1e}** | {bound:g} |")
-    for row in rows:
-        if row["what"].startswith(FITS):
-            what, _, count = row["what"].rpartition(", ")
-            lines.append(f"| {what} | {count.removesuffix(' cases')} | **{row['value']}** | {row['asked']} |")
+    lines += [f"| {title} | {cases} | **{worst:.1e}** | {bound:g} |" for title, cases, worst, bound in stages(rows)]
     return "\n".join(lines)
 
 
 def test_documents_show_the_worst_of_each_stage():
     rows = json.loads((RESULTS / "stress.json").read_text())["figures"]["rows"]
     assert marked("docs/numerics.md", "stress").strip() == summary_table(rows)
-    shown_stages = [next((words for words, begins in STAGES if re.match(begins, row["what"])), None) for row in rows]
-    assert set(shown_stages) >= {words for words, _ in STAGES}
-    worse = [{**row, "value": "worst 9.0e-01"} if row["what"].startswith("phase") else row for row in rows]
-    assert "| **9.0e-01** | 0.001 |" in summary_table(worse)
+    worse = [{**row, "value": "worst 9.0e-01"} if row["what"].startswith("plugin: im") else row for row in rows]
+    assert "| **9.0e-01** | 0.0001 |" in summary_table(worse)
 
 
 def test_stored_results_are_complete():

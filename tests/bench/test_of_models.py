@@ -1,16 +1,14 @@
-"""Benchmarks of models: stages and intervals of the hybrid, rows saved, positions, new receivers, stored parts."""
+"""Benchmarks of models: the hybrid and its parts, positions, new receivers, reception, stored parts."""
 
 from typing import Any
 
 import numpy as np
 import pytest
-from wrf_mi_bench import bench, comparison, page_tables, reception, stages
+from wrf_mi_bench import bench, reception, stages
 from wrf_mi_bench.comparison import MEASURED, STORED, measured_on, stored_part
 from wrf_mi_bench.locate import CELLS as LOCATE_CELLS
 from wrf_mi_bench.locate import STRETCH, stretches, summary
-from wrf_mi_bench.rows_saved import CURVES, IDW, ROWS, measure, rows_needed, saved
-from wrf_mi_bench.rows_saved import JOINT as JOINT_START
-from wrf_mi_bench.stages import CALIBRATED, CELLS, JOINT, LAB, MATERIALS, Cell, parts_of, rows_of
+from wrf_mi_bench.stages import CALIBRATED, CELLS, JOINT, MATERIALS, parts_of, rows_of
 from wrf_mi_bench.unmeasured import HYBRID, LAW, gains, only
 
 from wrf_mi.core import Receiver, Record
@@ -41,32 +39,6 @@ def test_dates_of_parts(days, stated):
     assert measured_on([{MEASURED: {"date": day}} for day in days]) == stated
 
 
-def test_intervals_of_runs_are_stored_and_those_outside_are_counted(tmp_path, monkeypatch):
-    asked = list[tuple[str, str]]()
-
-    def measured(cell: Cell, name: str, _: Any) -> dict[str, Any]:
-        asked.append((cell.name, name))
-        return {"block": "ssim", "score": {}, "inside_90": 0.97 if name == JOINT else 0.9, "crps": 0.02}
-
-    monkeypatch.setattr(comparison, "STORED", tmp_path)
-    cells = Cell("open", "official", None), Cell("meshed", "blocked", 400)
-    replaced = {"RUNS": tmp_path / "runs", "INTERVAL_CELLS": cells, "measured_intervals": measured}
-    for name, value in (replaced | {"data_folder": lambda name: tmp_path}).items():
-        monkeypatch.setattr(stages, name, value)
-    result = stages.intervals()
-    assert asked == [
-        (cell, name) for cell in ("open-official-all", "meshed-blocked-400") for name in stages.INTERVAL_MODELS
-    ]
-    assert (result["inside"], result["runs"]) == (4, 6)
-    assert result["failed"] == "intervals cover 85 to 95 % in 4 of 6 runs"
-    assert stages.intervals()["rows"] == result["rows"]
-    assert len(asked) == 6  # the second time from the files
-    assert stages.interval_table(result["rows"]).splitlines()[2:] == [
-        "| open, official, all rows | 90%, 0.02 | 97%, 0.02 | 90%, 0.02 |",
-        "| meshed, blocked, 400 rows | 90%, 0.02 | 97%, 0.02 | 90%, 0.02 |",
-    ]
-
-
 def test_table_names_the_kept_stages_and_the_best_part():
     def measured(model: str, median: float, gains: tuple[float, ...] = (), **more: Any) -> dict[str, Any]:
         score = {"median": median, "mean": median - 0.01}
@@ -82,10 +54,10 @@ def test_table_names_the_kept_stages_and_the_best_part():
         measured(JOINT, 0.91, (-0.01, -0.03, 0.01)),
     ]
     rows = rows_of(CELLS[0], results)
-    assert page_tables.stages(rows).splitlines()[2:] == [
+    assert stages.table(rows).splitlines()[2:] == [
         "| rfid-lab, official, 5 rows | **0.9** | 88% | mean, field | kriging 0.92 | -0.02 (-0.03 to -0.01) |"
     ]
-    assert len(page_tables.stages([{**row, "gain": 0.0} if "gain" in row else row for row in rows]).splitlines()) == 2
+    assert len(stages.table([{**row, "gain": 0.0} if "gain" in row else row for row in rows]).splitlines()) == 2
 
 
 @pytest.mark.parametrize(
@@ -98,34 +70,6 @@ def test_table_names_the_kept_stages_and_the_best_part():
 )
 def test_parts_are_those_of_the_task_and_the_scene(task, scene, parts):
     assert parts_of(task, scene) == parts
-
-
-@pytest.mark.parametrize(("goal", "rows"), [(2.5, 20 * 2**0.5), (0.5, 10), (4, None)])
-def test_rows_needed_are_where_the_curve_reaches_the_score(goal, rows):
-    """And the same of a score that is the better the lower."""
-    expected = None if rows is None else pytest.approx(rows)
-    assert rows_needed((10, 20, 40), (1, 2, 3), goal, True) == expected
-    assert rows_needed((10, 20, 40), (-1, -2, -3), -goal, False) == expected
-
-
-@pytest.mark.slow
-def test_a_cell_is_measured_with_all_starts_and_the_paths_alone(tmp_path):
-    scores = measure(Cell(LAB, "official", 5), 0, tmp_path / "cell", steps=2)
-    assert {*CURVES, IDW, "task"} == set(scores)
-    assert len({scores[name] for name in CURVES}) == len(CURVES)
-    assert not (tmp_path / "cell").exists()
-
-
-def test_table_states_the_share_of_the_rows():
-    shared = {"seed": 0, "task": "spectrum", IDW: 0.1}
-    scores = [
-        {"dataset": name, "rows": n, **shared, **dict.fromkeys(CURVES, k), JOINT_START: k + 1}
-        for name, rows in ROWS.items()
-        for k, n in enumerate(rows)
-    ]
-    lines = saved(scores)
-    assert "joint needs 80 (50%)" in next(line for line in lines if line["what"] == f"{LAB}, 160 rows")["value"]
-    assert len(lines) == sum(map(len, ROWS.values()))
 
 
 def positions(error_m: float, inside: float, count: int = 10 * STRETCH) -> dict[str, Any]:
@@ -191,7 +135,7 @@ def test_weakest_values_are_missing_and_reception_is_tabulated(monkeypatch):
     row = reception.row_of(cell, "idw", {"reception": block, "gain": [], "score": {"median": 3.0}})
     rows = [row, {**row, "model": "kriging", "log_loss": [0.2, 0.25, 0.25]}]
     cells = "flat-ble, blocked, 400 rows, a third missing (67% received) | 0.250 | **0.200** | 0.250 | 0.250"
-    assert page_tables.reception(rows).splitlines()[2] == f"| {cells} |"
+    assert reception.table(rows).splitlines()[2] == f"| {cells} |"
 
 
 def strengths(observed: np.ndarray) -> Record:

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from wrf_mi_bench import moved
-from wrf_mi_bench.page_tables import rooms
 from wrf_mi_bench.random_room import OPTIONS, SNR_DB, Survey, random_room_record
 from wrf_mi_bench.rooms import COLUMNS, clipped_cea_db, disagreement
+from wrf_mi_bench.rooms import table as rooms
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 from wrf_mi_scenes.random_rooms import CLEAR_M, FEWEST, HEIGHTS_M, LEAST_M, MOST, MOST_M, MOUNTED_M, MOUNTS, random_room
 

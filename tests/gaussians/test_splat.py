@@ -29,6 +29,7 @@ deviation of such derivatives."""
 SMALL: dict[str, Any] = {
     "wrf-gs": {"layers": 2, "width": 24, "signal_widths": (24, 12)},
     "wrf-gs+": {"layers": 3, "width": 24, "skip": 1},
+    "factorised": {"terms": 4, "layers": 2, "width": 16},
 }
 """Networks for finite differences; test_encoding_and_networks.py has the derivatives of their layers."""
 Tensor64 = dr.tensor_t(Float64)
@@ -102,7 +103,7 @@ def test_splat_without_visible_gaussians_is_zero():
 
 
 @pytest.mark.gradcheck
-@pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+"])
+@pytest.mark.parametrize("model", SMALL)
 def test_gradients_match_finite_differences(model):
     # An encoding of positions that hardly changes: it is detached on purpose, so differences alone would see it change.
     encoding, rng = Encoding(position_octaves=1, position_scale_m=1e12), np.random.default_rng(1)

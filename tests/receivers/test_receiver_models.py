@@ -23,6 +23,7 @@ from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
+from wrf_mi.receivers import antenna_csi, csi
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
 from wrf_mi.receivers.device_paths import Ports, path_sum
 from wrf_mi.receivers.receiver_models import magnitude, power
@@ -126,6 +127,28 @@ def test_path_sum_matches_spherical_waves() -> None:
     traced, arrays = paths()
     re, im = path_sum(traced, Ports(ELEMENTS_M, np.full(len(ELEMENTS_M), FREQUENCY_HZ)))
     np.testing.assert_allclose((re.numpy() + 1j * im.numpy()).reshape(2, -1), signals(arrays, ELEMENTS_M), atol=DOUBLE)
+
+
+def test_path_sums_of_far_and_faint_paths_keep_phases_at_28_ghz() -> None:
+    """Paths of 1 m to 100 km, gains of 1e-15 to 1e15, compared with the receivers in NumPy."""
+    rng, each, carrier_hz = np.random.default_rng(0), 50, 28e9
+    length, phase = 10 ** rng.uniform(0, 5, each), np.exp(1j * rng.uniform(0, 7, each))
+    gain = 10 ** rng.uniform(-15, 15, each) * phase
+    arrival = unit_vectors(rng.uniform(0, 7, each), rng.uniform(-1.5, 1.5, each))
+    real, imaginary, lengths, *directions = (
+        Float64(np.ascontiguousarray(a)) for a in (gain.real, gain.imag, length, *arrival.T)
+    )
+    traced, first = TracedPaths((real, imaginary), lengths, directions, 1, each), np.zeros(each, np.int64)
+    stored = paths_of(first, first, gain, length, arrival, 1, 1)
+    elements_m, tones_hz = planar_array(4, 4, 0.005), carrier_hz * np.linspace(0.98, 1.02, 16)
+    array = Receiver("array", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    for ports, expected in (
+        (Ports(elements_m, np.full(16, carrier_hz)), antenna_csi(stored, array, elements_m, carrier_hz)[..., 0]),
+        (Ports(np.zeros((16, 3)), tones_hz), csi(stored, tones_hz)),
+    ):
+        re, im = path_sum(traced, ports)
+        error = np.abs(re.numpy() + 1j * im.numpy() - expected.ravel()).max()
+        assert error < 1e-6 * np.abs(gain).sum()
 
 
 @pytest.mark.parametrize("how", ["coherent", "power"])

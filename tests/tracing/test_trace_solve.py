@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.constants import epsilon_0
+from scipy.constants import epsilon_0, speed_of_light
 from scipy.optimize import linear_sum_assignment
 from traced_rooms import (
     FREQUENCY_HZ,
@@ -18,14 +18,15 @@ from traced_rooms import (
     inside,
     receiver,
     room,
+    write_xml,
 )
 from wrf_mi_bench.sionna_reference import sionna_paths
-from wrf_mi_bench.stress_oracle import slab
+from wrf_mi_bench.wave_formulas import slab
 from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 
 from wrf_mi.core import InputError
-from wrf_mi.tracing import TraceOptions, recompute, trace_paths
+from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.paths import solve as solve_module
 from wrf_mi.tracing.search import chains as search_module
 from wrf_mi.tracing.search import images as images_module
@@ -71,6 +72,22 @@ def test_lengths_in_a_shoebox_are_those_of_the_mirror_images(shoebox):
         length = paths.length_m[(paths.tx == i) & (paths.rx == k)]
         np.testing.assert_allclose(length, image_lengths(tx[i], rx[k].position_m, 3), atol=EXACT_M)
     np.testing.assert_array_equal(np.lexsort((paths.length_m, paths.tx, paths.rx)), np.arange(len(paths)))
+
+
+@pytest.mark.parametrize(("hz", "size_m"), [(28e9, (100.0, 60.0, 12.0)), (915e6, (10_000.0, 4_000.0, 300.0))])
+def test_phases_in_large_halls_are_those_of_the_mirror_images(hz, size_m, tmp_path):
+    """Within a thousandth of a radian, of which lengths in float32 would leave some hundredths."""
+    parts = {}
+    for axis, side in product(range(3), (0, 1)):
+        spans = [(0.0, size_m[other]) for other in range(3) if other != axis]
+        parts[f"wall{axis}{side}"] = "itu_metal", sheet(axis, side * size_m[axis], *spans)
+    scene = open_scene(write_xml(tmp_path, parts), hz)
+    tx, rx = np.split(np.random.default_rng(0).uniform(0.1, 0.9, (6, 3)) * size_m, [5])
+    paths, wavenumber = traced(scene, tx, receiver(rx[0]), depth=2, rays=1 << 14), 2 * np.pi * hz / speed_of_light
+    for row, position_m in enumerate(tx):
+        exact, lengths_m = image_lengths(position_m, rx[0], 2, size_m), np.sort(paths.length_m[paths.tx == row])
+        np.testing.assert_allclose(wavenumber * (lengths_m - exact), 0, atol=1e-3)
+        assert wavenumber * np.abs(exact.astype(np.float32) - exact).max() > 1e-3
 
 
 def test_images_in_a_corner_and_points_of_reflection():

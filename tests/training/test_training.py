@@ -1,11 +1,15 @@
 """Fits of small fields to spectra that a known field made."""
 
 import gc
+import re
 from dataclasses import replace
 
 import drjit as dr
+import hypothesis
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from made_spectra import RECEIVERS, SIZE, small_field
 from scipy.spatial.distance import cdist
 from small_fits import official, settings, stop_after
@@ -290,4 +294,33 @@ def test_checkpoints_hold_finite_values_only(one_gateway):
     trainer = trainer_of(one_gateway, *own, "optimiser.network=1e38", "optimiser.warm_up=0")
     with pytest.raises(NumericsError, match=r"step [0-9]+: "):
         trainer.run(save=lambda: saved.append(trainer.state.params()))
+    assert all(np.isfinite(values).all() for params in saved for values in params.values())
+
+
+SHORT = ("steps=25", "log_every=25", "validate_every=25", "checkpoint_every=6", "optimiser.warm_up=0")
+GROUPS = ("network", "position", "scale", "rotation", "opacity", "signal")
+
+
+# Twelve fits, some of which are recorded anew: 20 seconds.
+@pytest.mark.slow
+@hypothesis.settings(max_examples=12)
+@given(
+    st.sampled_from(tuple(FIELDS)),
+    st.dictionaries(st.sampled_from(GROUPS), st.floats(-3, 38)),
+    st.floats(-10, 20),
+    st.floats(0.01, 80),
+)
+def test_fits_of_any_learning_rates_and_start_end_finite_or_name_step_and_group(
+    one_gateway, model, rates, signal, size_deg
+):
+    own = [f"optimiser.{group}={10**rate:.3e}" for group, rate in rates.items()]
+    own += [f"initial.signal={10**signal:.3e}", f"initial.size_deg={size_deg:g}"]
+    trainer, saved = trainer_of(one_gateway, *SHORT, *own, model=model), []
+    message = ""
+    try:
+        trainer.run(save=lambda: saved.append(trainer.state.params()))
+        saved.append(trainer.state.mean_params())
+    except NumericsError as error:
+        message = str(error)
+    assert not message or re.match(r"step \d+: .*not finite: \w+", message)
     assert all(np.isfinite(values).all() for params in saved for values in params.values())
