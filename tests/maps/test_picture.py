@@ -42,7 +42,7 @@ def mapped(data: Any, folder: Path, command: Command, *more: Any) -> tuple[xr.Da
 def dots(figure: Figure, panel: int) -> dict[str, np.ndarray]:
     """Levels of the measured rows of a panel: those of training rows and all others."""
     drawn = [one for one in figure.axes[panel].collections if isinstance(one, PathCollection)]
-    squares, circles = (np.asarray(one.get_array()) for one in drawn[1:])
+    squares, circles = (np.asarray(one.get_array()) for one in drawn)
     return {"trained": circles, "other": squares}
 
 
@@ -78,7 +78,7 @@ def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
     titles = [axes.get_title().split(": ")[-1] for axes in figure.axes[:3]]
     assert titles == ["expected power", "standard deviation of a reading", "probability of more than -10 dB"]
     assert [axes.get_ylabel().split()[0] for axes in figure.axes[3:]] == ["dB", "dB", "probability"]
-    assert "open crosses" not in heading(figure)
+    assert "open triangles" not in heading(figure)
     place = {"position_m": [0.0, 0.0, 0.0], "std_m": [0.5, 0.25, 0.0]}
     (run.folder / "receiver_places.json").write_text(json.dumps({run.receivers[0].name: place}))
     amid = {f"receiver_{axis}": ("receiver", [float(dataset[axis].mean())]) for axis in "xy"}
@@ -86,8 +86,8 @@ def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
     estimated = map_figure(dataset, run)
     (ellipse,) = estimated.axes[0].patches
     assert (ellipse.get_width(), ellipse.get_height()) == (1.0, 0.5)
-    assert "open crosses: receivers at estimated places" in heading(estimated)
-    assert "crosses: receivers," not in heading(estimated)
+    assert "open triangles: receivers at estimated places" in heading(estimated)
+    assert "triangles: receivers," not in heading(estimated)
     assert "not drawn" not in heading(estimated)
     split = make_splits(run.problem.record, "official")[0]
     assert len(split.test) <= 12 < len(split.all_train)

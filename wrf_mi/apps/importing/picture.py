@@ -16,7 +16,8 @@ MOST_NAMED = 9  # receivers with a colour of their own in the plan; the others a
 def plan_picture(record: Record) -> bytes:
     """PNG with the rows of signal strengths in their plan and the receivers at known positions."""
     from matplotlib.figure import Figure  # not before: every command imports the data sets
-    from matplotlib.text import Text
+
+    from ...scene import drawing
 
     extent_m = np.ptp(record.tx_pos_m[:, :2], axis=0)
     aspect = float(np.clip(extent_m[1] / max(extent_m[0], 1e-6), 0.3, 1.5))
@@ -35,18 +36,16 @@ def plan_picture(record: Record) -> bytes:
     places = np.stack([receiver.position_m for receiver in record.receivers])
     surveyed = np.isfinite(places).all(axis=1)
     if surveyed.any():
-        axes.plot(*places[:, :2].T, "k^", markersize=7, label="receivers")
+        drawing.draw_devices(axes, "receiver", places, label="receivers")
     names = np.array([receiver.name[:24] for receiver in record.receivers])
     for name, place in zip(names[surveyed], places[surveyed], strict=True) if surveyed.sum() <= MOST_NAMED else ():
         axes.annotate(name, place[:2], (5, 3), textcoords="offset points", fontsize="small")
     title = f"{record.name}: strongest receiver of each row"
     if (~surveyed).any():
         title = f"{title}\n" + textwrap.fill(f"receivers at unknown places: {listed(names[~surveyed])}", 90)
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    drawing.set_plan(axes)
     axes.set_title(title, fontsize="medium")
     figure.legend(loc="outside lower center", ncols=4, fontsize="small")
-    for text in figure.findobj(Text):
-        text.set_parse_math(False)  # names may contain dollar signs
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
+    drawing.without_formulas(figure).savefig(stream, format="png", dpi=110, metadata={"Software": None})
     return stream.getvalue()

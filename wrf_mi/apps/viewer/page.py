@@ -18,7 +18,8 @@ from matplotlib.colors import to_hex
 from numpy.typing import ArrayLike, NDArray
 
 from ...core import InputError
-from ...scene.preview import ENDS, SPAN_DB
+from ...scene.drawing import ENDS
+from ...scene.preview import SPAN_DB
 from .content import MapContent, ViewContent
 
 SCALES = {"strength": "viridis", "gain": "plasma", "error": "YlOrRd", "map": "turbo"}  # colour map of each quantity
@@ -76,7 +77,7 @@ def page_data(content: ViewContent) -> dict[str, Any]:
     return data | {
         "scales": {name: [to_hex(c) for c in colormaps[m](np.linspace(0, 1, STOPS))] for name, m in SCALES.items()},
         "span_db": SPAN_DB,
-        "ends": {name: colour for name, _, colour in ENDS},
+        "ends": {name: colour for name, (_, colour) in ENDS.items()},
         "colours": MATERIALS | dict(zip(others, cycle(OTHER_MATERIALS), strict=False)),
         "quantities": _quantities(content.maps),
     }
