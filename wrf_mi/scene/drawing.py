@@ -60,7 +60,7 @@ def draw_values(axes: Any, positions_m: FloatArray, values: ArrayLike, colours: 
 
 def draw_outlines(axes: Axes, outlines: Sequence[FloatArray], **options: Any) -> None:
     """Draw lines [n, 2, 2] in plan, such as the cuts of walls, one collection for each array."""
-    how = {"colors": "black", "linewidths": 1.2, "capstyle": "round"} | options
+    how: dict[str, Any] = {"colors": "black", "linewidths": 1.2, "capstyle": "round", **options}
     for lines in outlines:
         axes.add_collection(LineCollection(list(lines), **how))
 

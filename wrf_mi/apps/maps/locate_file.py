@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -230,7 +231,7 @@ def draw_positions(run: Run, located: LocatedPositions, true_m: FloatArray | Non
         axes.set_visible(False)
     dot: dict[str, Any] = {"linestyle": "none"}
     handles: list[Any] = [
-        Patch(color=drawing.shades(0, 1).to_rgba(0.7), label="probability, brightest where largest"),
+        Patch(color=colormaps[drawing.COLOUR_MAP](0.8), label="probability, brightest where largest"),
         Line2D([], [], color=REGION, label=f"{located.level:.0%} region"),
         Line2D([], [], marker="o", color=ESTIMATE, label="estimate", **dot),
         Line2D([], [], color=ESTIMATE, linestyle=":", label=f"circle of {located.level:.0%}"),
