@@ -250,8 +250,7 @@ def time_scatter(times: Mapping[str, Mapping[str, float]], scores: Mapping[str, 
         axes.margins(0.15)
         axes.grid(alpha=0.3)
     panels[0].set_ylabel(label)
-    entries = {text: line for axes in panels for line, text in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(entries.values(), entries.keys(), fontsize=8, loc="outside lower center", ncols=min(3, len(scores)))
+    drawing.add_legend(figure, columns=min(3, len(scores)))
     return figure
 
 
@@ -267,5 +266,5 @@ def choice_map(chosen: ArrayLike, names: Sequence[str], tx_pos_m: ArrayLike) -> 
         axes.plot(x[at], y[at], markersize=4, label=label, **_style(number))
     drawing.set_plan(axes)
     axes.grid(alpha=0.3)
-    figure.legend(fontsize=8, loc="outside lower center", ncols=min(3, len(names)))
+    drawing.add_legend(figure, columns=min(3, len(names)))
     return figure

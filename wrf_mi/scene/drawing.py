@@ -74,12 +74,21 @@ def draw_faces(axes: Any, corners_m: FloatArray, colours: FloatArray, **options:
 
 
 def draw_devices(axes: Any, kind: str, positions_m: ArrayLike, **options: Any) -> Line2D:
-    """Draw transmitters or receivers at positions [n, 2] or [n, 3] in a plan or a 3D view; a handle for a legend."""
+    """Draw transmitters or receivers at positions [n, 2] or [n, 3] in a plan or a 3D view."""
     marker, colour = ENDS[kind]
     how = {"markersize": 7, "markeredgecolor": "white", "linestyle": "none", "zorder": 8, "label": kind} | options
     points = np.atleast_2d(np.asarray(positions_m, float))
     (line,) = axes.plot(*points.T[: _dimensions(axes)], marker=marker, color=colour, **how)
     return line
+
+
+def add_legend(figure: Figure, loc: str = "outside lower center", columns: int = 4) -> None:
+    """Add a legend of the labelled marks of all axes, each label once."""
+    parts = (zip(*axes.get_legend_handles_labels(), strict=True) for axes in figure.axes)
+    entries: dict[str, Any] = {label: handle for part in parts for handle, label in part}
+    if entries:
+        how: dict[str, Any] = {"fontsize": LABEL_SIZE, "loc": loc, "ncols": columns}
+        figure.legend(list(entries.values()), list(entries), **how)
 
 
 def _dimensions(axes: Any) -> int:

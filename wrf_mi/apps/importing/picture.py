@@ -45,7 +45,7 @@ def plan_picture(record: Record) -> bytes:
         title = f"{title}\n" + textwrap.fill(f"receivers at unknown places: {listed(names[~surveyed])}", 90)
     drawing.set_plan(axes)
     axes.set_title(title, fontsize="medium")
-    figure.legend(loc="outside lower center", ncols=4, fontsize="small")
+    drawing.add_legend(figure)
     stream = io.BytesIO()
     drawing.without_formulas(figure).savefig(stream, format="png", dpi=110, metadata={"Software": None})
     return stream.getvalue()

@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch
+from matplotlib.patches import Circle
 
 from ...core import DataFault, InputError, Receiver
 from ...core.angles import FloatArray
@@ -40,6 +38,7 @@ SHOWN, COLUMNS = 6, 3  # number of rows that are drawn, and panels side by side
 MARGIN_M = 0.5  # margin of a panel around the candidates
 REGION, ESTIMATE, NEIGHBOURS = "tab:orange", "tab:red", "tab:purple"
 TRUTH: dict[str, Any] = {"marker": "*", "markersize": 11, "color": "white", "markeredgecolor": "black"}
+TRUTH |= {"linestyle": "none", "label": "true position"}
 
 
 def read_observations(
@@ -225,23 +224,11 @@ def draw_positions(run: Run, located: LocatedPositions, true_m: FloatArray | Non
     for axes, row in zip(panels, rows, strict=False):
         _draw_row(axes, arrays, located, int(row), true_m)
         drawing.draw_outlines(axes, walls)
-        devices = drawing.draw_devices(axes, "receiver", [receiver.position_m for receiver in run.receivers])
+        drawing.draw_devices(axes, "receiver", [receiver.position_m for receiver in run.receivers])
         drawing.set_plan(axes, ends_m[0] - MARGIN_M, ends_m[1] + MARGIN_M)
     for axes in panels[len(rows) :]:
         axes.set_visible(False)
-    dot: dict[str, Any] = {"linestyle": "none"}
-    handles: list[Any] = [
-        Patch(color=colormaps[drawing.COLOUR_MAP](0.8), label="probability, brightest where largest"),
-        Line2D([], [], color=REGION, label=f"{located.level:.0%} region"),
-        Line2D([], [], marker="o", color=ESTIMATE, label="estimate", **dot),
-        Line2D([], [], color=ESTIMATE, linestyle=":", label=f"circle of {located.level:.0%}"),
-    ]
-    if located.calibration.neighbours is not None:
-        name = f"{located.calibration.neighbours.count} nearest neighbours"
-        handles.append(Line2D([], [], marker="s", color=NEIGHBOURS, label=name, **dot))
-    if true_m is not None:
-        handles.append(Line2D([], [], **TRUTH, label="true position", **dot))
-    figure.legend(handles=[*handles, devices], loc="outside upper center", ncols=4, fontsize=8)
+    drawing.add_legend(figure, "outside upper center")
     return figure
 
 
@@ -259,11 +246,14 @@ def _draw_row(
         x, y = (np.concatenate([[2 * a[0] - a[1]], a, [2 * a[-1] - a[-2]]]) for a in (grid.x_m, grid.y_m))
         bordered = np.pad(inside.reshape(drawn.shape), 1)
         axes.contour(x, y, bordered, levels=[0.5], colors=REGION, linewidths=1.4)
+        axes.plot([], color=REGION, label=f"{located.level:.0%} region of the probability, brightest where largest")
     x_m, y_m = located.tx_pos_m[row, :2]
     axes.add_patch(Circle((x_m, y_m), located.radius_m[row], fill=False, color=ESTIMATE, linewidth=0.8, linestyle=":"))
-    axes.plot(x_m, y_m, "o", color=ESTIMATE, markersize=6, markeredgecolor="white")
-    if located.neighbours_m is not None:
-        axes.plot(*located.neighbours_m[row, :2], "s", color=NEIGHBOURS, markersize=5, markeredgecolor="white")
+    mark = {"markeredgecolor": "white", "linestyle": "none"}
+    axes.plot(x_m, y_m, "o", color=ESTIMATE, label=f"estimate, and its circle of {located.level:.0%}", **mark)
+    if located.neighbours_m is not None and located.calibration.neighbours is not None:
+        name = f"{located.calibration.neighbours.count} nearest neighbours"
+        axes.plot(*located.neighbours_m[row, :2], "s", color=NEIGHBOURS, label=name, **mark)
     title = f"row {row + 1}: {located.area_m2[row]:.1f} m²"
     if true_m is not None:
         axes.plot(*true_m[row], **TRUTH)

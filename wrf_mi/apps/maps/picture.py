@@ -33,8 +33,9 @@ MOST_POINTS = 250  # largest number of training rows of a panel, and of other me
 TAIL = 1.0  # percentage of values beyond either end of the colour scale
 MEASURED_TAIL = 10.0  # likewise for measured levels, among which are single deep fades
 STRONGEST = "strongest receiver"
-TRAINED: dict[str, Any] = {"marker": "o", "s": 13, "edgecolors": "white", "linewidths": 0.4}
-OTHER: dict[str, Any] = {"marker": "s", "s": 11, "edgecolors": "black", "linewidths": 0.4}
+AT_ESTIMATED = "receiver at an estimated place, with one standard deviation"
+TRAINED: dict[str, Any] = {"label": "training rows", "marker": "o", "s": 13, "edgecolors": "white"}
+OTHER: dict[str, Any] = {"label": "other measured rows", "marker": "s", "s": 11, "edgecolors": "black"}
 EDGE = 0.02  # margin around all that is drawn, a share of its size
 NEARBY = 0.25  # distance from the rest of a map up to which estimated receivers are drawn, a share of its size
 MOST_DEVIATIONS = 3  # number of receivers up to which the standard deviation of each is drawn
@@ -84,8 +85,8 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     at_m, around_m = _receivers(dataset)[:, : area_m.shape[1]], NEARBY * np.ptp(area_m, axis=0).max()
     is_drawn = ((at_m >= area_m[0] - around_m) & (at_m <= area_m[1] + around_m)).all(axis=1)
     area_m = _with_margin(np.concatenate([area_m, at_m[is_drawn]]))
-    heading = _heading(dataset, measured, estimated, is_drawn, int(width * LETTERS_PER_INCH))
-    height = (PANEL_IN * _aspect(dataset) + 0.5) * lines + 0.3 + LINE_IN * heading.count("\n")
+    heading = _heading(dataset, measured, is_drawn, int(width * LETTERS_PER_INCH))
+    height = (PANEL_IN * _aspect(dataset) + 0.5) * lines + 0.6 + LINE_IN * heading.count("\n")
     figure = Figure(figsize=(width, height), layout="constrained")
     kind: dict[str, Any] = {} if flat else {"projection": "3d", "computed_zorder": False}
     grid = figure.subplots(lines, columns, squeeze=False, subplot_kw=kind)
@@ -110,6 +111,7 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     figure.suptitle(heading, fontsize=8)
+    drawing.add_legend(figure)
     return drawing.without_formulas(figure)
 
 
@@ -192,14 +194,8 @@ def _with_margin(points_m: FloatArray) -> FloatArray:
     return np.stack([low - margin_m, high + margin_m])
 
 
-def _heading(
-    dataset: xarray.Dataset,
-    measured: Sequence[_Measured],
-    estimated: Mapping[str, Any],
-    is_drawn: NDArray[np.bool_],
-    width: int,
-) -> str:
-    """Title, heights of the transmitter, carrier and marks, in lines of at most ``width`` letters."""
+def _heading(dataset: xarray.Dataset, measured: Sequence[_Measured], is_drawn: NDArray[np.bool_], width: int) -> str:
+    """Title, heights of the transmitter and carrier, in lines of at most ``width`` letters."""
     heights = np.concatenate([rows.points_m[:, 2] for rows in measured])
     words = [] if "point" in dataset.sizes else [f"transmitter at z = {float(dataset['height']):.2f} m"]
     if FREQUENCY in dataset.attrs:
@@ -210,18 +206,9 @@ def _heading(
         words.append(f"measured at z = {heights.min():.2f} m")
     else:
         words.append(f"measured at z = {heights.min():.2f} to {heights.max():.2f} m")
-    trained = np.concatenate([rows.trained for rows in measured])
-    names = map(str, dataset["receiver"].values)
-    receivers = {name in estimated for name, drawn in zip(names, is_drawn, strict=True) if drawn}
-    outside = np.count_nonzero(np.isfinite(_receivers(dataset)).all(axis=1) & ~is_drawn)
-    marks = {
-        "circles: training rows": trained.any(),
-        "squares: other measured rows": not trained.all(),
-        "triangles: receivers": False in receivers,
-        "open triangles: receivers at estimated places, with one standard deviation": True in receivers,
-        f"{outside} estimated outside of the map, not drawn": outside,
-    }
-    parts = [dataset.attrs["title"], ", ".join(words), ", ".join(mark for mark, drawn in marks.items() if drawn)]
+    if outside := np.count_nonzero(np.isfinite(_receivers(dataset)).all(axis=1) & ~is_drawn):
+        words.append(f"{outside} receivers estimated outside of the map, not drawn")
+    parts = [dataset.attrs["title"], ", ".join(words)]
     if not dataset.attrs["level_is_absolute"]:
         parts.append("levels relative to full scale are no signal strengths")
     return "\n".join(textwrap.fill(part, width) for part in parts)
@@ -264,7 +251,7 @@ def _draw_points(
     for k in np.flatnonzero(is_drawn) if panel.number is None else [panel.number] * bool(is_drawn[panel.number]):
         place = estimated.get(str(dataset["receiver"].values[k]))
         colour = drawing.ENDS["receiver"][1]
-        mark = {} if place is None else {"markerfacecolor": "none", "markeredgecolor": colour, "markeredgewidth": 1.2}
+        mark = {} if place is None else {"markeredgecolor": colour, "label": AT_ESTIMATED, "markerfacecolor": "none"}
         drawing.draw_devices(axes, "receiver", at[k], **mark)
         if place is not None and dims == 2:
             spread = 2 * np.array(place["std_m"])[:2]
@@ -276,5 +263,6 @@ def _draw_points(
         return
     # Training rows, often the fewer, lie above the others.
     for rows, mark in ((~panel.measured.trained, OTHER), (panel.measured.trained, TRAINED)):
-        levels = panel.measured.points_m[rows], panel.measured.level[rows]
-        drawing.draw_values(axes, *levels, panel.colours, **mark, zorder=4)
+        points_m, level = panel.measured.points_m[rows], panel.measured.level[rows]
+        if len(level):
+            drawing.draw_values(axes, points_m, level, panel.colours, **mark, linewidths=0.4, zorder=4)
