@@ -249,7 +249,7 @@ def _draw_row(
         axes.plot([], color=REGION, label=f"{located.level:.0%} region of the probability, brightest where largest")
     x_m, y_m = located.tx_pos_m[row, :2]
     axes.add_patch(Circle((x_m, y_m), located.radius_m[row], fill=False, color=ESTIMATE, linewidth=0.8, linestyle=":"))
-    mark = {"markeredgecolor": "white", "linestyle": "none"}
+    mark: dict[str, Any] = {"markeredgecolor": "white", "linestyle": "none"}
     axes.plot(x_m, y_m, "o", color=ESTIMATE, label=f"estimate, and its circle of {located.level:.0%}", **mark)
     if located.neighbours_m is not None and located.calibration.neighbours is not None:
         name = f"{located.calibration.neighbours.count} nearest neighbours"

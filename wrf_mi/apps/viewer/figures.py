@@ -32,7 +32,7 @@ ROWS_TAIL, MAP_TAIL = 2, 1  # percentages of scores and of a map's values beyond
 BARS = {"rows": 0.0, "gain": 0.25, "signal": 0.5, "map": 0.75}  # left ends of colour bars, shares of the width
 BAR_LETTERS, MENU_LETTERS = 16, 36  # letters in a line above a colour bar, and of a quantity in a menu
 EYE = {"x": 1.05, "y": -1.55, "z": 1.35}  # place of the camera, in units of Plotly's
-BOX = 1.6  # diagonal of the box of the axes in these units: the camera's 45 degrees see all of it from there
+BOX = 1.6  # diagonal of the box of the axes in these units: the camera's 45 degrees see all of it, with its labels
 THINNEST = 0.05  # least edge of the box, a share of the largest: Plotly's camera cannot see all of much thinner ones
 
 
