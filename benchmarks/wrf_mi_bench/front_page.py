@@ -243,9 +243,10 @@ def picture(folder: Path) -> Figure:
     drawing.draw_layer(spread, x, y, std_db, deviations_db)
     inside = inside_interval(power[free], std_db[free], truth[free])
     spread.set_title(f"Its standard deviation: {100 * inside:.0f} % of the truth in 90 % intervals")
+    star: Any = {"markersize": 15, "color": drawing.ENDS["receiver"][1], "markeredgecolor": "white"}
     for axes in panels.flat:
         drawing.draw_outlines(axes, scene_cuts(run, HEIGHT_M) if axes is not given else (), linewidths=0.8)
-        drawing.draw_devices(axes, "receiver", receiver.position_m, markersize=10)
+        axes.plot(*receiver.position_m[:2], "*", **star)
         drawing.set_plan(axes, (x.min() - 0.3, y.min() - 0.3), (x.max() + 0.3, y.max() + 0.3))
         axes.label_outer()
         axes.title.set_fontsize(9.5)
