@@ -13,7 +13,6 @@ from wrf_mi.apps.viewer.content import (
     SceneContent,
     ViewContent,
 )
-from wrf_mi.apps.viewer.layers import png
 
 MARKUP = "<b>&amp;</script><img src=x onerror=alert(1)>"
 STORED, GAUSSIANS, HEIGHTS_M = 3, 5, (0.5, 1.5)
@@ -24,15 +23,15 @@ def made_view(observed: str = "image") -> ViewContent:
     rng = np.random.default_rng(4)
     floor = np.array([[[0.0, 0, 0], [4, 0, 0], [4, 3, 0]], [[0, 0, 0], [4, 3, 0], [0, 3, 0]]])
     meshes = (
-        MaterialMesh("concrete", False, floor, np.array([0, 0]), (MARKUP,)),
-        MaterialMesh("glass", False, floor[:1][..., [0, 2, 1]], np.array([0]), ("window",)),
-        MaterialMesh("plasterboard", True, floor + np.array([0, 0, 2.5]), np.array([0, 0]), ("ceiling",)),
+        MaterialMesh("concrete", "#9aa0a6", False, floor, np.array([MARKUP, MARKUP])),
+        MaterialMesh("glass", "#7fc4dd", False, floor[:1][..., [0, 2, 1]], np.array(["window"])),
+        MaterialMesh("plasterboard", "#d9d2c0", True, floor + np.array([0, 0, 2.5]), np.array(["ceiling"] * 2)),
     )
     score = rng.uniform(0.6, 0.9, (2, 6))
     score[1, 4] = np.nan
     positions = rng.uniform([0.5, 0.5, 0.8], [3.5, 2.5, 1.6], (6, 3))
     stored = np.array([0, 2, 5])
-    rows = RowsContent(10 + np.arange(6), positions, score, "SSIM", 3, True, stored, _observed(observed, rng), "grey")
+    rows = RowsContent(10 + np.arange(6), positions, score, "SSIM", 3, stored, _observed(observed, rng), "grey")
     receivers_m = np.array([[0.2, 0.2, 2.0], [3.8, 2.8, 2.0]])
     turns = rng.normal(size=(STORED, GAUSSIANS, 4))
     fall = np.sort(rng.uniform(-60, -20, (STORED, GAUSSIANS)))[:, ::-1]
@@ -63,14 +62,11 @@ def made_view(observed: str = "image") -> ViewContent:
 
 
 def _observed(kind: str, rng: np.random.Generator) -> dict:
-    from wrf_mi.apps.viewer.page import packed
-
     both = ("measured", "predicted")
     if kind == "image":
-        images = {key: [[png(rng.random((9, 36))) for _ in range(STORED)] for _ in range(2)] for key in both}
-        return {"kind": kind, "size": [9, 36], **images}
+        return {"kind": kind, **{key: rng.integers(0, 256, (2, STORED, 9, 36), np.uint8) for key in both}}
     shape = (2, STORED) if kind == "level" else (2, STORED, 8)
-    return {"kind": kind, **{key: packed(rng.uniform(-80, -40, shape)) for key in both}}
+    return {"kind": kind, **{key: rng.uniform(-80, -40, shape) for key in both}}
 
 
 def _map(height_m: float, receivers: tuple[str, ...]) -> MapContent:

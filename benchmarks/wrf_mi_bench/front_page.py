@@ -12,15 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from wrf_mi_scenes.floor_plans import office
 from wrf_mi_scenes.mitsuba_xml import write_scene
 
 import wrf_mi
-from wrf_mi.apps.maps.picture import scene_cuts
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.receivers import receiver_index
@@ -28,6 +24,8 @@ from wrf_mi.datasets.ble_folder import CARRIER_HZ
 from wrf_mi.receivers.channel import received_power
 from wrf_mi.receivers.reports import strength_db
 from wrf_mi.runs.folder import load_rows
+from wrf_mi.runs.scene_view import scene_cuts
+from wrf_mi.scene import drawing
 from wrf_mi.synthetic.floor_receivers import DEFAULT, NAME
 from wrf_mi.synthetic.searches import SCATTERING, set_scattering
 from wrf_mi.synthetic.stored import SCAN
@@ -234,34 +232,33 @@ def picture(folder: Path) -> Figure:
     errors = [np.nanmedian(np.abs(of - truth[free])) for of in (power[free], idw.predict(grid_m[free], RECEIVER).mean)]
     points = np.load(data_folder(NAME) / SCAN)["points"]
 
-    shades: Any = {"cmap": "viridis", "norm": Normalize(*np.nanpercentile(truth, [2, 98]))}
+    powers_dbm = drawing.shades(*np.nanpercentile(truth, [2, 98]))
+    deviations_db = drawing.shades(0, float(np.nanmax(std_db)))
     figure = Figure(figsize=(10, 5.4), layout="constrained", facecolor="white")
     (given, predicted), (spread, true) = panels = figure.subplots(2, 2, sharex=True, sharey=True)
     scan = points[(points[:, 2] > SLICE_M[0]) & (points[:, 2] < SLICE_M[1])]
     given.scatter(*scan[:, :2].T, s=0.05, color="0.65", linewidths=0, rasterized=True)
     levels = record.observation[number][train]
-    given.scatter(*record.tx_pos_m[train, :2].T, c=levels, s=42, edgecolors="black", linewidths=0.6, **shades)
+    marks = {"s": 42, "edgecolors": "black", "linewidths": 0.6}
+    drawing.draw_values(given, record.tx_pos_m[train], levels, powers_dbm, **marks)
     given.set_title(f"Given: LiDAR scan and power at {len(train)} positions (circles)")
-    predicted.pcolormesh(x, y, power, shading="nearest", rasterized=True, **shades)
+    drawing.draw_layer(predicted, x, y, power, powers_dbm)
     predicted.set_title(f"Predicted power: median error {errors[0]:.1f} dB (IDW: {errors[1]:.1f} dB)")
-    true.pcolormesh(x, y, truth, shading="nearest", rasterized=True, **shades)
+    drawing.draw_layer(true, x, y, truth, powers_dbm)
     true.set_title("True power")
-    bar = spread.pcolormesh(x, y, std_db, shading="nearest", cmap="magma", rasterized=True)
+    drawing.draw_layer(spread, x, y, std_db, deviations_db)
     inside = inside_interval(power[free], std_db[free], truth[free])
     spread.set_title(f"Its standard deviation: {100 * inside:.0f} % of the truth in 90 % intervals")
+    star: Any = {"markersize": 15, "color": drawing.ENDS["receiver"][1], "markeredgecolor": "white"}
     for axes in panels.flat:
-        for lines in scene_cuts(run, HEIGHT_M) if axes is not given else ():
-            axes.add_collection(LineCollection(list(lines), colors="black", linewidths=0.8))
-        axes.plot(*receiver.position_m[:2], "*", markersize=15, color="#c1121f", markeredgecolor="white")
-        axes.set(aspect="equal", xlim=(x.min() - 0.3, x.max() + 0.3), ylim=(y.min() - 0.3, y.max() + 0.3))
+        drawing.draw_outlines(axes, scene_cuts(run, HEIGHT_M) if axes is not given else (), linewidths=0.8)
+        axes.plot(*receiver.position_m[:2], "*", **star)
+        drawing.set_plan(axes, (x.min() - 0.3, y.min() - 0.3), (x.max() + 0.3, y.max() + 0.3))
+        axes.label_outer()
         axes.title.set_fontsize(9.5)
-    for axes in panels[1]:
-        axes.set_xlabel("x (m)")
-    for axes in panels[:, 0]:
-        axes.set_ylabel("y (m)")
-    figure.colorbar(ScalarMappable(**shades), ax=panels[:, 1], label="received power (dBm)", extend="both")
+    drawing.colour_bar(figure, powers_dbm, panels[:, 1], "received power (dBm)", extend="both")
     how: Any = {"location": "left", "shrink": 0.44, "anchor": (0.0, 0.0), "panchor": False}
-    figure.colorbar(bar, ax=panels[:, 0], label="standard deviation (dB)", **how)
+    drawing.colour_bar(figure, deviations_db, panels[:, 0], "standard deviation (dB)", **how)
     return figure
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from calling import SMALL
 from commands import rows_of
+from matplotlib.text import Text
 from pages import PHONE, open_page
 from playwright.sync_api import Browser
 from test_compare import captured, edit_metrics, make_run
@@ -343,5 +344,5 @@ def test_maps_show_errors_and_the_best_run(tmp_path: Path, monkeypatch: pytest.M
     panels, scores, _ = times[-1]
     assert panels["ms per sample"] == {"good": 3.25, "bad": 3.25}
     assert scores["good"] > scores["bad"]
-    texts = [text.get_text() for text in figures.time_scatter(*times[-1]).findobj(figures.Text)]
+    texts = [text.get_text() for text in figures.time_scatter(*times[-1]).findobj(Text)]
     assert not any("$" in text for text in texts)

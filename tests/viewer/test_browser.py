@@ -21,20 +21,20 @@ ELLIPSOID = 42
 TOOLS = """
 const scene = document.getElementById("scene");
 const drawn = () => new Promise((done) => requestAnimationFrame(() => setTimeout(done, 0)));
-const lengths = (shown) => scene.data.filter(shown).map((trace) => trace.x.length);
-const meshes = () => lengths((trace) => trace.type === "mesh3d").sort((a, b) => a - b);
-const paths = () => lengths((trace) => trace.mode === "lines" && trace.hovertemplate);
-const heights = () => scene.data.filter((trace) => trace.type === "surface").map((trace) => trace.z[1][1]);
+const shown = (traces) => scene._fullData.filter((trace) => trace.visible === true && traces(trace));
+const meshes = () => shown((trace) => trace.type === "mesh3d").map((trace) => trace.x.length).sort((a, b) => a - b);
+const paths = () => shown((trace) => trace.mode === "lines" && trace.hovertemplate).map((trace) => trace.x.length);
+const heights = () => shown((trace) => trace.type === "surface").map((trace) => trace.z[1][1]);
 const upper = (id) => document.getElementById(id).getBoundingClientRect().top;
-async function set(name, value) {
-  const label = [...document.querySelectorAll("label")].find((one) => name.test(one.textContent));
-  const input = label.querySelector("input, select");
-  if (input.type === "checkbox") input.click();
-  else {
-    input.value = value;
-    input.dispatchEvent(new Event(input.tagName === "SELECT" ? "change" : "input"));
-  }
+const named = (text) => scene._fullData.findIndex((trace) => trace.name.startsWith(text));
+async function set(id, value) {
+  const input = document.getElementById(id);
+  input.value = value;
+  input.dispatchEvent(new Event(input.tagName === "SELECT" ? "change" : "input"));
   await drawn();
+}
+async function press(menu, button) {
+  await Plotly.restyle(scene, ...scene.layout.updatemenus[menu].buttons[button].args);
 }
 """
 FIRST = """
@@ -43,26 +43,25 @@ FIRST = """
   below: upper("choices") > upper("scene") + scene.clientHeight - 1,
   title: document.querySelector("h1").textContent,
   note: document.getElementById("notes").textContent,
-  layers: document.querySelectorAll("#layers label.layer input").length,
-  images: document.getElementById("observation").layout.images?.length ?? 0,
-  lines: document.getElementById("observation").data.map((trace) => trace.y.length),
+  layers: scene._fullData.length,
+  observed: document.getElementById("observation")._fullData.map((trace) => (trace.z ?? trace.y).length),
   meshes: meshes(), paths: paths(), heights: heights(),
 })
 """
 CONTROLS = """
 (async () => {
   const seen = {};
-  await set(/^Transmitter:/, 2);
-  await set(/^Receiver/, 1);
+  await set("transmitter", 2);
+  await set("receiver", 1);
   seen.chosen = document.getElementById("observation-title").textContent;
-  await set(/^Height:/, 1);
+  await press(0, 2);
   seen.heights = heights();
-  await set(/^ 1$/);
+  await press(1, 4);
+  seen.opacity = scene._fullData[named("concrete")].opacity;
+  await Plotly.restyle(scene, { visible: "legendonly" }, [named("paths: reflection"), named("Gaussians")]);
+  await Plotly.restyle(scene, { visible: true }, [named("plasterboard, ceiling")]);
+  await set("transmitter", 1);
   seen.direct = paths();
-  await set(/^Strongest:/, 2);
-  seen.fewer = meshes();
-  await set(/^Gaussians/);
-  await set(/, ceiling$/);
   seen.ceiling = meshes();
   return seen;
 })()
@@ -92,16 +91,15 @@ def test_views_need_no_network_and_answer_their_controls(browser, tmp_path, size
         "below": size == PHONE,
         "title": content.title,
         "note": content.notes[0],
-        "layers": 10,
-        "images": 2 if observed == "image" else 0,
-        "lines": [1, 1] if observed == "image" else [2, 2],
-        "meshes": [3, 6, 5 * ELLIPSOID],  # glass, concrete, Gaussians
-        "paths": [3 + 4],  # a direct path and a reflection, each with a gap behind it
+        "layers": 15,
+        "observed": [9, 9] if observed == "image" else [2, 2],
+        "meshes": [3, 4, 5 * ELLIPSOID],  # glass, concrete, Gaussians
+        "paths": [3, 4],  # a direct path and a reflection, each with a gap behind it
         "heights": [0.5],
     }
     shown = view.page.evaluate(CONTROLS)
     assert shown.pop("chosen").startswith("row 15, SSIM 0.")
-    assert shown == {"heights": [1.5], "direct": [3], "fewer": [3, 6, 2 * ELLIPSOID], "ceiling": [3, 6, 6]}
+    assert shown == {"heights": [1.5], "opacity": 1, "direct": [3], "ceiling": [3, 4, 4]}
     assert view.complaints == []
     requests = [url for url in view.requests if not url.startswith(("data:", "blob:"))]
     assert requests == [(tmp_path / "view.html").as_uri()]
@@ -111,7 +109,7 @@ def test_views_need_no_network_and_answer_their_controls(browser, tmp_path, size
 def test_channels_are_drawn_over_subcarriers(browser, tmp_path):
     view = opened(browser, tmp_path, POSITIONS_ALONE, PHONE)
     first = view.page.evaluate(FIRST)
-    assert (first["images"], first["lines"], first["layers"]) == (0, [8, 8], 3)
+    assert (first["observed"], first["layers"]) == ([8, 8], 4)
     assert view.complaints == []
     view.page.close()
 
@@ -132,6 +130,7 @@ def map_alone(stretch: float) -> ViewContent:
 def test_whole_map_is_in_the_picture(browser, tmp_path, stretch):
     view = opened(browser, tmp_path, map_alone(stretch), PHONE)
     assert view.complaints == []
+    view.page.add_style_tag(content=".infolayer, .menulayer { display: none; }")  # colour bars, legend, menus
     scene, end = view.page.get_by_role("img", name="3D view"), time.monotonic() + REDRAWN_S
     while (data := colourful(scene.screenshot()))[:, 0].any() and time.monotonic() < end:
         pass  # WebGL shows the camera's new place some frames after Plotly has set it, on a busy machine seconds

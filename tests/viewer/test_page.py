@@ -1,7 +1,6 @@
 """The page of a view: self-contained, escaped, complete, and small."""
 
 import base64
-import io
 import json
 import re
 import sys
@@ -10,28 +9,32 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from made_views import MARKUP, made_view
-from PIL import Image
 
 from wrf_mi.apps.viewer import page as page_module
 from wrf_mi.apps.viewer import view as view_module
-from wrf_mi.apps.viewer.layers import png
-from wrf_mi.apps.viewer.page import LARGEST, MISSING, SMALLEST_RANGE, packed, page, plotly_js
+from wrf_mi.apps.viewer.figures import spec
+from wrf_mi.apps.viewer.page import page, plotly_js
 from wrf_mi.apps.viewer.view import View
 from wrf_mi.core import InputError
 
-ROUNDED = 0.51 / LARGEST
-"""Largest error of a packed number as a share of the range: half a step, and rounding."""
+FLOAT32 = 1e-6
+"""Relative rounding of numbers of a page."""
 DATA = r'<script id="content" type="application/json">(.*?)</script>'
 
 
-def unpacked(stored: dict[str, Any]) -> np.ndarray:
-    """What ``unpack`` of tools.js gives."""
-    codes = np.frombuffer(base64.b64decode(stored["codes"]), "<u2").reshape(stored["shape"])
-    return np.where(codes == MISSING, np.nan, stored["low"] + codes * stored["step"])
+def array_of(stored: dict[str, str]) -> np.ndarray:
+    """What Plotly reads of an array."""
+    shape = [int(size) for size in stored["shape"].split(",")]
+    return np.frombuffer(base64.b64decode(stored["bdata"]), f"<{stored['dtype']}").reshape(shape)
+
+
+def points_of(trace: dict[str, Any]) -> np.ndarray:
+    """Points [n, 3] of a trace."""
+    return np.stack([array_of(trace[axis]) for axis in "xyz"], axis=-1)
 
 
 def data_of(text: str) -> dict[str, Any]:
@@ -61,20 +64,14 @@ def text() -> str:
     return page(made_view())
 
 
-@example(np.full((3, 4), 5e-324) * np.eye(3, 4))
 @given(arrays(float, (3, 4), elements=st.floats(-1e6, 1e6) | st.just(np.nan)))
-def test_packed_numbers_keep_half_a_step(values):
-    stored, finite = unpacked(packed(values)), np.isfinite(values)
-    np.testing.assert_array_equal(np.isnan(stored), np.isnan(values))
-    if finite.any():
-        atol = ROUNDED * np.ptp(values[finite]) + SMALLEST_RANGE
-        np.testing.assert_allclose(stored[finite], values[finite], rtol=1e-12, atol=atol)
+def test_arrays_of_a_page_are_rounded_to_float32(values):
+    np.testing.assert_array_equal(array_of(spec(values)), values.astype(np.float32))
 
 
-def test_packed_integers_are_exact():
-    values = np.array([[-3, 0], [7, LARGEST - 3]])
-    np.testing.assert_array_equal(unpacked(packed(values)), values)
-    assert unpacked(packed(np.zeros((0, 3)))).shape == (0, 3)
+@given(arrays(int, (2, 3), elements=st.integers(0, 2**31)))
+def test_integers_of_a_page_are_exact(values):
+    np.testing.assert_array_equal(array_of(spec(values)), values)
 
 
 def test_page_holds_plotly_and_refers_to_nothing_else(text):
@@ -97,40 +94,53 @@ def test_markup_in_names_is_text(text):
     assert parsed.heading == f"made {MARKUP}"
     assert [tag for tag, _ in parsed.found].count("script") == 3
     data = data_of(text)
-    assert data["receivers"][0] == MARKUP
+    assert data["names"][0] == MARKUP
     assert data["notes"] == [f"A note {MARKUP}."]
+    escaped = MARKUP.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    (receivers,) = [trace for trace in data["traces"] if trace["name"] == "receivers (2)"]
+    assert receivers["text"][0] == escaped
+    label = data["layout"]["updatemenus"][0]["buttons"][0]["label"]
+    assert label.startswith(escaped[:20])
+    assert "<" not in label
 
 
 def test_page_holds_the_numbers_of_the_content(text):
     content, data = made_view(), data_of(text)
     counts = {"triangles": 5, "held_out_rows": 6, "transmitters": 3, "gaussians": 5, "paths": 12, "maps": 2}
     assert content.counts == counts
-    for stored, mesh in zip(data["scene"]["meshes"], content.scene.meshes, strict=True):
-        np.testing.assert_allclose(unpacked(stored["corners_m"]), mesh.corners_m, atol=4 * ROUNDED)
-        assert (stored["material"], stored["ceiling"]) == (mesh.material, mesh.ceiling)
-    np.testing.assert_array_equal(unpacked(data["rows"]["row"]), content.rows.row)
-    np.testing.assert_allclose(unpacked(data["rows"]["score"]), content.rows.score, atol=ROUNDED)
-    np.testing.assert_allclose(unpacked(data["gaussians"]["log_scale"]), content.gaussians.log_scale)
-    assert data["gaussians"]["total"] == 9
-    for name in ("tx", "rx", "order", "kind"):
-        np.testing.assert_array_equal(unpacked(data["paths"][name]), getattr(content.paths, name))
-    corners = unpacked(data["paths"]["corners_m"])
-    assert len(corners) == (content.paths.order + 2).sum()
-    np.testing.assert_allclose(corners, content.paths.corners_m, atol=4 * ROUNDED)
-    for stored, layer in zip(data["maps"], content.maps, strict=True):
-        assert stored["height_m"] == layer.height_m
-        values = unpacked(stored["values"]["power_dbm"])
-        np.testing.assert_allclose(values, layer.values["power_dbm"], atol=50 * ROUNDED)
-    low, high = data["quantities"]["power_dbm"]["range"]
-    assert low < high
+    traces = {trace["name"]: trace for trace in data["traces"] if trace["name"] != "map"}
+    number = {trace["name"]: str(k) for k, trace in enumerate(data["traces"])}
+    for mesh in content.scene.meshes:
+        stored = traces[mesh.material + ", ceiling" * mesh.ceiling]
+        faces = np.stack([array_of(stored[corner]) for corner in "ijk"], axis=-1)
+        np.testing.assert_allclose(points_of(stored)[faces], mesh.corners_m, rtol=FLOAT32)
+        assert (stored["color"], stored["visible"]) == (mesh.colour, "legendonly" if mesh.ceiling else True)
+    rows, paths = content.rows, content.paths
+    np.testing.assert_array_equal(array_of(traces["held-out rows (6)"]["customdata"]), rows.row)
+    for receiver, score in enumerate(rows.score):
+        shown = data["receivers"][receiver][number["held-out rows (6)"]]["marker.color"]
+        np.testing.assert_allclose(array_of(shown), score, rtol=FLOAT32)
+    ends = np.cumsum(paths.order + 2)
+    for k, (tx, rx) in enumerate(zip(paths.tx, paths.rx, strict=True)):
+        stored = data["pairs"][tx][rx][number[f"paths: {paths.kinds[paths.kind[k]]}"]]
+        corners = paths.corners_m[ends[k] - paths.order[k] - 2 : ends[k]]
+        np.testing.assert_allclose(points_of(stored)[:-1], corners, rtol=FLOAT32)
+        assert array_of(stored["line.color"]) == pytest.approx(paths.gain_db[k])
+        assert array_of(stored["customdata"]) == pytest.approx(paths.length_m[k])
+    maps = [(k, trace) for k, trace in enumerate(data["traces"]) if trace["name"] == "map"]
+    assert [trace["visible"] for _, trace in maps] == [True, False, False, False]
+    for (k, trace), layer in zip(maps[::2], content.maps, strict=True):
+        assert np.nanmax(array_of(trace["z"])) == layer.height_m
+        for receiver, values in enumerate(layer.values["power_dbm"]):
+            np.testing.assert_array_equal(array_of(data["receivers"][receiver][str(k)]["surfacecolor"]), values)
 
 
-def test_images_of_spectra_have_the_highest_elevation_at_the_top():
-    grey = np.zeros((4, 6))
-    grey[3, 2] = 1.0
-    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(png(grey).partition(",")[2]))))
-    assert pixels[0, 2] == pixels.sum() == 255
-    assert png(np.full((4, 6), np.nan)) is None
+def test_axes_hold_all_that_is_shown(text):
+    scene = data_of(text)["layout"]["scene"]
+    content = made_view()
+    for axis, values in zip("xyz", content.receivers_m.T, strict=True):
+        low, high = scene[f"{axis}axis"]["range"]
+        assert low <= values.min() <= values.max() <= high
 
 
 def test_views_display_themselves_in_notebooks(text):

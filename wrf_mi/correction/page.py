@@ -22,10 +22,10 @@ from matplotlib.colors import Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, listed, write_atomically, write_figure
+from ..scene import drawing
 from ..scene.correction_data import FILE
 from ..scene.correction_data import KEY as DATA
 from ..scene.mesh.surfaces import Kind
@@ -318,17 +318,13 @@ def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
         room.legend(handles=handles, fontsize=8, loc="upper left")
     else:
         label, most = "shifts of planes along their normals", max(1.0, float(np.abs(shift).max()))
-        shades = ScalarMappable(Normalize(-most, most), "RdBu")
-        colours = shades.to_rgba(shift[surfaces.plane][shown], alpha=0.45)
-        figure.colorbar(shades, ax=room, shrink=0.6, pad=0.14, label="shift (mm)")
-    room.add_collection3d(Poly3DCollection(triangles[shown], facecolors=colours, edgecolors="0.4", linewidths=0.3))
+        shifts = ScalarMappable(Normalize(-most, most), "RdBu")  # signed: planes that stayed are white
+        colours = shifts.to_rgba(shift[surfaces.plane][shown], alpha=0.45)
+        drawing.colour_bar(figure, shifts, room, "shift (mm)", shrink=0.6, pad=0.14)
+    drawing.draw_faces(room, triangles[shown], colours, edgecolors="0.4", linewidths=0.3, antialiaseds=True)
     room.plot(*correction.misfit.record.tx_pos_m[correction.misfit.rows].T, ",", color="0.2")
-    for receiver in correction.misfit.receivers:
-        room.plot(*np.asarray(receiver.position_m)[:, None], "^", color="C1")
-    low, high = triangles.reshape(-1, 3).min(axis=0), triangles.reshape(-1, 3).max(axis=0)
-    for axis, a, b in zip("xyz", low, high, strict=True):
-        room.set(**{f"{axis}lim": (a, b), f"{axis}label": f"{axis} (m)"})
-    room.set_box_aspect(np.maximum(high - low, 0.1))
+    drawing.draw_devices(room, "receiver", [receiver.position_m for receiver in correction.misfit.receivers])
+    drawing.set_box(room, triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1)))
     room.set_title(label)
     _plot_scores(figure.add_subplot(1, 2, 2), correction)
     return figure

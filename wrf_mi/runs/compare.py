@@ -16,6 +16,7 @@ from ..core import InputError, Prediction
 from ..core.angles import FloatArray
 from ..core.files import atomic_folder, write_atomically, write_csv, write_figure
 from ..estimators.ray_tracing import PATHS
+from ..scene.drawing import without_formulas
 from ..tasks import TASKS
 from ..training.session import OnProgress, quiet
 from . import figures
@@ -87,7 +88,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
         _write_table(folder / "differences.csv", DIFFERENCES, changes)
         for done, (name, _, figure) in enumerate(drawn):
             on_progress("drawing", done / len(drawn))
-            write_figure(folder / name, figures.without_formulas(figure))
+            write_figure(folder / name, without_formulas(figure))
         write_atomically(folder / INDEX, page(sections, out))
     return out / INDEX
 

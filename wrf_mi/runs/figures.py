@@ -7,16 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
 from numpy.typing import ArrayLike
 
 from ..core.angles import FloatArray, azimuth_elevation, azimuth_rad, elevation_rad
 from ..core.types import IntArray
+from ..scene import drawing
 from ..stages.scene import STAGES
 
 if TYPE_CHECKING:
@@ -43,7 +41,7 @@ def polar_spectrum(axes: Axes, spectrum: ArrayLike, title: str = "") -> None:
     # The zenith is no sample: it gets the mean of the ring around it.
     values = np.vstack([values, np.full(width, values[-1].mean())])
     radius_deg = np.append(90 - np.degrees(elevation_rad(height)), 0.0)
-    axes.pcolormesh(azimuth_rad(width), radius_deg, values, shading="nearest", cmap="viridis", vmin=0, vmax=1)
+    axes.pcolormesh(azimuth_rad(width), radius_deg, values, shading="nearest", cmap=drawing.COLOUR_MAP, vmin=0, vmax=1)
     _sky(axes, title, ring_labels="white")
 
 
@@ -84,30 +82,28 @@ def spectrum_table(rows: Rows, columns: Sequence[str]) -> Figure:
 
 def position_table(rows: Rows, columns: Sequence[str], tx_pos_m: ArrayLike, label: str) -> Figure:
     """Table of maps of values [m], NaN left out, at positions [m, 3] in metres; those of a row share their colours."""
-    x, y, _ = np.asarray(tx_pos_m, float).T
-    aspect = float(np.clip((np.ptp(y) + 0.1) / (np.ptp(x) + 0.1), 0.3, 1.5))
+    positions_m = np.asarray(tx_pos_m, float)
+    x, y, _ = np.ptp(positions_m, axis=0) + 0.1
+    aspect = float(np.clip(y / x, 0.3, 1.5))
     panel_in = max(PANEL_IN, TABLE_IN / len(columns))
     figure = Figure(figsize=(panel_in * len(columns) + 0.8, panel_in * aspect * len(rows) + 0.6), layout="constrained")
     grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey=True)
     for r, (name, maps) in enumerate(rows):
         row_values = np.concatenate([np.ravel(values) for values in maps if values is not None])
         low, high = np.nanpercentile(row_values, [1, 99]) if np.isfinite(row_values).any() else (0.0, 1.0)
+        colours = drawing.shades(low, high)
         for c, (title, values) in enumerate(zip(columns, maps, strict=True)):
             axes = grid[r, c]
-            axes.set_aspect("equal")
-            axes.tick_params(labelsize=6)
-            axes.set_title(title if r == 0 else "", fontsize=8)
-            axes.set_ylabel(f"{name}\ny (m)" if c == 0 else "", fontsize=7)
-            axes.set_xlabel("x (m)" if r == len(rows) - 1 else "", fontsize=7)
+            drawing.set_plan(axes)
+            axes.set_title(title if r == 0 else "", fontsize=drawing.LABEL_SIZE)
+            axes.set_ylabel(f"{name}\ny (m)")
+            axes.label_outer()
             if values is None:
                 axes.set_axis_off()
             else:
-                size = float(np.clip(POINTS_AREA / len(x), 6, 40))
-                axes.scatter(x, y, c=np.asarray(values), s=size, cmap="viridis", vmin=low, vmax=high, linewidths=0)
-        colours = ScalarMappable(Normalize(low, high), cmap="viridis")
-        bar = figure.colorbar(colours, ax=list(grid[r]), shrink=0.9)
-        bar.set_label(label, fontsize=7)
-        bar.ax.tick_params(labelsize=6)
+                size = float(np.clip(POINTS_AREA / len(positions_m), 6, 40))
+                drawing.draw_values(axes, positions_m, np.asarray(values), colours, s=size, linewidths=0)
+        drawing.colour_bar(figure, colours, list(grid[r]), label, shrink=0.9)
     return figure
 
 
@@ -139,14 +135,12 @@ def footprint_sky(spectrum: ArrayLike, gaussians: Footprints, weight: ArrayLike,
     figure = Figure(figsize=(2 * 1.6 * PANEL_IN, 1.5 * PANEL_IN), layout="constrained")
     left, right = figure.subplots(1, 2, subplot_kw={"projection": "polar"})
     polar_spectrum(left, spectrum, "spectrum")
-    lines = LineCollection(list(_outlines(gaussians, drawn)), cmap="magma_r", linewidths=0.8)
+    lines = LineCollection(list(_outlines(gaussians, drawn)), cmap=drawing.COLOUR_MAP, linewidths=0.8)
     lines.set_array(colour[drawn])
     lines.set_clim(0, None)
     right.add_collection(lines)
     _sky(right, f"footprints of {len(drawn)} Gaussians", ring_labels="black")
-    bar = figure.colorbar(lines, ax=right, shrink=0.8)
-    bar.set_label(label, fontsize=8)
-    bar.ax.tick_params(labelsize=7)
+    drawing.colour_bar(figure, lines, right, label, shrink=0.8)
     return figure
 
 
@@ -247,7 +241,7 @@ def time_scatter(times: Mapping[str, Mapping[str, float]], scores: Mapping[str, 
                 axes.plot(of_runs[name], score, label=name, **_style(number))
         if any(seconds > 0 for seconds in of_runs.values()):
             axes.set_xscale("log")
-            axes.xaxis.set_major_formatter("{x:g}")  # the default is a formula, see `without_formulas`
+            axes.xaxis.set_major_formatter("{x:g}")  # the default is a formula, see `drawing.without_formulas`
             axes.xaxis.set_minor_formatter(NullFormatter())
         else:
             axes.set_xticks([])
@@ -256,8 +250,7 @@ def time_scatter(times: Mapping[str, Mapping[str, float]], scores: Mapping[str, 
         axes.margins(0.15)
         axes.grid(alpha=0.3)
     panels[0].set_ylabel(label)
-    entries = {text: line for axes in panels for line, text in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(entries.values(), entries.keys(), fontsize=8, loc="outside lower center", ncols=min(3, len(scores)))
+    drawing.add_legend(figure, columns=min(3, len(scores)))
     return figure
 
 
@@ -271,14 +264,7 @@ def choice_map(chosen: ArrayLike, names: Sequence[str], tx_pos_m: ArrayLike) -> 
         at = which == number
         label = f"{name}: {at.sum() / max((which >= 0).sum(), 1):.0%}"
         axes.plot(x[at], y[at], markersize=4, label=label, **_style(number))
-    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    drawing.set_plan(axes)
     axes.grid(alpha=0.3)
-    figure.legend(fontsize=8, loc="outside lower center", ncols=min(3, len(names)))
-    return figure
-
-
-def without_formulas(figure: Figure) -> Figure:
-    """Switch off formulas in all texts of a figure: names may contain dollar signs."""
-    for text in figure.findobj(Text):
-        text.set_parse_math(False)
+    drawing.add_legend(figure, columns=min(3, len(names)))
     return figure

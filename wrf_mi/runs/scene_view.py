@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,12 @@ from matplotlib.figure import Figure
 from ..core.angles import FloatArray
 from ..estimators.ray_tracing import PATHS
 from ..gaussians.parameters import Gaussians
-from ..scene.mesh.surfaces import KINDS, Kind, Surface
+from ..scene.mesh.surfaces import KINDS, Kind, Surface, cut_lines
 from ..scene.preview import GaussianCloud, draw_scene
 from ..tracing import load_trace
 from ..tracing.search.surfaces import scene_surfaces
 from .api import open_run
+from .run import Run
 
 SHOWN_GAUSSIANS = 40  # number of Gaussians shown, the strongest
 WEAKEST = 1e-6  # lower limit of drawn signals: -120 dB
@@ -53,6 +55,13 @@ def surfaces_of(scene: Any) -> list[Surface]:
         vertices, vertex = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
         surfaces.append(Surface(name, kind, vertices, vertex.reshape(-1, 3)))
     return surfaces
+
+
+def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:
+    """Lines [n, 2, 2] in which a height cuts surfaces of a run's scene, metres, of those that it cuts."""
+    scene = run.problem.opened_scene
+    cuts = [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
+    return [lines for lines in cuts if len(lines)]  # a floor has none
 
 
 def gaussian_cloud(gaussians: Gaussians) -> GaussianCloud:

@@ -1,7 +1,6 @@
 """A picture of a scene in two views: from above at a slant without the ceiling, and in plan.
 
-Surfaces, the scan they were made from, traced paths and the Gaussians of a field are drawn in both. Figures are made
-without pyplot: no global state, no window system.
+Surfaces, the scan they were made from, traced paths and the Gaussians of a field are drawn in both.
 """
 
 from __future__ import annotations
@@ -13,29 +12,25 @@ from typing import Any
 import numpy as np
 import trimesh
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import Normalize, to_rgb
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
-from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.angles import FloatArray, rotation_matrix, unit_vectors
 from ..core.paths import Paths
+from . import drawing
 from .mesh.surfaces import Surface, box_of, cut_lines
 
 KIND_COLOURS = {"floor": "#cfc6b8", "ceiling": "#e8e8e4", "wall": "#7d9cb5", "other": "#c58f5c"}
-MOST_POINTS, MOST_GAUSSIANS, MOST_PATHS, MOST_FACES = 20_000, 3_000, 300, 20_000
+MOST_POINTS, MOST_GAUSSIANS, MOST_PATHS = 20_000, 3_000, 300
 """Points are thinned to their number; of the others the strongest or largest are drawn."""
 OUTLINE_POINTS = 20
 SPAN_DB = 40.0  # range of the colours below the strongest
-ENDS = (("transmitter", "^", "#c1121f"), ("receiver", "o", "#0353a4"))
-"""Name, marker and colour of each end of paths."""
-ELEVATION_DEG, AZIMUTH_DEG = 48.0, -60.0  # direction of the viewer of the slanted view
-EYE = unit_vectors(*np.radians([AZIMUTH_DEG, ELEVATION_DEG]))  # unit vector from the scene to the viewer
+EYE = unit_vectors(*np.radians([drawing.AZIMUTH_DEG, drawing.ELEVATION_DEG]))  # from the scene to the viewer
 LIGHT = np.array([0.35, -0.5, 0.79])
 CUT = 0.45  # share of the height at which the plan is cut
 TOP = 0.8  # level faces above this share of the height are taken off like a ceiling
@@ -140,17 +135,16 @@ def _draw_scan(slant: Any, plan: Axes, scan: FloatArray, top_m: float) -> None:
 def _draw_ends(slant: Any, plan: Axes, ends: Sequence[FloatArray | None]) -> list[Line2D]:
     """Markers of transmitters and receivers, and their handles for the legend."""
     handles = []
-    for points, (name, marker, colour) in zip(ends, ENDS, strict=True):
+    for points, kind in zip(ends, drawing.ENDS, strict=True):
         if points is not None:
-            slant.plot(*points.T, marker, color=colour, markersize=5, markeredgecolor="white", zorder=8)
-            plan.plot(*points.T[:2], marker, color=colour, markersize=6, markeredgecolor="white", zorder=8)
-            handles.append(Line2D([], [], marker=marker, color=colour, linestyle="none", label=name))
+            drawing.draw_devices(slant, kind, points)
+            handles.append(drawing.draw_devices(plan, kind, points))
     return handles
 
 
 def _draw_gaussians(figure: Figure, slant: Any, plan: Axes, cloud: GaussianCloud) -> None:
     """The outline of each Gaussian: an orthographic view keeps Gaussians Gaussian."""
-    rgba = _coloured(figure, cloud.strength_db, "viridis", "signal of a Gaussian (dB)", 0.4)
+    rgba = _coloured(figure, cloud.strength_db, "signal of a Gaussian (dB)", 0.4)
     right = np.cross([0, 0, 1], EYE) / np.linalg.norm(np.cross([0, 0, 1], EYE))
     screen = np.stack([right, np.cross(EYE, right)])
     outlines = cloud.position_m[:, None] + cloud.silhouettes(screen) @ screen
@@ -171,19 +165,17 @@ def _draw_paths(figure: Figure, slant: Any, plan: Axes, paths: Paths, transmitte
         np.vstack([transmitters[paths.tx[i]], paths.vertices_m[i][: int(paths.bounces[i])], receivers[paths.rx[i]]])
         for i in order
     ]
-    rgba = _coloured(figure, strength[order], "plasma", "gain of a path (dB)", 0.85)
+    rgba = _coloured(figure, strength[order], "gain of a path (dB)", 0.85)
     slant.add_collection3d(Line3DCollection(corners, colors=rgba, linewidths=0.9, zorder=6))
     plan.add_collection(LineCollection([c[:, :2] for c in corners], colors=rgba, linewidths=0.9, zorder=6))
 
 
-def _coloured(figure: Figure, strength: FloatArray, colours: str, label: str, alpha: float) -> FloatArray:
+def _coloured(figure: Figure, strength: FloatArray, label: str, alpha: float) -> FloatArray:
     """Colours [n, 4] of strengths, and their bar in the figure."""
     top = float(np.max(strength))
-    shades = ScalarMappable(Normalize(max(float(np.min(strength)), top - SPAN_DB), top + 1e-9), colours)
-    bar = figure.colorbar(shades, ax=figure.axes[:2], shrink=0.6, pad=0.01, aspect=30)
-    bar.set_label(label, fontsize=8)
-    bar.ax.tick_params(labelsize=7)
-    return shades.to_rgba(strength, alpha=alpha)
+    colours = drawing.shades(max(float(np.min(strength)), top - SPAN_DB), top + 1e-9)
+    drawing.colour_bar(figure, colours, figure.axes[:2], label, shrink=0.6, pad=0.01, aspect=30)
+    return colours.to_rgba(strength, alpha=alpha)
 
 
 def _normals(corners: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -236,31 +228,14 @@ def _draw_slant(axes: Any, surfaces: Sequence[Surface], low: FloatArray, high: F
     for order, group in enumerate((floors, others), start=1):
         # The empty part serves groups without surfaces.
         lit = [(np.empty((0, 3, 3)), np.empty((0, 4))), *(_lit_faces(surface, low, high) for surface in group)]
-        corners, shades = map(np.concatenate, zip(*lit, strict=True))
-        if len(largest := np.argsort(-trimesh.triangles.area(corners))[:MOST_FACES]):
-            flat = {"edgecolors": "none", "antialiaseds": False, "zorder": order}
-            axes.add_collection3d(Poly3DCollection(corners[largest], facecolors=shades[largest], **flat))
+        corners, colours = map(np.concatenate, zip(*lit, strict=True))
+        drawing.draw_faces(axes, corners, colours, zorder=order)
     # Thin lines along the free edges of walls and floors make the corners readable; closed bodies have none.
     if len(lines := np.concatenate([np.empty((0, 2, 3)), *map(free_edges, floors + others)])):
         axes.add_collection3d(Line3DCollection(lines, colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3))
-    _set_view(axes, low, high)
-
-
-def _set_view(axes: Any, low: FloatArray, high: FloatArray) -> None:
-    """Orthographic view of a box of two corners [3], to scale, with labels."""
-    axes.set_proj_type("ortho")
-    axes.view_init(ELEVATION_DEG, AZIMUTH_DEG)
-    size = np.maximum(high - low, 0.1)
-    for axis, name, a, s in zip((axes.xaxis, axes.yaxis, axes.zaxis), "xyz", low, size, strict=True):
-        axes.set(**{f"{name}lim": (a, a + s)})
-        axis.set_label_text(f"{name} (m)", fontsize=8)
-        axis.set_pane_color((1, 1, 1, 0))
-    axes.zaxis.labelpad = -8
-    axes.set_box_aspect(size, zoom=0.98)
-    axes.tick_params(labelsize=7, pad=0)
+    drawing.set_box(axes, low, high)
     axes.set_title("ceiling not drawn, walls in front transparent", fontsize=9)
-    axes.zaxis.set_major_locator(MaxNLocator(3))
-    axes.grid(False)
+    axes.zaxis.labelpad = -8
 
 
 def _draw_plan(axes: Axes, surfaces: Sequence[Surface], low: FloatArray, high: FloatArray) -> None:
@@ -274,18 +249,12 @@ def _draw_plan(axes: Axes, surfaces: Sequence[Surface], low: FloatArray, high: F
             flat: dict[str, Any] = {"edgecolors": "none", "antialiased": False, "zorder": 1}
             axes.add_collection(PolyCollection(list(triangles), facecolors=[0.45 * colour + 0.55], **flat))
         elif len(cut := cut_lines(surface, level)):
-            lines = LineCollection(list(cut), colors=[0.6 * colour], linewidths=2.2, capstyle="round", zorder=3)
-            axes.add_collection(lines)
+            drawing.draw_outlines(axes, [cut], colors=[0.6 * colour], linewidths=2.2, zorder=3)
             if named and surface.kind == "wall":
                 _draw_name(axes, surface.name, cut)
     size = np.maximum(high - low, 0.1)[:2]
     margin = 0.06 * size.max()
-    axes.set_xlim(low[0] - margin, low[0] + size[0] + margin)
-    axes.set_ylim(low[1] - 2 * margin, low[1] + size[1] + margin)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x (m)", fontsize=8)
-    axes.set_ylabel("y (m)", fontsize=8)
-    axes.tick_params(labelsize=7)
+    drawing.set_plan(axes, low[:2] - margin * np.array([1, 2]), low[:2] + size + margin)
     axes.set_title(f"plan, cut at z = {level:.1f} m", fontsize=9)
     bar = max((b for b in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100) if b <= size[0] / 3), default=0.1)
     corner = low[0], low[1] - 1.35 * margin

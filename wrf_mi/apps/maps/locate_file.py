@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch
+from matplotlib.patches import Circle
 
 from ...core import DataFault, InputError, Receiver
 from ...core.angles import FloatArray
@@ -23,12 +21,13 @@ from ...core.yaml_files import read_yaml
 from ...datasets.folder_files import CsvTable, read_csv
 from ...runs.folder import load_rows
 from ...runs.run import Run
+from ...runs.scene_view import scene_cuts
+from ...scene import drawing
 from ...tasks.scores import summary
 from ..importing.importing import FACTS
 from ..importing.observed import ObservedTable, read_observed
 from ..importing.readings import id_key
 from .locate import LocatedPositions
-from .picture import scene_cuts
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +36,9 @@ DBM, RSSI, ANCHOR = "_dbm", "rssi_", "anchor"
 SILENT = "no receiver of the run received anything, so there is no position; remove the row"
 SHOWN, COLUMNS = 6, 3  # number of rows that are drawn, and panels side by side
 MARGIN_M = 0.5  # margin of a panel around the candidates
-REGION, ESTIMATE, NEIGHBOURS, TRUTH = "tab:orange", "tab:red", "tab:purple", "black"
+REGION, ESTIMATE, NEIGHBOURS = "tab:orange", "tab:red", "tab:purple"
+TRUTH: dict[str, Any] = {"marker": "*", "markersize": 11, "color": "white", "markeredgecolor": "black"}
+TRUTH |= {"linestyle": "none", "label": "true position"}
 
 
 def read_observations(
@@ -215,38 +216,19 @@ def draw_positions(run: Run, located: LocatedPositions, true_m: FloatArray | Non
     columns = min(COLUMNS, len(rows))
     lines = -(-len(rows) // columns)
     arrays, walls = posterior_arrays(located), scene_cuts(run, located.candidates.grid.height_m)
-    size = np.array([np.ptp(arrays["x_m"]), np.ptp(arrays["y_m"])]) + 1.0
+    ends_m = np.stack([arrays["x_m"][[0, -1]], arrays["y_m"][[0, -1]]], axis=1)
+    size = ends_m[1] - ends_m[0] + 1.0
     height = 3.6 * float(np.clip(size[1] / size[0], 0.4, 2.0)) + 0.6
     figure = Figure(figsize=(3.6 * columns + 0.3, height * lines + 0.5), layout="constrained", facecolor="white")
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes, row in zip(panels, rows, strict=False):
         _draw_row(axes, arrays, located, int(row), true_m)
-        for lines_m in walls:
-            axes.add_collection(LineCollection(list(lines_m), colors="0.35", linewidths=1.2))
-        place = np.stack([receiver.position_m[:2] for receiver in run.receivers])
-        axes.plot(*place.T, "^", color="tab:blue", markersize=6, markeredgecolor="white")
-        for grid_m, set_limits in ((arrays["x_m"], axes.set_xlim), (arrays["y_m"], axes.set_ylim)):
-            set_limits(grid_m[0] - MARGIN_M, grid_m[-1] + MARGIN_M)
-        axes.set_aspect("equal")
-        axes.tick_params(labelsize=7)
+        drawing.draw_outlines(axes, walls)
+        drawing.draw_devices(axes, "receiver", [receiver.position_m for receiver in run.receivers])
+        drawing.set_plan(axes, ends_m[0] - MARGIN_M, ends_m[1] + MARGIN_M)
     for axes in panels[len(rows) :]:
         axes.set_visible(False)
-    figure.supxlabel("x (m)", fontsize=8)
-    figure.supylabel("y (m)", fontsize=8)
-    dot: dict[str, Any] = {"linestyle": "none"}
-    handles: list[Any] = [
-        Patch(color="tab:green", alpha=0.6, label="probability"),
-        Line2D([], [], color=REGION, label=f"{located.level:.0%} region"),
-        Line2D([], [], marker="o", color=ESTIMATE, label="estimate", **dot),
-        Line2D([], [], color=ESTIMATE, linestyle=":", label=f"circle of {located.level:.0%}"),
-    ]
-    if located.calibration.neighbours is not None:
-        name = f"{located.calibration.neighbours.count} nearest neighbours"
-        handles.append(Line2D([], [], marker="s", color=NEIGHBOURS, label=name, **dot))
-    if true_m is not None:
-        handles.append(Line2D([], [], marker="+", color=TRUTH, markeredgewidth=2, label="true position", **dot))
-    handles.append(Line2D([], [], marker="^", color="tab:blue", label="receiver", **dot))
-    figure.legend(handles=handles, loc="outside upper center", ncols=4, fontsize=8)
+    drawing.add_legend(figure, "outside upper center")
     return figure
 
 
@@ -255,7 +237,8 @@ def _draw_row(
 ) -> None:
     grid = located.candidates.grid
     drawn = arrays["probability"][row]
-    axes.pcolormesh(grid.x_m, grid.y_m, np.where(drawn > 0, drawn, np.nan), shading="nearest", cmap="Greens")
+    colours = drawing.shades(0, float(drawn.max()))
+    drawing.draw_layer(axes, grid.x_m, grid.y_m, np.where(drawn > 0, drawn, np.nan), colours)
     inside = np.zeros(drawn.size)
     inside[located.candidates.inside] = located.region[row]
     if min(drawn.shape) > 1:
@@ -263,13 +246,16 @@ def _draw_row(
         x, y = (np.concatenate([[2 * a[0] - a[1]], a, [2 * a[-1] - a[-2]]]) for a in (grid.x_m, grid.y_m))
         bordered = np.pad(inside.reshape(drawn.shape), 1)
         axes.contour(x, y, bordered, levels=[0.5], colors=REGION, linewidths=1.4)
+        axes.plot([], color=REGION, label=f"{located.level:.0%} region of the probability, brightest where largest")
     x_m, y_m = located.tx_pos_m[row, :2]
     axes.add_patch(Circle((x_m, y_m), located.radius_m[row], fill=False, color=ESTIMATE, linewidth=0.8, linestyle=":"))
-    axes.plot(x_m, y_m, "o", color=ESTIMATE, markersize=6)
-    if located.neighbours_m is not None:
-        axes.plot(*located.neighbours_m[row, :2], "s", color=NEIGHBOURS, markersize=5)
+    mark: dict[str, Any] = {"markeredgecolor": "white", "linestyle": "none"}
+    axes.plot(x_m, y_m, "o", color=ESTIMATE, label=f"estimate, and its circle of {located.level:.0%}", **mark)
+    if located.neighbours_m is not None and located.calibration.neighbours is not None:
+        name = f"{located.calibration.neighbours.count} nearest neighbours"
+        axes.plot(*located.neighbours_m[row, :2], "s", color=NEIGHBOURS, label=name, **mark)
     title = f"row {row + 1}: {located.area_m2[row]:.1f} m²"
     if true_m is not None:
-        axes.plot(*true_m[row], "+", color=TRUTH, markersize=11, markeredgewidth=2)
+        axes.plot(*true_m[row], **TRUTH)
         title += f", error {located.error_m(true_m)[row]:.2f} m"
     axes.set_title(title, fontsize=9)

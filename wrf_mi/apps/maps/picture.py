@@ -8,25 +8,19 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
 from ...core import Prediction
 from ...core.angles import FloatArray
 from ...core.carriers import FREQUENCY
 from ...estimators.receiver_places import stored_places
-from ...runs.figures import without_formulas
 from ...runs.folder import load_rows
 from ...runs.results import RECEPTION
 from ...runs.run import Run
-from ...runs.scene_view import surfaces_of
-from ...scene.mesh.surfaces import cut_lines
-from ...scene.preview import AZIMUTH_DEG, ELEVATION_DEG, MOST_FACES
+from ...runs.scene_view import scene_cuts
+from ...scene import drawing
 from .dataset import COVERAGE, POWER, STD, STD_OF_MEAN
 
 if TYPE_CHECKING:
@@ -38,12 +32,11 @@ MOST_POINTS = 250  # largest number of training rows of a panel, and of other me
 TAIL = 1.0  # percentage of values beyond either end of the colour scale
 MEASURED_TAIL = 10.0  # likewise for measured levels, among which are single deep fades
 STRONGEST = "strongest receiver"
-TRAINED = {"marker": "o", "s": 13, "edgecolors": "white", "linewidths": 0.4}
-OTHER = {"marker": "s", "s": 11, "edgecolors": "black", "linewidths": 0.4}
+AT_ESTIMATED = "receiver at an estimated place, with one standard deviation"
+TRAINED: dict[str, Any] = {"label": "training rows", "marker": "o", "s": 13, "edgecolors": "white"}
+OTHER: dict[str, Any] = {"label": "other measured rows", "marker": "s", "s": 11, "edgecolors": "black"}
 EDGE = 0.02  # margin around all that is drawn, a share of its size
 NEARBY = 0.25  # distance from the rest of a map up to which estimated receivers are drawn, a share of its size
-ESTIMATED: dict[str, Any] = {"marker": "X", "s": 26, "facecolors": "none"}  # receiver at an estimated place
-RED = "#c1121f"  # of receivers
 MOST_DEVIATIONS = 3  # number of receivers up to which the standard deviation of each is drawn
 CERTAIN = 0.9  # least coverage of a panel in one colour, whose title states the values
 LETTERS_PER_INCH, LINE_IN = 14, 0.16  # of the text above the panels, and height of its lines in inches
@@ -91,8 +84,8 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     at_m, around_m = _receivers(dataset)[:, : area_m.shape[1]], NEARBY * np.ptp(area_m, axis=0).max()
     is_drawn = ((at_m >= area_m[0] - around_m) & (at_m <= area_m[1] + around_m)).all(axis=1)
     area_m = _with_margin(np.concatenate([area_m, at_m[is_drawn]]))
-    heading = _heading(dataset, measured, estimated, is_drawn, int(width * LETTERS_PER_INCH))
-    height = (PANEL_IN * _aspect(dataset) + 0.5) * lines + 0.3 + LINE_IN * heading.count("\n")
+    heading = _heading(dataset, measured, is_drawn, int(width * LETTERS_PER_INCH))
+    height = (PANEL_IN * _aspect(dataset) + 0.5) * lines + 0.6 + LINE_IN * heading.count("\n")
     figure = Figure(figsize=(width, height), layout="constrained")
     kind: dict[str, Any] = {} if flat else {"projection": "3d", "computed_zorder": False}
     grid = figure.subplots(lines, columns, squeeze=False, subplot_kw=kind)
@@ -101,31 +94,31 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
             axes.set_axis_off()
             continue
         if flat:
-            _draw_plan(axes, dataset, panel.values, panel.colours, walls)
-            axes.set_xlabel("x (m)", fontsize=7)
-            axes.set_ylabel("y (m)", fontsize=7)
+            drawing.draw_layer(axes, dataset["x"].values, dataset["y"].values, panel.values, panel.colours)
+            drawing.draw_outlines(axes, walls)
         else:
-            _draw_mesh(axes, dataset, panel.values, panel.colours)
+            triangles = dataset["triangle"].values
+            drawing.draw_faces(axes, triangles, panel.colours.to_rgba(np.ma.masked_invalid(panel.values)), zorder=1)
+            drawing.set_box(axes, triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1)))
         _draw_points(axes, dataset, panel, estimated, is_drawn)
-        if flat:  # of which ellipses may reach beyond
-            axes.set(xlim=area_m[:, 0], ylim=area_m[:, 1])
+        if flat:  # after ellipses, which may reach beyond
+            drawing.set_plan(axes, *area_m)
         axes.set_title(textwrap.fill(panel.title, int(PANEL_IN * LETTERS_PER_INCH)), fontsize=8)
-        axes.tick_params(labelsize=6)
-        bar = figure.colorbar(panel.colours, ax=axes, shrink=0.8, pad=0.02 if flat else 0.12, extend=panel.beyond)
-        bar.ax.tick_params(labelsize=6)
         top = f" (largest: {np.nanmax(panel.values):.0f})" if panel.beyond == "both" else ""
-        bar.set_label(f"{panel.unit}{top}", fontsize=7)
+        how = {"shrink": 0.8, "pad": 0.02 if flat else 0.12, "extend": panel.beyond}
+        drawing.colour_bar(figure, panel.colours, axes, f"{panel.unit}{top}", **how)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
     figure.suptitle(heading, fontsize=8)
-    return without_formulas(figure)
+    drawing.add_legend(figure)
+    return drawing.without_formulas(figure)
 
 
 def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Panel | None]:
     """Panels of the strongest receiver, then of each of the first ones, in lines; None leaves a place free."""
     power = dataset[POWER].values
     low, high = _range(power, np.concatenate([rows.level for rows in measured]))
-    colours = ScalarMappable(Normalize(low, max(high, low + 1e-3)), "viridis")
+    colours = drawing.shades(low, max(high, low + 1e-3))
     unit = dataset[POWER].attrs["units"]
     names = [str(name) for name in dataset["receiver"].values]
     several = len(names) > 1
@@ -145,10 +138,10 @@ def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Pan
     title, each = "{}: standard deviation of " + of, deviation in dataset and 1 < len(names) <= MOST_DEVIATIONS
     if deviation in dataset:
         drawn = dataset[deviation].values if each else of_best(deviation)
-        shades = ScalarMappable(Normalize(0, max(float(np.nanmax(drawn)), 1e-3)), "magma")
-        panels.append(_Panel(title.format(who), of_best(deviation), shades, "dB", "neither", number, None))
+        spread = drawing.shades(0, max(float(np.nanmax(drawn)), 1e-3))
+        panels.append(_Panel(title.format(who), of_best(deviation), spread, "dB", "neither", number, None))
     if COVERAGE in dataset:
-        probable = ScalarMappable(Normalize(0, 1), "cividis")
+        probable = drawing.shades(0, 1)
         values = of_best(COVERAGE)
         panels.append(_Panel(_covered(dataset, who, values), values, probable, "probability", "neither", number, None))
     numbers = range(len(names) if several else 0)[:MOST_PANELS]
@@ -156,7 +149,7 @@ def _panels(dataset: xarray.Dataset, measured: Sequence[_Measured]) -> list[_Pan
     if not each:
         return panels + powers
     std = dataset[deviation].values
-    spreads = [_Panel(title.format(names[k]), std[k], shades, "dB", "neither", k, None) for k in numbers]
+    spreads = [_Panel(title.format(names[k]), std[k], spread, "dB", "neither", k, None) for k in numbers]
     return [panel for line in (panels, powers, spreads) for panel in (*line, *[None] * (COLUMNS - len(line)))]
 
 
@@ -200,14 +193,8 @@ def _with_margin(points_m: FloatArray) -> FloatArray:
     return np.stack([low - margin_m, high + margin_m])
 
 
-def _heading(
-    dataset: xarray.Dataset,
-    measured: Sequence[_Measured],
-    estimated: Mapping[str, Any],
-    is_drawn: NDArray[np.bool_],
-    width: int,
-) -> str:
-    """Title, heights of the transmitter, carrier and marks, in lines of at most ``width`` letters."""
+def _heading(dataset: xarray.Dataset, measured: Sequence[_Measured], is_drawn: NDArray[np.bool_], width: int) -> str:
+    """Title, heights of the transmitter and carrier, in lines of at most ``width`` letters."""
     heights = np.concatenate([rows.points_m[:, 2] for rows in measured])
     words = [] if "point" in dataset.sizes else [f"transmitter at z = {float(dataset['height']):.2f} m"]
     if FREQUENCY in dataset.attrs:
@@ -218,18 +205,9 @@ def _heading(
         words.append(f"measured at z = {heights.min():.2f} m")
     else:
         words.append(f"measured at z = {heights.min():.2f} to {heights.max():.2f} m")
-    trained = np.concatenate([rows.trained for rows in measured])
-    names = map(str, dataset["receiver"].values)
-    receivers = {name in estimated for name, drawn in zip(names, is_drawn, strict=True) if drawn}
-    outside = np.count_nonzero(np.isfinite(_receivers(dataset)).all(axis=1) & ~is_drawn)
-    marks = {
-        "circles: training rows": trained.any(),
-        "squares: other measured rows": not trained.all(),
-        "crosses: receivers": False in receivers,
-        "open crosses: receivers at estimated places, with one standard deviation": True in receivers,
-        f"{outside} estimated outside of the map, not drawn": outside,
-    }
-    parts = [dataset.attrs["title"], ", ".join(words), ", ".join(mark for mark, drawn in marks.items() if drawn)]
+    if outside := np.count_nonzero(np.isfinite(_receivers(dataset)).all(axis=1) & ~is_drawn):
+        words.append(f"{outside} receivers estimated outside of the map, not drawn")
+    parts = [dataset.attrs["title"], ", ".join(words)]
     if not dataset.attrs["level_is_absolute"]:
         parts.append("levels relative to full scale are no signal strengths")
     return "\n".join(textwrap.fill(part, width) for part in parts)
@@ -246,41 +224,6 @@ def _range(power: FloatArray, measured: FloatArray) -> tuple[float, float]:
 def _aspect(dataset: xarray.Dataset) -> float:
     x_m, y_m = (np.ptp(dataset[axis].values) + 0.1 for axis in "xy")
     return 0.9 if "point" in dataset.sizes else float(np.clip(y_m / x_m, 0.3, 1.6))
-
-
-def scene_cuts(run: Run, height_m: float) -> Sequence[FloatArray]:
-    """Lines [n, 2, 2] in which a height cuts surfaces of a run's scene, metres, of those that it cuts."""
-    scene = run.problem.opened_scene
-    cuts = [] if scene is None else [cut_lines(part, height_m) for part in surfaces_of(scene)]
-    return [lines for lines in cuts if len(lines)]  # a floor has none
-
-
-def _draw_plan(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable, walls: Any) -> None:
-    shades: Any = {"cmap": colours.cmap, "norm": colours.norm}
-    axes.pcolormesh(dataset["x"].values, dataset["y"].values, values, shading="nearest", rasterized=True, **shades)
-    for lines in walls:
-        axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2, capstyle="round"))
-    axes.set_aspect("equal")
-    axes.margins(0)
-
-
-def _draw_mesh(axes: Any, dataset: xarray.Dataset, values: FloatArray, colours: ScalarMappable) -> None:
-    triangles = dataset["triangle"].values
-    area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
-    largest = np.argsort(-area, kind="stable")[:MOST_FACES]
-    rgba = colours.to_rgba(np.ma.masked_invalid(values[largest]))
-    faces = Poly3DCollection(triangles[largest], facecolors=rgba, edgecolors="none", antialiaseds=False, zorder=1)
-    axes.add_collection3d(faces)
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    size = np.maximum(high - low, 0.05 * float((high - low).max()))
-    for axis, start, extent in zip("xyz", low, size, strict=True):
-        axes.set(**{f"{axis}lim": (start, start + extent)})
-        # Labels of a short axis would lie upon each other.
-        getattr(axes, f"{axis}axis").set_major_locator(MaxNLocator(max(1, round(6 * extent / size.max()))))
-        getattr(axes, f"set_{axis}label")(f"{axis} (m)", fontsize=7)
-    axes.set_box_aspect(size, zoom=0.85)
-    axes.set_proj_type("ortho")
-    axes.view_init(ELEVATION_DEG, AZIMUTH_DEG)
 
 
 def _measured(dataset: xarray.Dataset, run: Run, number: int) -> _Measured:
@@ -302,22 +245,23 @@ def _measured(dataset: xarray.Dataset, run: Run, number: int) -> _Measured:
 def _draw_points(
     axes: Any, dataset: xarray.Dataset, panel: _Panel, estimated: Mapping[str, Any], is_drawn: NDArray[np.bool_]
 ) -> None:
-    """Measured levels of a receiver, and the receivers as crosses, open with an ellipse where estimated."""
+    """Measured levels of a receiver, and the receivers, open with an ellipse where estimated."""
     dims, at = 3 if "point" in dataset.sizes else 2, _receivers(dataset)
     for k in np.flatnonzero(is_drawn) if panel.number is None else [panel.number] * bool(is_drawn[panel.number]):
         place = estimated.get(str(dataset["receiver"].values[k]))
-        mark = {"marker": "x", "color": RED, "s": 22} if place is None else ESTIMATED | {"edgecolors": RED}
-        axes.scatter(*at[k, :dims, None], **mark, linewidths=1.4, zorder=5)
+        colour = drawing.ENDS["receiver"][1]
+        mark = {} if place is None else {"markeredgecolor": colour, "label": AT_ESTIMATED, "markerfacecolor": "none"}
+        drawing.draw_devices(axes, "receiver", at[k], **mark)
         if place is not None and dims == 2:
             spread = 2 * np.array(place["std_m"])[:2]
-            axes.add_patch(Ellipse((at[k, 0], at[k, 1]), *spread, fill=False, edgecolor=RED, linewidth=1, zorder=5))
+            axes.add_patch(Ellipse((at[k, 0], at[k, 1]), *spread, fill=False, edgecolor=colour, linewidth=1, zorder=5))
             paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
-            text = {"textcoords": "offset points", "fontsize": 6, "color": RED, "bbox": paper, "zorder": 5}
+            text = {"textcoords": "offset points", "fontsize": 6, "color": colour, "bbox": paper, "zorder": 5}
             axes.annotate("estimated", at[k, :2], (7, 4), **text)
     if panel.measured is None:
         return
-    shades = {"cmap": panel.colours.cmap, "norm": panel.colours.norm}
     # Training rows, often the fewer, lie above the others.
     for rows, mark in ((~panel.measured.trained, OTHER), (panel.measured.trained, TRAINED)):
-        at_m = panel.measured.points_m[rows]
-        axes.scatter(*at_m.T[:dims], c=panel.measured.level[rows], **shades, **mark, zorder=4)
+        points_m, level = panel.measured.points_m[rows], panel.measured.level[rows]
+        if len(level):
+            drawing.draw_values(axes, points_m, level, panel.colours, **mark, linewidths=0.4, zorder=4)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 
-from ...runs.figures import without_formulas
 from ...runs.run import Run
-from .picture import scene_cuts
+from ...runs.scene_view import scene_cuts
+from ...scene import drawing
 from .plan import Plan
 
 MARGIN_M = 0.3
@@ -25,21 +24,20 @@ def plan_figure(plan: Plan, run: Run) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, WIDTH_IN * aspect * 0.8 + 0.9), layout="constrained", facecolor="white")
     axes = figure.subplots()
     nearest_m = KDTree(plan.measured_m).query(plan.candidates_m)[0]
-    x_m, y_m, _ = plan.candidates_m.T
-    dots = axes.scatter(x_m, y_m, s=14, c=nearest_m, cmap="viridis", linewidths=0)
-    for lines in walls:
-        axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.2))
+    colour = drawing.ENDS["transmitter"][1]
+    colours = drawing.shades(0, float(nearest_m.max()))
+    drawing.draw_values(axes, plan.candidates_m, nearest_m, colours, s=14, linewidths=0)
+    drawing.draw_outlines(axes, walls)
     axes.plot(*plan.measured_m[:, :2].T, ".", color="white", markersize=6, markeredgecolor="0.3", markeredgewidth=0.6)
-    receivers_m = np.stack([receiver.position_m[:2] for receiver in run.receivers])
-    axes.plot(*receivers_m.T, "^", color="#c1121f", markersize=7, markeredgecolor="white")
+    drawing.draw_devices(axes, "receiver", [receiver.position_m for receiver in run.receivers])
     for number, (x, y, _) in enumerate(plan.tx_pos_m.tolist(), start=1):
-        box = {"boxstyle": "circle,pad=0.15", "facecolor": "#c1121f", "edgecolor": "white", "linewidth": 0.6}
+        box = {"boxstyle": "circle,pad=0.15", "facecolor": colour, "edgecolor": "white", "linewidth": 0.6}
         axes.text(x, y, str(number), color="white", fontsize=8, ha="center", va="center", bbox=box)
-    axes.set(xlabel="x (m)", ylabel="y (m)", xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    figure.colorbar(dots, ax=axes, shrink=0.85).set_label("distance from the nearest measured position (m)", fontsize=8)
+    drawing.set_plan(axes, low, high)
+    drawing.colour_bar(figure, colours, axes, "distance from the nearest measured position (m)", shrink=0.85)
     text = "white: measured; numbers: measure next, in this order; triangles: receivers"
     figure.suptitle(f"{text}\n{summary(plan)}", fontsize=8)
-    return without_formulas(figure)
+    return drawing.without_formulas(figure)
 
 
 def summary(plan: Plan) -> str:

@@ -30,10 +30,10 @@ class MaterialMesh:
     """Triangles of a material."""
 
     material: str  # name of the radio material
+    colour: str  # its colour, ``#rrggbb``
     ceiling: bool  # whether these hide the inside from above
     corners_m: FloatArray  # corners [f, 3, 3], metres
-    surface: IntArray  # surface of each triangle, index into ``names`` [f]
-    names: tuple[str, ...]  # names of the surfaces
+    surface: NDArray[np.str_]  # name of the surface of each triangle [f]
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,9 @@ class RowsContent:
     score: FloatArray  # score of each receiver [n_rx, m]; NaN where nothing was received
     label: str  # name of the score
     digits: int  # digits of the score after the decimal point
-    higher_is_better: bool  # whether the score is an accuracy or an error
     stored: IntArray  # indices [t] into the rows of the transmitters that can be chosen
-    # measured and predicted observations of the stored transmitters: ``image``, PNG by receiver and transmitter;
-    # ``level``, numbers [n_rx, t]; or ``curve``, numbers [n_rx, t, k] (`observations_of`)
+    # ``measured`` and ``predicted`` observations of the stored transmitters, and their ``kind``: ``image``, spectra
+    # [n_rx, t, H, W] in steps of 1/255; ``level``, numbers [n_rx, t]; or ``curve``, numbers [n_rx, t, k]
     observed: dict[str, Any]
     quantity: str  # name of the observed quantity, with its unit
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from matplotlib import colormaps
+from matplotlib.colors import to_hex
 from numpy.typing import NDArray
-from PIL import Image
 
 from ...core import InputError
 from ...core.angles import FloatArray
@@ -24,66 +21,65 @@ from ...runs.folder import SPLIT
 from ...runs.results import Results
 from ...runs.run import Run
 from ...runs.scene_view import gaussian_cloud, surfaces_of
-from ...scene.mesh.surfaces import Surface
+from ...scene.mesh.surfaces import Surface, box_of
 from ...scene.preview import ceiling_faces, free_edges
 from ...tasks import TASKS
 from ...tracing import TraceOptions, TraceResult, load_trace, open_scene, trace_paths
 from ...tracing.sionna.scenes import MESHES
 from .content import GaussiansContent, MaterialMesh, PathsContent, RowsContent, SceneContent, ViewOptions
-from .page import packed
 
-MOST_TRIANGLES = 100_000  # triangles of a page, the largest: 2.4 MB
+MOST_TRIANGLES = 100_000  # triangles of a page, the largest: 3 MB
 MOST_EDGES = 20_000
 OPENED_HZ = 3.5e9
 """Carrier at which a scene without data is opened; materials are shown by name, so that it has no influence."""
 NO_MATERIAL, ANY_MATERIAL = "no material", "concrete"  # label of a bare mesh, and the material that it is opened with
 IMAGE_BYTES = 4_000_000  # bytes of a page for observations that are images, at most
-PATH_NUMBERS = 1_000_000  # coordinates of all paths of a page, at most: 2.7 MB
+PATH_NUMBERS = 500_000  # coordinates of all paths of a page, at most: 4 MB
 WEAKEST_GAIN, SMALLEST_M = 1e-20, 1e-9  # limits before logarithms
 KINDS = {1: "reflection", 2: "scattering", 4: "transmission", 8: "diffraction"}
 """Words for Sionna RT's ``InteractionType``."""
+Look = tuple[str, str]  # name of a radio material, and its colour in Sionna RT, ``#rrggbb``
 OnStage = Callable[[str, float], None]  # progress callback: stage and fraction done
 
 
-def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Surface], dict[str, str]]:
-    """Surfaces of a scene, by name, folder, XML or mesh, and the radio material of each by its name.
+def read_scene(source: str | Path, material: str | None = None) -> tuple[list[Surface], dict[str, Look]]:
+    """Surfaces of a scene, by name, folder, XML or mesh, and the look of each by its name.
 
     A mesh without a material is shown without one. `InputError` for no such scene, or one that cannot be opened.
     """
     bare = material is None and Path(source).suffix.lower() in MESHES
     if bare and not Path(source).is_file():
         raise InputError(f"{source}: no such file; give a run folder, a map or a scene")
-    surfaces, materials = surfaces_in(open_scene(source, OPENED_HZ, material=ANY_MATERIAL if bare else material))
-    return surfaces, dict.fromkeys(materials, NO_MATERIAL) if bare else materials
+    surfaces, looks = surfaces_in(open_scene(source, OPENED_HZ, material=ANY_MATERIAL if bare else material))
+    return surfaces, {name: (NO_MATERIAL, colour) for name, (_, colour) in looks.items()} if bare else looks
 
 
-def surfaces_in(scene: Any) -> tuple[list[Surface], dict[str, str]]:
-    """Surfaces of a ``sionna.rt.Scene``, and the radio material of each by its name."""
-    return surfaces_of(scene), {name: thing.radio_material.name for name, thing in scene.objects.items()}
+def surfaces_in(scene: Any) -> tuple[list[Surface], dict[str, Look]]:
+    """Surfaces of a ``sionna.rt.Scene``, and the look of each by its name."""
+    looks = {}
+    for name, thing in scene.objects.items():
+        # Names of radio materials without the prefix of ITU-R P.2040's.
+        label = re.sub("^itu[_-]", "", thing.radio_material.name).replace("_", " ")
+        looks[name] = label, to_hex(thing.radio_material.color)
+    return surfaces_of(scene), looks
 
 
 def scene_content(
-    surfaces: Sequence[Surface], materials: Mapping[str, str], most: int = MOST_TRIANGLES
+    surfaces: Sequence[Surface], looks: Mapping[str, Look], most: int = MOST_TRIANGLES
 ) -> tuple[SceneContent, str | None]:
     """Triangles by material, and a note if there are more than ``most``, of which the largest are kept."""
-    vertices = np.concatenate([surface.vertices_m for surface in surfaces])
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low, high = box_of(surfaces)
     corners = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
     ceiling = np.concatenate([ceiling_faces(surface, low, high) for surface in surfaces])
-    number = np.repeat(np.arange(len(surfaces)), [len(surface.faces) for surface in surfaces])
-    drawn, note = np.ones(len(corners), bool), None
-    if len(corners) > most:
-        drawn[:] = False
-        drawn[np.argsort(-trimesh.triangles.area(corners), kind="stable")[:most]] = True
-        note = f"Mesh: the largest {most} of {len(corners)} triangles."
-    # Names of radio materials without the prefix of ITU-R P.2040's.
-    labels = np.array([re.sub("^itu[_-]", "", materials[surface.name]).replace("_", " ") for surface in surfaces])
+    names = np.repeat([surface.name for surface in surfaces], [len(surface.faces) for surface in surfaces])
+    drawn = np.argsort(-trimesh.triangles.area(corners), kind="stable")[:most]
+    note = f"Mesh: the largest {most} of {len(corners)} triangles." if len(drawn) < len(corners) else None
     meshes = []
-    for label, above in sorted(set(zip(labels[number[drawn]].tolist(), ceiling[drawn].tolist(), strict=True))):
-        chosen = np.flatnonzero(drawn & (labels[number] == label) & (ceiling == above))
-        used, index = np.unique(number[chosen], return_inverse=True)
-        names = tuple(surfaces[k].name for k in used)
-        meshes.append(MaterialMesh(label, above, corners[chosen], index, names))
+    for look in sorted({looks[surface.name] for surface in surfaces}):
+        of_material = np.isin(names[drawn], [name for name in looks if looks[name] == look])
+        for above in (False, True):
+            if len(chosen := drawn[of_material & (ceiling[drawn] == above)]):
+                meshes.append(MaterialMesh(*look, above, corners[chosen], names[chosen]))
     return SceneContent(tuple(meshes), _longest_edges(surfaces)), note
 
 
@@ -111,8 +107,7 @@ def rows_content(results: Results, options: ViewOptions) -> tuple[RowsContent | 
         notes.append(f"Transmitters: {len(stored)} of {len(placed)} held-out rows, {text}.")
     observed = observations_of(results, chosen)
     rows = results.row[placed], results.tx_pos_m[placed], score
-    words = task.label, task.digits, task.higher_is_better
-    return RowsContent(*rows, *words, stored, observed, task.quantity), notes
+    return RowsContent(*rows, task.label, task.digits, stored, observed, task.quantity), notes
 
 
 def representative(score: FloatArray, count: int) -> IntArray:
@@ -131,36 +126,26 @@ def representative(score: FloatArray, count: int) -> IntArray:
 
 
 def observations_of(results: Results, rows: IntArray) -> dict[str, Any]:
-    """Measured and predicted observations of some test rows for the page.
+    """Measured and predicted observations of some test rows.
 
-    ``kind`` and, by ``measured`` and ``predicted``: ``image``, with ``size`` [H, W], PNG as data URI or None by
-    receiver and row; ``level``, numbers [n_rx, rows]; ``curve``, power in dB [n_rx, rows, k], mean over antennas.
+    ``kind`` and, by ``measured`` and ``predicted``: ``image``, spectra [n_rx, rows, H, W] in steps of 1/255;
+    ``level``, numbers [n_rx, rows]; ``curve``, power in dB [n_rx, rows, k], mean over antennas.
     """
     task = TASKS[results.task]
     both = {"measured": results.truth[:, rows], "predicted": results.prediction[:, rows]}
     if task.image:
-        images = {key: [[png(spectrum) for spectrum in part] for part in values] for key, values in both.items()}
-        return {"kind": "image", "size": list(results.truth.shape[-2:])} | images
+        # Spectra that were not received are zero.
+        known = {key: np.clip(np.nan_to_num(values), 0, 1) for key, values in both.items()}
+        return {"kind": "image"} | {key: np.round(255 * values).astype(np.uint8) for key, values in known.items()}
     if task.axes == 0:
-        return {"kind": "level"} | {key: packed(values) for key, values in both.items()}
-    return {"kind": "curve"} | {key: packed(power_db(values)) for key, values in both.items()}
+        return {"kind": "level"} | both
+    return {"kind": "curve"} | {key: power_db(values) for key, values in both.items()}
 
 
 def power_db(channels: NDArray[Any]) -> FloatArray:
     """Power of channels [n_rx, m, k] or [n_rx, m, antennas, k] in dB, mean over antennas, [n_rx, m, k]."""
     power = np.square(np.abs(channels)).reshape(*channels.shape[:2], -1, channels.shape[-1]).mean(axis=2)
     return np.asarray(10 * np.log10(np.where(power > 0, power, np.nan)))
-
-
-def png(grey: NDArray[Any]) -> str | None:
-    """Data URI of a spectrum [H, W] in 0..1, its highest elevation at the top; None where it is not finite."""
-    if not np.isfinite(grey).all():
-        return None
-    image = Image.fromarray(np.round(255 * np.clip(grey[::-1], 0, 1)).astype(np.uint8), mode="P")
-    image.putpalette((255 * colormaps["viridis"](np.arange(256))[:, :3]).round().astype(np.uint8).tobytes())
-    file = io.BytesIO()
-    image.save(file, "PNG", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode("ascii")
 
 
 def gaussians_content(

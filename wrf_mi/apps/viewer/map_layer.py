@@ -23,7 +23,7 @@ from ..maps.dataset import ZARR, require_packages
 from .content import MapContent
 
 SUFFIXES = (".nc", ".nc4", ".netcdf", ZARR)  # endings of maps' names
-MAP_NUMBERS = 900_000  # values of all maps of a page, at most: 2.4 MB
+MAP_NUMBERS = 600_000  # values of all maps of a page, at most: 3 MB
 RECEIVER, POINT = "receiver", "point"  # dimensions of receivers and of the points of a surface
 FACTS, VALUES = "facts", "value/"
 """Key of all but the arrays of a map that a child process has read, and prefix of the keys of its values."""

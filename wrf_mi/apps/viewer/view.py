@@ -72,7 +72,7 @@ class _Gathered:
     progress: bool
     content: ViewContent = field(default_factory=lambda: ViewContent(""))
     titles: list[str] = field(default_factory=list)
-    scenes: list[tuple[Any, dict[str, str]]] = field(default_factory=list)  # the first is shown
+    scenes: list[tuple[Any, dict[str, layers.Look]]] = field(default_factory=list)  # the first is shown
     material_used: bool = False
 
     def add(self, source: Source) -> None:
