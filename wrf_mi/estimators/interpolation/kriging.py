@@ -35,7 +35,7 @@ variance."""
 LIKELIHOOD_EVALUATIONS = 200  # Nelder-Mead on three logarithms settles to 0.01 in 60 to 150
 
 
-CONSTANT = Trend()  # one unknown mean
+UNKNOWN_MEAN = Trend()  # one unknown mean
 SCALE = "scale"  # key of the arrays that kriging without standard deviations has not
 STORED = ("lengths", "positions_m", "coefficients", "weights", "like")  # attributes of `Kriged` as they are
 
@@ -163,7 +163,7 @@ class Kriging(CovarianceSettings):
         seed: seed of the rows of the likelihood.
     """
 
-    trend: Trend = CONSTANT
+    trend: Trend = UNKNOWN_MEAN
     trend_fit: Literal["gls", "ols"] = "gls"
     seed: int = 0
 
