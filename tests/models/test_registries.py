@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import refused
 from outside_packages import ATTENUATORS, CABLE_DB, NEAREST, STEPS, commands, installed
 from small_fits import stop_after
 from wrf_mi_bench import bench
@@ -29,6 +28,7 @@ from wrf_mi.runs.compare import compare
 from wrf_mi.stages.further import FURTHER_STAGES
 from wrf_mi.tasks import LOSSES
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 SETTINGS = ("steps=60", "batch=8", "validate_every=20", "checkpoint_every=20", "initial.gaussians=6")
 SETTINGS += ("network.layers=2", "network.width=8", "view.height=4", "view.columns=8", "deterministic=true")
 SERVED = {"trees": "rssi", "wrf-gs": "spectrum, rssi and csi", "factorised": "spectrum, rssi and csi"}
@@ -57,11 +57,11 @@ def attenuated() -> Iterator[None]:
     yield from registered("attenuators", ATTENUATORS, "ATTENUATED", receivers, receivers._RECEIVERS)
 
 
-def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, flat_folder, tmp_path, capsys) -> None:
+def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, flat_folder, tmp_path, command) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted, match=rf"stopped in nearest rows; go on with: wrf-mi train --resume {out}"):
         train(flat_folder, "nearest", out=out, settings=("neighbours=2",), stop=lambda: True)
-    refused(["evaluate", out], r"model\.npz: missing, the fit was stopped; finish it with train --resume", capsys)
+    command.refused(["evaluate", out], r"model\.npz: missing, the fit was stopped; finish it with train --resume")
     reported: list[tuple[str, float]] = []
     run = resume(out, on_progress=lambda stage, share, _: reported.append((stage, share)))
     assert reported == [("nearest rows", 0.0)]
@@ -78,7 +78,7 @@ def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, fla
     compare([out, other.folder], tmp_path / "page")
     with (tmp_path / "page" / "compare.csv").open(newline="") as file:
         assert [row["model"] for row in csv.DictReader(file)][:2] == ["nearest", "nearest"]
-    refused(["train", flat_folder, "--model", "nearest", "--scene", "x", "--out", "y"], "takes no scene", capsys)
+    command.refused(["train", flat_folder, "--model", "nearest", "--scene", "x", "--out", "y"], "takes no scene")
 
 
 def test_registered_receiver_is_trained_resumed_evaluated_and_compared(attenuated, flat_folder, tmp_path) -> None:
