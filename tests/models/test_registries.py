@@ -18,7 +18,6 @@ from wrf_mi_bench.bench import CHECKS, Check
 
 from wrf_mi import models
 from wrf_mi.core import InputError, Receiver, Record
-from wrf_mi.core.registry import Registry
 from wrf_mi.datasets import load
 from wrf_mi.datasets.ble_folder import write_ble_folder
 from wrf_mi.graph import receivers
@@ -292,13 +291,3 @@ def test_registered_benchmark_is_listed() -> None:
     finally:
         del bench._CHECKS._known["own"]
     assert {"pixel", "array", "power", "csi"} <= set(RECEIVERS)
-
-
-def test_registry_imports_entries_on_access() -> None:
-    registry: Registry[Any] = Registry("parser", "no.such.group", {"json": "json:loads"})
-    assert list(registry) == ["json"]
-    assert registry["json"] is json.loads
-    registry.add("other", json.dumps)
-    assert len(registry) == 2
-    with pytest.raises(KeyError):
-        registry["none"]

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wrf_mi.core import InputError
-from wrf_mi.core.settings import describe, settings_from, with_settings
+from wrf_mi.core.settings import settings_from, with_settings
 from wrf_mi.training.config import PRESETS, TrainConfig
 from wrf_mi.training.fields import make_field
 
@@ -171,9 +171,7 @@ def test_ends_of_ranges_are_accepted():
     [
         ({"stepz": 1}, "config.yaml, setting stepz: unknown; known here: steps, batch,"),
         ({"density": {"evry": 1}}, "config.yaml, setting density.evry: unknown; known here: density.every,"),
-        ({"density": 3}, "config.yaml, setting density: expected a mapping, got 3"),
         (None, "config.yaml, setting top: expected a mapping, got None"),
-        ({"steps": "3"}, "config.yaml, setting steps: expected int, got '3'"),
     ],
 )
 def test_invalid_files_are_refused(values, message):
@@ -207,9 +205,3 @@ def test_zero_scale_distinguishes_all_training_transmitters(extent_m, scale_m):
     assert own.resolved(tx).encoding.tx_scale_m == 0.25
     with pytest.raises(InputError, match=r"encoding\.tx_scale_m: 0 is resolved by the training transmitters"):
         make_field(TrainConfig())
-
-
-def test_description_names_every_setting_and_can_be_set():
-    lines = describe(TrainConfig()).splitlines()
-    assert [line.partition("=")[0] for line in lines] == list(DEFAULTS)
-    assert with_settings(TrainConfig(steps=7, seed=9), lines) == TrainConfig()
