@@ -74,7 +74,8 @@ def of_receivers(values: Any, receivers: Sequence[Receiver]) -> Any:
 
 
 def _observed(task: str, ndim: int) -> tuple[str, ...]:
-    return ("elevation", "azimuth") if task == "spectrum" else OBSERVED.get(ndim - 2, ())
+    """Dimensions of arrays beyond receiver and row; numbers of readings and their deviations have none."""
+    return ("elevation", "azimuth") if task == "spectrum" and ndim > 2 else OBSERVED.get(ndim - 2, ())
 
 
 def _labels(names: Sequence[str], task: str, shape: tuple[int, ...]) -> dict[str, Any]:
@@ -133,7 +134,7 @@ def record_of(data: Any) -> Record:
     arrays: dict[str, Any] = {}
     for name in map(str, dataset.data_vars):
         if name in OF_RECEIVERS:
-            dims = (*PAIR, *_observed(task, observation.ndim))
+            dims = (*PAIR, *_observed(task, dataset[name].ndim))
             arrays[name] = ordered(dataset[name], "receiver", *(dim for dim in dims if dim != "receiver"))
         elif name in DIMENSIONS:
             arrays[name] = ordered(dataset[name], *DIMENSIONS[name])
