@@ -253,10 +253,13 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_scene(folder / "plan.csv", folder / "room", height_m=2.7).folder
 
 
-@pytest.mark.parametrize(("model", "split"), [("ray-tracing", "none"), ("hybrid", "official")])
-def test_a_scene_is_traced_to_estimated_places(model: str, split: str, room: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("model", "split", "settings"),
+    [("ray-tracing", "none", ("depth=1", "rays=4096")), ("hybrid", "official", ("stages=mean,residual",))],
+)
+def test_a_scene_is_traced_to_estimated_places(model, split, settings, room: Path, tmp_path: Path) -> None:
     record = unmapped(building(), "lab")
-    run = train(record, model, out=tmp_path / "run", scene=room, split=split)
+    run = train(record, model, out=tmp_path / "run", scene=room, split=split, settings=settings)
     place = run.metrics["receiver_places"]["lab"]
     np.testing.assert_allclose(place["position_m"][:2], [6.0, 7.5], atol=1.0)
     again = open_run(run.folder, record)

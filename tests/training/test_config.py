@@ -75,7 +75,7 @@ def configurations(draw):
 
 
 @given(configurations())
-@settings(deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_a_configuration_survives_a_dictionary_a_file_and_settings_as_text(config):
     """Values as they are typed after ``--set key=``."""
     assert read(asdict(config)) == config
