@@ -1,8 +1,5 @@
 """Made-up records with what `wrf_mi.apps.checking` looks for: lines of sight, distance laws, headings along a path."""
 
-from collections.abc import Callable
-from dataclasses import replace
-
 import numpy as np
 
 from wrf_mi.core import Receiver, Record
@@ -42,16 +39,6 @@ def _steering(directions: np.ndarray) -> np.ndarray:
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     elements = np.array([np.ravel(axis) for axis in np.mgrid[:4, :4]])
     return np.exp(1j * np.pi * directions[..., :2] @ elements)
-
-
-def with_images(record: Record, change: Callable) -> Record:
-    return replace(record, observation=np.ascontiguousarray(change(record.observation)))
-
-
-def with_orientations(record: Record, change: Callable) -> Record:
-    """The record with changed orientations of its receivers."""
-    turned = (replace(receiver, orientation_xyzw=change(receiver.orientation_xyzw)) for receiver in record.receivers)
-    return replace(record, receivers=tuple(turned))
 
 
 def strengths(rows: int = 120, receivers: int = 4, seed: int = 0, noise_db: float = 4.0) -> Record:

@@ -43,10 +43,8 @@ IN_FILE: Mapping[str, Edits] = {
     "xml": (
         *(("(?s)(.{300}).*", r"\1"), ("</shape>", "</shap>"), ("mesh-", "mesh-&")),
         ("^", '<!DOCTYPE scene [<!ENTITY a "x">]>'),
-    ),
-    "root": edits('<scene version="3.0.0">', "<scene>", '<scene version="three">', '<scene version="3">'),
-    "element": appended(
-        "</scene>", "<mesh/>", '<emitter type="lamp"/>', '<sensor type="camera"/>', '<include filename="other.xml"/>'
+        ('<scene version="3.0.0">', "<scene>"),
+        *appended("</scene>", "<mesh/>", '<emitter type="lamp"/>', '<include filename="other.xml"/>'),
     ),
 }
 """Faults of the scene as a whole."""
@@ -67,8 +65,6 @@ IN_SHAPE: Mapping[str, Edits] = {
     ),
     "missing-file": edits(FILE, r"meshes\\\1.ply", r"\1.ply", r"meshes/\1.PLY", "meshes/gone.ply"),
     "outside-folder": edits("meshes/", "../meshes/"),
-    "odd-name": edits(r"mesh-\w+", "mesh-sp ace", "mesh-wänd", "mesh-壁", "mesh-a b.c"),
-    "reserved-id": edits(r"mesh-\w+", "merged-shapes"),
     "duplicate-id": (
         (rf"(?s)^(.*){FILE}(.*)$", r"\g<0>\1meshes/floor.ply\3"),
         (rf"(?s)^(.*)mesh-(\w+)(.*){FILE}(.*)$", r"\g<0>\1\2\3meshes/floor.ply\5"),

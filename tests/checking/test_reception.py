@@ -18,9 +18,7 @@ from wrf_mi.apps.checking.rows import (
     few_rows,
     named_rows,
     not_heard,
-    repeated_observations,
     repeated_rows,
-    single_position,
 )
 from wrf_mi.core import Record
 from wrf_mi.datasets import write_ble_folder
@@ -38,7 +36,7 @@ def taken(record: Record, rows: np.ndarray) -> Record:
 
 def test_repeated_rows_are_named():
     for record in (strengths(), channels(), spectra(60)):
-        for check in (repeated_rows, repeated_observations, constant_observations, single_position):
+        for check in (repeated_rows, constant_observations):
             assert list(check(record)) == []
         rows = np.arange(len(record))
         rows[[7, 9, 30]] = [2, 2, 29]
@@ -82,19 +80,7 @@ def test_test_rows_among_training_rows_are_named_once():
     assert [name for name, _ in repeated_rows(taken(record, rows))] == ["repeated-rows"]
 
 
-def test_copies_of_observations_are_named():
-    for record in (channels(), spectra(60)):
-        observation = record.observation.copy()
-        observation[:, [4, 5]] = observation[:, [1]]
-        ((name, text),) = repeated_observations(replace(record, observation=observation))
-        assert name == "repeated-observations"
-        assert "2 of 60 rows have the observation of an earlier row at another position: rows 5, 6;" in text
-    observation = strengths().observation.copy()
-    observation[:, 4] = observation[:, 1]
-    assert list(repeated_observations(replace(strengths(), observation=observation))) == []
-
-
-def test_constant_receivers_blank_spectra_and_single_positions_are_named():
+def test_constant_receivers_and_blank_spectra_are_named():
     record = strengths()
     observation = record.observation.copy()
     observation[2] = -70
@@ -104,16 +90,10 @@ def test_constant_receivers_blank_spectra_and_single_positions_are_named():
     images = spectra(40)
     same = replace(images, observation=np.repeat(images.observation[:, :1], 40, axis=1))
     assert [name for name, _ in constant_observations(same)] == ["constant"]
-    assert list(repeated_observations(same)) == []  # reported as constant
     blank = images.observation.copy()
     blank[0, [3, 8]] = 0.5
     ((_, text),) = constant_observations(replace(images, observation=blank))
     assert "spectra of a single grey value in rows 4, 9;" in text
-    still = replace(record, tx_pos_m=np.repeat(record.tx_pos_m[3:4], len(record), axis=0))
-    ((name, text),) = single_position(still)
-    assert name == "single-position"
-    assert text.startswith("all 120 transmitters are at (")
-    assert list(single_position(replace(record, tx_pos_m=np.full((120, 3), np.nan)))) == []
 
 
 DRAWS = np.random.default_rng(0)

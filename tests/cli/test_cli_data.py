@@ -23,9 +23,6 @@ def test_correct_data(flat: Path, command: Command) -> None:
     command.done(["data", "check", flat, "--strict"])
     status, out, err = command(["data", "check", flat, "--json"])
     assert (status, err) == (0, "")
-    command.refused(
-        ["data", "check", flat, "--antennas", flat / "drawn"], "no measured antenna pattern; omit --antennas"
-    )
     known = {"dataset": str(flat), "ok": True, "source": str(flat), "task": "rssi", "rows": 30}
     assert json.loads(out) == known | {"faults": [], "suspicions": [], "notes": []}
 
@@ -59,30 +56,12 @@ def test_suspicions_end_with_status_1_if_asked(flat: Path, command: Command) -> 
     status, out, err = command(["data", "check", flat])
     assert (status, err) == (0, "")
     first, last = out.splitlines()
-    assert first.startswith("suspicion strengths: signal strengths in training rows and test rows of anchor1, anchor2")
+    assert first.startswith("suspicion strengths: no signal strength of anchor1, anchor2 is below 0 dBm: ")
     assert last == f"{flat}: no fault, 1 suspicion"
     status, out, _ = command(["data", "check", flat, "--strict", "--json"])
     assert (status, [suspicion["name"] for suspicion in json.loads(out)["suspicions"]]) == (1, ["strengths"])
     command.done(["data", "check", flat, "--strict", "--ignore", "strengths"])
     command.refused(["data", "check", flat, "--ignore", "strength"], "suspicion 'strength': unknown; known are")
-
-
-def test_measured_antennas_are_described_and_drawn(flat: Path, tmp_path: Path, command: Command) -> None:
-    rows = [f"{theta},{phi},{-1 - theta / 100}" for theta in range(0, 181, 30) for phi in range(0, 360, 60)]
-    (flat / "own.csv").write_text("\n".join(["theta,phi,gain_db", *rows]))
-    header, *anchors = (flat / "anchors.csv").read_text().splitlines()
-    (flat / "anchors.csv").write_text("\n".join([f"{header},pattern", *(f"{row},own.csv" for row in anchors)]))
-    (picture, note, _) = command.done(["data", "check", flat, "--antennas", tmp_path / "drawn"]).splitlines()
-    assert note.startswith(
-        "note: antenna own.csv of anchor1, anchor2: -1.0 dBi at azimuth 0 deg, elevation 90 deg, eff"
-    )
-    assert note.endswith("efficiency 65%")
-    assert Path(picture).read_bytes().startswith(b"\x89PNG")
-    (flat / "own.csv").write_text("\n".join(["theta,phi,gain_db", *rows[:-7]]))
-    status, out, _ = command(["data", "check", flat])
-    assert status == 2
-    assert out.startswith("fault: anchors.csv, row 1: antenna: ")
-    assert "directions are no sphere and no two cuts" in out
 
 
 def test_data_sets_that_do_not_exist(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
@@ -142,12 +121,11 @@ def test_bad_options_end_with_status_2(importing: list[object], tmp_path: Path, 
 
 @needs("wifi-office")
 def test_wifi_office_imports_by_one_command(tmp_path: Path, command: Command) -> None:
-    """Grid indices of 0.6 m, -200 dBm and 100 m of range where nothing was heard, access points at unknown places."""
+    """Grid indices of 0.6 m, -200 dBm where nothing was heard, access points at unknown places."""
     train, test = (DATA / "wifi-office" / f"database_office_{part}.csv" for part in ("train", "test"))
     folder, run = tmp_path / "office", tmp_path / "run"
     out = command.done(["data", "import", train, "--test", test, "--pitch", 0.6, "--out", folder])
     assert "-200 is not heard: 659 readings are empty fields" in out
-    assert "100000 is no rtt" in out
     assert "split: 81 training and 27 test rows" in out
     command.done(["train", folder, "--model", "idw", "--out", run])
     error_db = json.loads((run / "metrics.json").read_text())["abs_error_db"]["median"]

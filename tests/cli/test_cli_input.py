@@ -114,7 +114,10 @@ def test_bad_positions_are_refused(name: str, run: Path, tmp_path: Path, command
     [
         (OSError(errno.ENOSPC, "No space left on device", "a.npz"), "a.npz: No space left on device; free some space"),
         (OSError(errno.EACCES, "Permission denied", "a.npz"), "a.npz: Permission denied; change its permissions"),
-        (OSError(errno.EROFS, "Read-only file system"), "Read-only file system; choose a place that can be written"),
+        (
+            OSError(errno.EROFS, "Read-only file system"),
+            "Read-only file system; change its permissions or choose another place",
+        ),
         (OSError(errno.EISDIR, "Is a directory", "part", None, "a"), "a: Is a directory; choose another place"),
         (OSError(errno.ENOENT, "No such file or directory", "a"), "a: No such file or directory; check the name"),
         (OSError("a damaged\nfile"), "a damaged file"),

@@ -13,11 +13,11 @@ from scipy.constants import speed_of_light
 
 from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits, read_newrf
-from wrf_mi.datasets.newrf import KEYS, arrays_sha256, convert_newrf, read_pickled_table
+from wrf_mi.datasets.newrf import KEYS, arrays_sha256, convert_newrf
 
 PICKLES = Path(__file__).parent / "data"
 PICKLE = (PICKLES / "newrf_protocol5.pkl").read_bytes()
-NO_TABLE = "not the pickle of a table of numbers .*; fetch it again"
+NO_TABLE = "not the pickle of a table of numbers.*; fetch it again"
 ROUNDING = 1e-15
 """Sums of some tens of gains below 0.02 in float64, in another order."""
 
@@ -118,14 +118,6 @@ def test_the_authors_pickle_is_converted(protocol: int):
     assert arrays_sha256(arrays) == arrays_sha256(expected)
 
 
-@pytest.mark.parametrize("strings", ["strings", "arrow"])
-def test_a_table_of_pandas_3_is_read(strings: str):
-    """Written by pandas 3.1.1, whose names of columns are arrays of texts, by NumPy or by Arrow."""
-    columns = read_pickled_table(PICKLES / f"pandas-3-{strings}.pkl")
-    np.testing.assert_array_equal(columns["TxID"], [1.0, 2.0])
-    np.testing.assert_array_equal(columns["TxPos"][1], [[1.0, 2.0, 3.0]])
-
-
 def test_the_hash_is_of_names_types_shapes_and_values():
     arrays = drawn()
     csi, gain = arrays["csi"], arrays["path_gain"]
@@ -152,13 +144,13 @@ def test_nothing_that_a_pickle_names_is_run(tmp_path: Path):
     assert touched.exists(), "the test's harm does no harm"
     touched.unlink()
     (tmp_path / "bad.pkl").write_bytes(harm)
-    refusal(read_pickled_table, tmp_path / "bad.pkl", r"bad\.pkl: not the pickle of a table of numbers")
+    refusal(convert_newrf, tmp_path / "bad.pkl", r"bad\.pkl: not the pickle of a table of numbers")
     assert not touched.exists()
-    # Ahead of the authors' own table, made and thrown away (0 pops it): the table is read all the same.
+    # Ahead of the authors' own table, made and thrown away (0 pops it).
     ahead = pickletools.optimize(pickle.dumps(Harm(touched), protocol=2))[2:-1]
     frame = 11  # bytes of its head: protocol and the length of a frame
     (tmp_path / "both.pkl").write_bytes(PICKLE[:2] + ahead + b"0" + PICKLE[frame:])
-    assert arrays_sha256(convert_newrf(tmp_path / "both.pkl")) == arrays_sha256(drawn())
+    refusal(convert_newrf, tmp_path / "both.pkl", r"both\.pkl: not the pickle of a table .*\(names posix\.system\)")
     assert not touched.exists()
 
 
@@ -167,7 +159,7 @@ def test_nothing_that_a_pickle_names_is_run(tmp_path: Path):
     [
         *((b, NO_TABLE) for b in (b"", b"\x80\x05.", b"no pickle", pickle.dumps([1, 2]), pickle.dumps({"_mgr": 1}))),
         (PICKLE.replace(b"RxChanPerRay", b"SomethingNew"), "no column RxChanPerRay; give a data set of NeWRF"),
-        (b"\x80\x02Nr\xff\xff\xff\x7f.", r"place 2147483647 in a list of at most 9 objects"),  # gigabytes
+        (b"\x80\x02Nr\xff\xff\xff\x7f.", NO_TABLE),  # object 2147483647 of a list
     ],
 )
 def test_other_files_are_refused_in_one_line(tmp_path: Path, content: bytes, message: str):
@@ -178,7 +170,7 @@ def test_other_files_are_refused_in_one_line(tmp_path: Path, content: bytes, mes
 def test_a_pickle_that_is_cut_or_changed_is_refused_or_gives_other_arrays(tmp_path: Path):
     expected = drawn()
     rng = np.random.default_rng(4)
-    for trial in range(300):
+    for trial in range(12):
         content = bytearray(PICKLE)
         if trial % 2:
             content[rng.integers(len(content))] ^= int(rng.integers(1, 256))

@@ -120,7 +120,6 @@ def overlap(folder: Path) -> None:
 
 
 GREY = np.zeros((5, 8), np.uint8)
-SEVERAL = "several carriers.*column frequency_hz, or make a folder for each"
 ANTENNA = "gateway9:\n  position: [0, 0, 0]\n  orientation: [0, 0, 0, 1]\n  antenna: "
 WRONG = {  # each is refused, see test_faults.py
     "no poses": (remove(YML), YML, "missing"),
@@ -159,8 +158,10 @@ WRONG = {  # each is refused, see test_faults.py
             ("array: 16", "array is '16'; give rows, columns and spacing_m, or elements_m"),
             ("array: {rows: 0, columns: 4, spacing_m: 1}", "array is"),
             ("array: {elements_m: [[0, 1], [0, 2]]}", "array is"),
-            ("frequency_hz: [915e6, 2.4e9]", SEVERAL),
-            ("frequency_hz: 915e6\ncarrier_hz: 868e6", SEVERAL),
+            (
+                "frequency_hz: [915e6, 2.4e9]",
+                r"frequency_hz is \[.*or those of rows in tx_pos\.csv, column frequency_hz",
+            ),
             ("tx_antenna: {frame: array}", "tx_antenna is .*; give some of pattern, polarization"),
             (f"{ANTENNA}{{polarisation: V}}", "gateway9: antenna is .*; give some of pattern, polarization, frame"),
             (f"{ANTENNA}{{polarization: vertical}}", "polarization is 'vertical'; choose from V, H"),
@@ -246,16 +247,6 @@ def test_attributes_beyond_the_layout_are_not_written(tmp_path: Path, case: str)
     with pytest.raises(InputError, match=message):
         write_spectrum_folder(tmp_path / "a", replace(ONE, **changes))
     assert not (tmp_path / "a").exists()
-
-
-def test_several_carriers_of_receivers_are_refused_and_equal_ones_are_one(tmp_path: Path):
-    folder = write_spectrum_folder(tmp_path / "two", make_record(4, gateways=2))
-    for name in ("gateway1", "gateway2"):
-        text(YML, f"{name}:\n", f"{name}:\n  frequency_hz: 915e6\n")(folder)
-    np.testing.assert_array_equal(read_spectrum_folder(folder).frequencies_hz, [915e6])
-    text(YML, "gateway2:\n  frequency_hz: 915e6", "gateway2:\n  frequency_hz: 2.44e9")(folder)
-    message = r"gateway1: frequency_hz of 9.15e\+08 and gateway2: frequency_hz of 2.44e\+09"
-    refusal(read_spectrum_folder, folder, message)
 
 
 def test_equal_carriers_of_rows_are_one(tmp_path: Path):

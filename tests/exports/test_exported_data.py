@@ -24,7 +24,7 @@ from wrf_mi.apps.exports.paths_table import read_paths
 from wrf_mi.core import Paths, Record
 from wrf_mi.core.angles import rotation_matrix
 from wrf_mi.datasets import load, write_record_file
-from wrf_mi.datasets.registry import data_home, stated_task
+from wrf_mi.datasets.registry import data_home
 from wrf_mi.runs.api import train
 from wrf_mi.runs.run import open_run
 from wrf_mi.tracing import TraceOptions, load_trace
@@ -34,7 +34,6 @@ from wrf_mi.tracing import TraceOptions, load_trace
 def test_npz_holds_a_record_without_loss(record: Record, tmp_path: Path) -> None:
     file = write_record_file(tmp_path / "one.npz", record)
     assert_same(load(file), record)
-    assert stated_task(file) == record.task
     # Exported again, from the folder that holds it, too.
     export(tmp_path, "npz", tmp_path / "two" / "again.npz")
     assert_same(load(tmp_path / "two"), record)

@@ -33,30 +33,12 @@ def listed(names: Iterable[str], most: int = 6, mark: str = ", ") -> str:
 
 
 _REMEDIES = {
-    errno.ENOSPC: "free some space or choose another disk",
-    errno.EDQUOT: "free some of the quota or choose another disk",
-    errno.EFBIG: "choose a file system that takes larger files",
-    errno.EROFS: "choose a place that can be written",
-    errno.EACCES: "change its permissions or choose another place",
-    errno.EPERM: "change its permissions or choose another place",
-    errno.EISDIR: "choose another place, or a file in it",
-    errno.ENOTDIR: "choose another place: a file is where a folder is needed",
-    errno.EEXIST: "choose another place: a file is where a folder is needed",
-    errno.ENOTEMPTY: "empty the folder or choose another one",
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space or choose another disk"),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "change its permissions or choose another place"),
+    **dict.fromkeys((errno.EISDIR, errno.ENOTDIR, errno.EEXIST), "choose another place: a file or folder is there"),
     errno.ENOENT: "check the name",
-    errno.ENAMETOOLONG: "choose a shorter name",
-    errno.ELOOP: "correct its symbolic links",
-    errno.EXDEV: "choose a place on one file system",
-    errno.EMFILE: "raise the limit of open files (ulimit -n)",
-    errno.ENFILE: "close other programs: the system has too many open files",
-    errno.ENOMEM: "free some memory",
-    errno.EIO: "check the disk or the network drive",
-    errno.ESTALE: "check the disk or the network drive",
-    errno.ETIMEDOUT: "check the address and the network",
-    errno.ECONNREFUSED: "check the address, and that the server runs",
-    errno.ECONNRESET: "check that the server runs",
-    errno.EADDRINUSE: "choose another port or end the program that uses it",
 }
+"""Remedies of frequent errors; the texts of others, such as "File name too long", say what to do."""
 
 
 def os_failure(error: OSError, path: Path | None = None, what: str = "") -> str:

@@ -123,8 +123,8 @@ def _frequencies_hz(attributes: dict[str, Any]) -> tuple[FloatArray | None, Floa
 
 
 def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
-    for group in (stored, _local(file, stored, "Data")):
-        pilots = None if group is None or not hasattr(group, "get") else _local(file, group, PILOTS)
+    for group in (stored, stored.get("Data")):
+        pilots = None if not hasattr(group, "get") else group.get(PILOTS)
         if pilots is not None and hasattr(pilots, "shape"):
             try:
                 return pilots, {**stored.attrs, **group.attrs, **pilots.attrs}
@@ -132,15 +132,6 @@ def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
                 text = f"an attribute cannot be read ({one_line(error)})"
                 raise DataFault(file, f"{text}; write it again as a number or as text") from None
     raise DataFault(file, f"neither /{PILOTS} nor /Data/{PILOTS} in it; give a capture with raw pilots")
-
-
-def _local(file: Path, group: Any, name: str) -> Any:
-    """What a name in a group means; `DataFault` where that is in another file."""
-    import h5py
-
-    if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
-        raise DataFault(file, f"{name} is a link to another file; give the file with the samples")
-    return group.get(name)
 
 
 def _open(
@@ -188,8 +179,6 @@ def _check_samples(file: Path, pilots: Any) -> tuple[int, ...]:
     if len(shape) not in (4, 5) or 0 in shape or pilots.dtype.kind != "i":
         need = "[frames, antennas, samples, 2] or [frames, cells, users, antennas, 2 x samples]"
         raise DataFault(file, f"{PILOTS} holds {pilots.dtype} {list(shape)}; whole numbers {need} are read")
-    if pilots.is_virtual or pilots.external:
-        raise DataFault(file, f"{PILOTS} is in other files; give the file with the samples")
     size = file.stat().st_size
     if pilots.nbytes > MOST_DEFLATED * size:
         raise DataFault(file, f"{PILOTS} states {list(shape)} samples, and the file has {size} bytes; fetch it again")

@@ -7,13 +7,10 @@ of the original, which is not kept.
 from __future__ import annotations
 
 import hashlib
-import io
 import logging
 import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from functools import partial
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import pooch
@@ -30,8 +27,6 @@ from .registry import DATA_VARIABLE, FOLDER, DataSet, RemoteFile, data_home, kno
 THREADS = 8  # number of simultaneous downloads
 RETRIES = 2  # number of further attempts after a failure
 TIMEOUT_S = 30  # seconds without an answer after which a download fails
-MOST_BYTES, MOST_CONVERTED = 64 << 20, 4 << 30
-"""Largest download of a file that is kept (those known have less than 1 MB), and of one that is converted."""
 
 
 def fetch(name: str, *, base_url: str | None = None, progress: bool = True) -> Path:
@@ -98,31 +93,10 @@ def _convert(path: Path, entry: RemoteFile, source: str) -> None:
     write_arrays(path, arrays, compressed=True)
 
 
-class _TooLarge(Exception):
-    """A server sends more than a file can have."""
-
-
-class _Bounded(io.FileIO):
-    def __init__(self, path: str, most: int) -> None:
-        super().__init__(path, "w")
-        self.left = most
-
-    def write(self, data: Any) -> int:
-        self.left -= len(data)
-        if self.left < 0:
-            raise _TooLarge
-        return super().write(data)
-
-
 def _fetch_all(folder: Path, name: str, entries: list[RemoteFile], urls: dict[str, str], progress: bool) -> None:
     hashes = {entry.path: None if entry.converted else f"sha256:{entry.sha256}" for entry in entries}
     store = pooch.create(path=folder, base_url="", registry=hashes, urls=urls, retry_if_failed=RETRIES)
-    unbounded = pooch.HTTPDownloader(timeout=TIMEOUT_S)
-
-    def bounded(url: str, path: str, store: pooch.Pooch, most: int) -> None:
-        with _Bounded(path, most) as file:
-            unbounded(url, file, store)
-
+    downloader = pooch.HTTPDownloader(timeout=TIMEOUT_S)
     logger = pooch.get_logger()
     level = logger.level
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
@@ -132,10 +106,7 @@ def _fetch_all(folder: Path, name: str, entries: list[RemoteFile], urls: dict[st
     ):
         task = bar.add_task(f"fetching {name}", total=len(store.registry))
         logger.setLevel(logging.WARNING)  # one line per file otherwise
-        jobs = {}
-        for entry in entries:
-            most = MOST_CONVERTED if entry.converted else MOST_BYTES
-            jobs[pool.submit(store.fetch, entry.path, downloader=partial(bounded, most=most))] = entry.path
+        jobs = {pool.submit(store.fetch, entry.path, downloader=downloader): entry.path for entry in entries}
         try:
             for job in as_completed(jobs):
                 if (error := job.exception()) is not None:
@@ -154,8 +125,6 @@ def _failure(error: BaseException, url: str, name: str) -> str:
         case requests.exceptions.RequestException():
             remedy = f"check the network, or set {DATA_VARIABLE} to a folder that holds {name}/"
             return f"{urlsplit(url).netloc} cannot be reached; {remedy}"
-        case _TooLarge():
-            return f"{url} is larger than any published file, nothing was kept; check the mirror"
         case ValueError():  # raised by pooch for a wrong hash
             return f"{url} has not the published SHA-256, nothing was kept; try again"
         case OSError():

@@ -5,23 +5,17 @@ their ``simulator/mat2pkl.py`` wrote, one row per receiver. ``TxPos``, ``RxPos``
 ``LastXPts`` [3, p], ``RxChanPerRay`` [p, 1] and ``LineOfSight`` are used. Receivers without a path have no numbers and
 are left out, as their ``loaders.py`` does.
 
-Python's pickle calls whatever a file names. Here every name becomes an inert object (`_Named`) that holds its
-arguments: nothing is looked up, imported or called. The columns are rebuilt from these objects, out of NumPy arrays
-of plain numbers. Format: pickle as of Python's ``pickletools``; a ``DataFrame`` as pandas 1.4 to 3 write it
-(blocks of columns with their indices), arrays as NumPy writes them (``_reconstruct`` up to protocol 4,
-``_frombuffer`` from protocol 5).
+Python's pickle calls whatever a file names. Here it may name the classes of NumPy and pandas that a table of numbers
+consists of (`TABLE_NAMES`), and nothing else: "Restricting globals" of Python's documentation of pickle.
 """
 
 from __future__ import annotations
 
 import hashlib
-import itertools
-import math
-import pickle
-import pickletools
-from collections.abc import Iterator, Mapping, Sequence
-from io import BytesIO
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -29,8 +23,9 @@ from numpy.typing import NDArray
 
 from ..core import DataFault, InputError, Receiver, Record
 from ..core.antenna import UPRIGHT
-from ..core.array_files import stored_arrays
+from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import one_line, readable
+from ..parallel import run_module
 from .faults import refuse, stop_at_faults
 from .folder_files import single_file
 
@@ -41,8 +36,13 @@ TEST_FRACTION = 0.2
 SCALARS = ("TxID", "RxID", "Frequency", "LineOfSight")
 ARRAYS = ("TxPos", "RxPos", "CSI", "LastXPts", "RxChanPerRay")
 LARGEST_BYTES = 64 * 2**20  # largest file that is read
-NUMBERS = frozenset("?bBhHiIlLqQefdFD")  # type characters of arrays of plain numbers
-PLAIN = (int, float, complex, type(None))  # types of fields beside arrays in a column of objects
+CONVERSION_S, REFUSED = 120.0, 2  # time of the process that converts a file, and its exit status where it refuses one
+NO_TABLE = "not the pickle of a table of numbers"
+TABLE_NAMES = (
+    *("DataFrame", "BlockManager", "_unpickle_block", "_new_Index", "Index", "Int64Index", "RangeIndex"),
+    *("_reconstruct", "_frombuffer", "ndarray", "dtype"),
+)
+"""Names in packages of pandas and NumPy that a pickled table of numbers and arrays may contain."""
 
 
 def read_newrf(path: str | Path, name: str | None = None) -> Record:
@@ -113,19 +113,36 @@ def _check(file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def convert_newrf(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a room's ``.npz`` file from the authors' pickle, of which nothing is run.
+    """The arrays of a room's ``.npz`` file from the authors' pickle, read in a child process.
+
+    Damaged content ends a process that unpickles arrays.
 
     Raises:
-        InputError: not their pickle.
+        InputError: not their pickle, or pandas is not installed.
     """
-    columns = read_pickled_table(path)
-    lacking = sorted(set(SCALARS + ARRAYS) - set(columns))
-    if lacking:
-        raise InputError(f"{path}: no column {lacking[0]}; give a data set of NeWRF for a single frequency")
+    with TemporaryDirectory() as place:
+        out = Path(place) / "arrays.npz"
+        arguments = [str(path), str(out)]
+        status, message = run_module("wrf_mi.datasets.newrf", arguments, quiet=True, most_s=CONVERSION_S)
+        if status == 0:
+            return stored_arrays(out)
+    raise InputError(message if status == REFUSED else f"{path}: {NO_TABLE}; fetch it again")
+
+
+def main(path: str, out: str) -> int:
+    """Write the arrays of a pickle to an ``.npz`` file, or on standard error why it is refused."""
     try:
-        return _convert(columns)
+        columns = read_pickled_table(Path(path))
+        if lacking := sorted({*SCALARS, *ARRAYS} - set(columns)):
+            raise InputError(f"{path}: no column {lacking[0]}; give a data set of NeWRF for a single frequency")
+        write_arrays(Path(out), _convert(columns))
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return REFUSED
     except (ValueError, TypeError, IndexError) as error:
-        raise InputError(f"{path}: not in the form of NeWRF's data ({one_line(error)}); fetch it again") from None
+        print(f"{path}: not in the form of NeWRF's data ({one_line(error)}); fetch it again", file=sys.stderr)
+        return REFUSED
+    return 0
 
 
 def _convert(columns: dict[str, Any]) -> dict[str, NDArray[Any]]:
@@ -157,138 +174,37 @@ def _fields(column: Any, rows: NDArray[np.int64], kind: type, length: int) -> li
     return [np.asarray(column[row], kind).reshape(length) for row in rows]
 
 
-class _Named:
-    """An object named in a pickle, with its arguments and state."""
-
-    name = ""
-    args: tuple[Any, ...]
-    state: Any
-
-    def __new__(cls, *args: Any, **_: Any) -> _Named:
-        inert = super().__new__(cls)
-        inert.args, inert.state = args, None
-        return inert
-
-    def __setstate__(self, state: Any) -> None:
-        self.state = state
-
-
-class _Unpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> type[_Named]:
-        return type("_Named", (_Named,), {"name": f"{module}.{name}"})
-
-
-def _check_pickle(content: bytes) -> None:
-    """Refuse a pickle that would take more memory than its size allows: Python makes room for what it states."""
-    for code, argument, _ in pickletools.genops(content):
-        if code.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > len(content):
-            raise ValueError(f"place {argument} in a list of at most {len(content)} objects")
-
-
-def read_pickled_table(path: Path) -> dict[str, list[Any] | NDArray[Any]]:
-    """The columns of a pickled ``DataFrame``: NumPy arrays of numbers, or lists of fields that are arrays.
+def read_pickled_table(path: Path) -> dict[str, NDArray[Any]]:
+    """The columns of a pickled ``DataFrame`` of numbers and arrays of numbers.
 
     Raises:
-        InputError: missing, too large, damaged, or not a table of numbers and arrays of numbers.
+        InputError: pandas is not installed, or a file that is missing, too large, damaged, or not such a table.
     """
     try:
-        size = path.stat().st_size
-        if size > LARGEST_BYTES:
+        from pandas import DataFrame
+        from pandas.compat.pickle_compat import Unpickler
+    except ImportError:
+        raise InputError(f"{path}: reading it needs pandas; install it: pip install '.[tables]'") from None
+
+    class TableUnpickler(Unpickler):
+        """Pandas' reader of tables of former versions, which looks up no other names."""
+
+        def find_class(self, module: str, name: str) -> Any:
+            if module.partition(".")[0] not in ("pandas", "numpy") or name not in TABLE_NAMES:
+                raise ValueError(f"names {module}.{name}")
+            return super().find_class(module.replace("numpy.core.", "numpy._core."), name)
+
+    try:
+        if (size := path.stat().st_size) > LARGEST_BYTES:
             raise ValueError(f"{size / 2**20:.0f} MiB, where a table has {LARGEST_BYTES // 2**20} at most")
-        content = path.read_bytes()
-        _check_pickle(content)
-        return _columns(_Unpickler(BytesIO(content)).load())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({one_line(error)}); fetch it again") from None
+        with path.open("rb") as stream:
+            frame = TableUnpickler(stream).load()
+        if not isinstance(frame, DataFrame):
+            raise ValueError(f"{type(frame).__name__} in place of a table")
+        return {str(name): frame[name].to_numpy() for name in frame.columns}
     except Exception as error:  # a damaged or hostile pickle raises nearly every kind
-        raise InputError(f"{path}: not the pickle of a table of numbers ({one_line(error)}); fetch it again") from None
+        raise InputError(f"{path}: {NO_TABLE} ({one_line(error)}); fetch it again") from None
 
 
-def _columns(frame: Any) -> dict[str, list[Any] | NDArray[Any]]:
-    state = _named(frame, "DataFrame").state
-    manager = _named(state.get("_mgr") if isinstance(state, dict) else None, "BlockManager")
-    blocks, axes = _arguments(manager, 2)
-    _, index = _arguments(_named(axes[0], "_new_Index"), 2)
-    names = _names(index.get("data")) if isinstance(index, dict) else []
-    if not names or not all(isinstance(name, str) for name in names):
-        raise ValueError("columns without names")
-    numbered = itertools.chain.from_iterable(map(_numbered_columns, blocks))
-    return {names[number]: column for number, column in numbered}
-
-
-def _numbered_columns(block: Any) -> Iterator[tuple[int, list[Any] | NDArray[Any]]]:
-    """Numbers of a block's columns, and their numbers or fields."""
-    values, places, _ = _arguments(_named(block, "_unpickle_block"), 3)
-    rows = _array(values)
-    in_steps = _is(places, "slice")
-    numbers = range(*_arguments(places, 3))[: len(rows) + 1] if in_steps else _array(places).tolist()
-    if len(numbers) != len(rows):
-        raise ValueError(f"{len(rows)} columns with {len(numbers)} numbers")
-    for number, row in zip(numbers, rows, strict=True):
-        plain = row.dtype != object
-        yield number, row if plain else [field if isinstance(field, PLAIN) else _array(field) for field in row]
-
-
-def _names(described: Any) -> list[Any]:
-    """Names of columns: an array of objects, or as of pandas 3 an array of texts, by NumPy or by Arrow."""
-    if _is(described, "__pyx_unpickle_NDArrayBacked"):
-        described = described.state[1]
-    if not _is(described, "ArrowStringArray"):
-        return list(_array(described))
-    kind, count, _, first, buffers, *_ = _named(described.state["_pa_array"], "_restore_array").args[0]
-    (alias,) = _arguments(_named(kind, "type_for_alias"), 1)
-    contents = (_arguments(_named(buffer, "py_buffer"), 1)[0] for buffer in buffers[1:3])
-    bounds, text = (content.args[0] if _is(content, "bytearray") else content for content in contents)
-    at = np.frombuffer(bounds, {"string": "<i4", "large_string": "<i8"}[alias])[first : first + count + 1].tolist()
-    if len(at) != count + 1:
-        raise ValueError(f"{count} names with {len(at)} bounds")
-    return [bytes(text[a:b]).decode() for a, b in itertools.pairwise(at)]
-
-
-def _array(described: Any) -> NDArray[Any]:
-    """The NumPy array of a description: by its bytes, or by a list where it holds objects."""
-    if _is(described, "_frombuffer"):
-        data, dtype, shape, order = _arguments(described, 4)
-    else:
-        state = _named(described, "_reconstruct").state
-        if not isinstance(state, tuple) or len(state) != 5:
-            raise ValueError("an array without content")
-        _, shape, dtype, fortran, data = state
-        order = "F" if fortran else "C"
-    flat = _flat_array(data, dtype)
-    if math.prod(shape) != len(flat):
-        raise ValueError(f"{len(flat)} values for the shape {shape}")
-    return flat.reshape(shape, order=order)
-
-
-def _flat_array(data: Any, dtype: Any) -> NDArray[Any]:
-    """Values of an array in the order of its description, a copy."""
-    code, *_ = _named(dtype, "dtype").args
-    if code == "O8":
-        if not isinstance(data, list):
-            raise ValueError("an array of objects without a list")
-        objects = np.empty(len(data), object)
-        objects[:] = data
-        return objects
-    endian = dtype.state[1] if isinstance(dtype.state, tuple) else "|"
-    if endian not in ("<", ">", "|") or np.dtype(str(code)).char not in NUMBERS:
-        raise ValueError(f"an array of type {code}")
-    if not isinstance(data, bytes | bytearray):
-        raise ValueError("an array of numbers without bytes")
-    return np.frombuffer(data, f"{endian}{code}").copy()
-
-
-def _is(value: Any, name: str) -> bool:
-    return isinstance(value, _Named) and value.name.rpartition(".")[2] == name
-
-
-def _named(value: Any, name: str) -> _Named:
-    if not _is(value, name):
-        raise ValueError(f"{getattr(value, 'name', type(value).__name__)} where {name} belongs")
-    return value
-
-
-def _arguments(value: _Named, count: int) -> tuple[Any, ...]:
-    if len(value.args) != count:
-        raise ValueError(f"{value.name} of {len(value.args)} arguments")
-    return value.args
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

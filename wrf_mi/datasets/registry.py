@@ -191,12 +191,3 @@ def find(name_or_folder: str | Path) -> tuple[Path, DataSet | None]:
             how = f"wrf_mi.synthetic.load_record({dataset.name!r}) traces it"
         raise InputError(f"data set {dataset.name}: not on this machine; {how}")
     return folder / (dataset.file or ""), dataset
-
-
-def stated_task(name_or_folder: str | Path) -> str | None:
-    """The task of a data set by its layout or name, read only if its layout has several; None if it is not known."""
-    path = Path(name_or_folder)
-    if is_data(path):
-        layout = layout_of(path)
-        return layout.task or layout.read(path, None).task
-    return next((dataset.task for dataset in KNOWN if dataset.name == str(name_or_folder)), None)

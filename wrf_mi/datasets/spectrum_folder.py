@@ -19,6 +19,7 @@ from PIL import Image
 from ..core import DataFault, InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.arrays import planar_array
+from ..core.carriers import FREQUENCY
 from ..core.files import atomic_folder, one_line, text_lines
 from ..core.memory import require_memory
 from ..core.pictures import PICTURE_ERRORS, open_picture
@@ -27,7 +28,6 @@ from ..core.yaml_files import read_yaml
 from . import folder_files as files
 from .faults import attempt, recoverable, refuse, stop_at_faults
 
-CARRIER_KEYS = ("frequency_hz", "frequencies_hz", "carrier_hz")  # keys under which a file may state carriers
 GATEWAYS, FOLDS, IMAGES = "gateway_info.yml", "blocked_folds.txt", "spectrum"
 RESERVED = ("array", files.TX_ANTENNA)  # mappings of the file that are no receivers; receivers cannot have these names
 MOST_PIXELS = 1 << 22  # most pixels of a spectrum: 2,048 elevations and as many azimuths
@@ -168,30 +168,14 @@ def parse_folds(path: Path, rows: int) -> IntArray:
 
 
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
-    """The carrier [1] of all rows, stated for all receivers or in their entries; None if it is not stated."""
-    entries = {"": info} | {f"{name}: ": entry for name, entry in info.items() if isinstance(entry, dict)}
-    carriers: dict[float, str] = {}
-    for prefix, entry in entries.items():
-        for key in filter(entry.__contains__, CARRIER_KEYS):
-            carriers |= dict.fromkeys(_carriers_hz(path, f"{prefix}{key}", entry[key]), f"{prefix}{key}")
-    if len(carriers) > 1:
-        (a, first), (b, second) = list(carriers.items())[:2]
-        text = f"{one_line(first)} of {a:g} and {one_line(second)} of {b:g}: several carriers, but this file states one"
-        remedy = f"give those of rows in {files.POSITIONS}, column frequency_hz, or make a folder for each"
-        raise DataFault(path, f"{text}; {remedy}")
-    return np.array(list(carriers)) if carriers else None
-
-
-def _carriers_hz(path: Path, name: str, value: Any) -> list[float]:
-    """Carriers of an entry, a number or a list of numbers."""
-    try:
-        carriers_hz = [float(number) for number in (value if isinstance(value, list) else [value])]  # 920e6 is a text
-    except (TypeError, ValueError, OverflowError):
-        carriers_hz = [np.nan]
-    if all(0 < carrier_hz < np.inf for carrier_hz in carriers_hz):
-        return carriers_hz
-    refuse(DataFault(path, f"{one_line(name)} is {files.shown(value)}; give the carrier in Hz, such as 920e6"))
-    return []
+    """The carrier [1] of all rows; None if it is not stated."""
+    if (stated := info.get(FREQUENCY)) is None:
+        return None
+    carrier_hz = files.numbers_of(stated)  # YAML reads 920e6 as text
+    if carrier_hz.ndim or not 0 < carrier_hz < np.inf:
+        remedy = f"give the carrier in Hz, such as 920e6, or those of rows in {files.POSITIONS}, column {FREQUENCY}"
+        raise DataFault(path, f"{FREQUENCY} is {files.shown(stated)}; {remedy}")
+    return carrier_hz.reshape(1)
 
 
 def _array(path: Path, entry: dict[Any, Any], name: str) -> FloatArray | None:

@@ -73,19 +73,21 @@ def parsed_xml(path: Path) -> Element:
     return root
 
 
-def read_scene_xml(path: Path) -> Element:
+def read_scene_xml(path: Path, check_shapes: bool = True) -> Element:
     """The root of a scene file.
 
-    `InputError`: missing, not XML, or with an element, plugin, entity or file that a scene file may not name.
+    `InputError`: missing, not XML in UTF-8, or with an element, plugin or entity that a scene file may not name; with
+    ``check_shapes`` also with a type of shape or a file that it may not name, or a value that is left to the caller.
     """
     try:
+        path.read_text("utf-8")
         root = parsed_xml(path)
     except DefusedXmlException:
         raise InputError(f"{path}: has a document type or entities; remove them") from None
     except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
         raise InputError(f"{path}: cannot be opened ({one_line(error)}); correct the scene") from None
     named = {id(shape): f"{path}: {name}" for name, shape in named_shapes(root)}
-    _check(root, str(path), named, path.parent, 0)
+    _check(root, str(path), named, path.parent if check_shapes else None, 0)
     if root.tag != "scene" or not root.get("version"):
         raise InputError(
             f'{path}: begins with <{root.tag}>, not with a scene and its version; write <scene version="3.0.0">'
@@ -102,15 +104,16 @@ def named_shapes(root: Element) -> list[tuple[str, Element]]:
     return [(name(number, shape), shape) for number, shape in enumerate(root.iter("shape"), start=1)]
 
 
-def _check(element: Element, where: str, named: Mapping[int, str], folder: Path, depth: int) -> None:
+def _check(element: Element, where: str, named: Mapping[int, str], folder: Path | None, depth: int) -> None:
     where = named.get(id(element), where)
     if depth > DEEPEST:
         raise InputError(f"{where}: elements within elements to more than {DEEPEST} levels; correct the scene")
-    _check_plugin(element, where)
     tag = element.tag
-    if tag == "string" and "$" in element.get("value", ""):
+    if tag != "shape" or folder is not None:
+        _check_plugin(element, where)
+    if tag == "string" and "$" in element.get("value", "") and folder is not None:
         raise InputError(f"{where}: a value with a parameter ($) that has no <default>; write the value in its place")
-    if tag == "string" and element.get("name") in FILES:
+    if tag == "string" and element.get("name") in FILES and folder is not None:
         inside(folder, element.get("value", ""), where)
     for child in element:
         _check(child, where, named, folder, depth + 1)

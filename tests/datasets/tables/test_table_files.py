@@ -9,6 +9,7 @@ from changed_folders import error_line, refusal
 
 from wrf_mi.apps.importing import files
 from wrf_mi.apps.importing.files import joined, read_table
+from wrf_mi.core import memory
 
 pandas = pytest.importorskip("pandas")
 
@@ -98,8 +99,10 @@ def test_text_in_a_column_of_numbers_is_refused_with_its_file_and_row(tmp_path: 
 
 def test_tables_beyond_memory_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "t.csv").write_text("x,y\n" + "1,2\n" * 6)
-    monkeypatch.setattr(files, "MOST_FIELDS", 11)
-    refusal(read_table, tmp_path / "t.csv", "6 rows of 2 columns are more than the 11 fields")
+    monkeypatch.setattr(memory, "SMALL_BYTES", 0)
+    for free_bytes, message in ((100, r"t\.csv takes"), (180, r"t\.csv: 6 rows of 2 columns")):
+        monkeypatch.setattr(memory, "free_bytes", lambda free=free_bytes: free)
+        refusal(read_table, tmp_path / "t.csv", message)
 
 
 def test_missing_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,17 +7,10 @@ import numpy as np
 import pytest
 from changed_folders import refusal
 
-from wrf_mi.apps.importing.columns import Columns, find_columns, parsed_columns, unit_of
 from wrf_mi.apps.importing.files import read_table
+from wrf_mi.apps.importing.forms import Columns, find_columns, parsed_columns, unit_of
 from wrf_mi.apps.importing.places import find_frame, headings_rad, place_numbers, unit_scale
-from wrf_mi.apps.importing.readings import (
-    Readings,
-    mean_strengths,
-    merged,
-    normal_id,
-    virtual_networks,
-    without_not_heard,
-)
+from wrf_mi.apps.importing.readings import Readings, mean_strengths, normal_id, without_not_heard
 
 pytest.importorskip("pandas")
 
@@ -64,11 +57,10 @@ def test_tables_with_a_column_per_receiver(header: str, tmp_path: Path) -> None:
     assert "id" not in columns.of
 
 
-def test_ranges_belong_to_receivers_and_other_columns_are_kept(tmp_path: Path) -> None:
+def test_further_quantities_of_receivers_are_kept(tmp_path: Path) -> None:
     header = next(iter(WIDE))
     columns = columns_of(tmp_path, header, WIDE[header][0])
-    assert columns.others == {"AP1 RTT(mm)": ("rtt", "AP1"), "AP2 RTT(mm)": ("rtt", "AP2")}
-    assert columns.kept == ["LOS APs"]
+    assert columns.kept == ["AP1 RTT(mm)", "AP2 RTT(mm)", "LOS APs"]
 
 
 def test_stated_columns_and_patterns_replace_guesses(tmp_path: Path) -> None:
@@ -258,21 +250,6 @@ def test_other_numbers_that_pile_up_are_kept() -> None:
     assert without_not_heard(both, None)[2] == []
     for _ in range(20):
         assert without_not_heard(readings(np.round(rng.normal(-70, 9, (200, 4))), 4), None)[2] == []
-
-
-def test_networks_of_one_radio_are_found_and_merged() -> None:
-    rng = np.random.default_rng(5)
-    radio = rng.normal(-60, 10, 40)
-    other = radio - 8  # the other band of the same device
-    rows = [radio, radio + rng.normal(0, 1, 40), other, rng.normal(-60, 10, 40), radio + rng.normal(0, 1, 40)]
-    # Last digit, its other band, a neighbour of similar address, and a local address.
-    last = ["00:aa:bb:cc:dd:e0", "00:aa:bb:cc:dd:e1", "00:aa:bb:cc:dd:e8", "00:aa:bb:cc:dd:ef", "06:aa:bb:cc:dd:e0"]
-    groups = virtual_networks(last, np.stack(rows))
-    assert groups == [[0, 1, 4]]
-    one = merged(Readings(tuple(last), np.arange(5), np.arange(5), np.arange(5.0)), groups)
-    assert one.ids == (last[0], last[2], last[3])
-    np.testing.assert_array_equal(one.receiver, [0, 0, 1, 2, 0])
-    assert virtual_networks(["kitchen", "hall"], np.stack([radio, radio])) == []
 
 
 def test_ids_are_those_that_the_layout_reads() -> None:

@@ -13,47 +13,28 @@ from ...datasets.faults import collect_faults
 from ...datasets.registry import find, known, locate
 from ...estimators.checks import check_parts
 from ...synthetic import load_record
-from .antennas import antenna_notes
-from .directions import spectrum_axes
-from .plans import distance_law, unlike_units
-from .rows import constant_observations, few_rows, not_heard, repeated_observations, repeated_rows, single_position
-from .units import Found, channel_phase, degrees, far_from_origin, heading_unit, position_unit, strength_scale
+from .distances import unlike_units
+from .rows import constant_observations, few_rows, not_heard, repeated_rows
+from .units import NamedTexts, degrees, far_from_origin, strength_scale
 
 logger = logging.getLogger(__name__)
 
 SUSPICIONS = {
-    "headings": "headings in degrees, or clockwise",
-    "positions": "positions in centimetres or millimetres",
-    "degrees": "longitudes and latitudes in degrees for metres",
     "not-heard": "numbers for what was not heard among signal strengths, channels and spectra of zeros",
     "few-rows": "receivers with too few training rows to be fitted",
     "strengths": "powers on a linear scale, or without their sign, for dBm",
-    "channels": "channels that are magnitudes or decibels for complex coefficients",
-    "spectrum-axes": "image rows or columns in another order or with another origin",
-    "orientation": "quaternions in the order w, x, y, z, or of the inverse rotation",
-    "plan": "transmitters in a plan that is mirrored or turned against that of the receivers",
-    "unlike-units": "receivers and transmitters in different units, or rows in steps of a grid",
-    "walls": "transmitters outside the building of the folder or across its walls",
-    "inside-solids": "receivers or transmitters inside walls or solid bodies",
-    "wall-vertices": "receivers at the vertices of a plan's walls",
-    "building": "a plan or mesh beside the data that cannot be read",
-    "train-test": "test rows that are training rows too",
     "repeated-rows": "rows that repeat an earlier row",
-    "repeated-observations": "spectra or channels of a row elsewhere",
+    "train-test": "test rows that are training rows too",
     "constant": "receivers that observe the same in every row, and blank spectra",
-    "single-position": "a single position of the transmitter",
+    "degrees": "longitudes and latitudes in degrees for metres",
+    "unlike-units": "receivers and transmitters in different units, or rows in steps of a grid",
 }
 """Names of the suspicions, and what the data are instead."""
-Check = Callable[[Record], Found]
-OF_VALUES: tuple[Check, ...] = (
-    *(heading_unit, not_heard, few_rows, strength_scale, channel_phase),
-    *(repeated_rows, repeated_observations, constant_observations, single_position),
-)
+Check = Callable[[Record], NamedTexts]
+OF_VALUES: tuple[Check, ...] = (not_heard, few_rows, strength_scale, repeated_rows, constant_observations)
 """Suspicions about the values of a record."""
 WARNED: tuple[Check, ...] = (not_heard, degrees)
 """Suspicions that a fit warns of: without a warning the scores alone would show them, as errors of some 10 dB."""
-OF_PLACES: tuple[Check, ...] = (spectrum_axes, distance_law, unlike_units)
-"""Suspicions about directions and distances, which need the unit of positions."""
 MOST_LINES = 10  # faults of one kind in one file that are printed; the others are counted
 
 
@@ -176,21 +157,15 @@ def check_data(data: str | Path | Record, ignore: Collection[str] = (), progress
     record, faults = collect_faults(read)
     if record is None:
         return DataReport(name, source, None, tuple(faults), ())
-    suspicions = tuple(Suspicion(name, text) for name, text in _suspected(record, ignore) if name not in ignore)
+    suspicions = tuple(Suspicion(name, text) for name, text in _suspected(record) if name not in ignore)
     note = far_from_origin(record)
-    notes = *([] if note is None else [note]), *antenna_notes(record)
-    return DataReport(name, record.source, record, (), suspicions, notes)
+    return DataReport(name, record.source, record, (), suspicions, () if note is None else (note,))
 
 
-def _suspected(record: Record, ignore: Collection[str]) -> Found:
-    """All suspicions; those about directions and distances only where the unit of positions is not one of them."""
-    wrong_unit = list(degrees(record)) or list(position_unit(record))
-    of_places = (*OF_PLACES, _of_building) if {name for name, _ in wrong_unit} <= set(ignore) else ()
+def _suspected(record: Record) -> NamedTexts:
     for check in OF_VALUES:
         yield from check(record)
-    yield from wrong_unit
-    for check in of_places:
-        yield from check(record)
+    yield from list(degrees(record)) or unlike_units(record)  # distances mean nothing in degrees
 
 
 def warn_of_suspicions(record: Record) -> None:
@@ -208,26 +183,6 @@ def _path(dataset: str | Path) -> Path | None:
     if is_name and known(str(dataset)).base_url is None:
         return locate(str(dataset))
     return find(dataset)[0]
-
-
-def _of_building(record: Record) -> Found:
-    # Most fits have no building, and need none of the packages that read meshes and plans.
-    from .building import at_vertices, building_file, inside_solids, plan_against_walls, read_building
-
-    file = building_file(record.source) if record.source else None
-    if file is None:
-        return
-    try:
-        building = read_building(file)
-    except InputError as error:
-        yield "building", f"{error}"
-        return
-    # Transmitters in another plan are in its walls, too.
-    if wrong_plan := list(plan_against_walls(record, building)):
-        yield from wrong_plan
-        return
-    yield from inside_solids(record, building)
-    yield from at_vertices(record, building)
 
 
 def _plain(fault: InputError) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS, LEAST_ROWS, fitted_receivers
 from ...datasets.sentinels import suspicious_values
 from ...tasks import task_of
-from .units import Found, is_above_0_dbm
+from .units import NamedTexts, is_above_0_dbm
 
 FEWEST_STRENGTHS = 4
 """Least number of receivers that received a repeated row: strengths in whole dB of fewer receivers repeat by chance
@@ -33,7 +33,7 @@ APART = (
 """What a suspicious strength is, and the remedy."""
 
 
-def not_heard(record: Record) -> Found:
+def not_heard(record: Record) -> NamedTexts:
     """Numbers for "not heard" among signal strengths, and channels and spectra of zeros."""
     if record.task == "rssi":
         yield from _strengths(record)
@@ -49,7 +49,7 @@ def not_heard(record: Record) -> Found:
             yield "not-heard", f"{text}; zeros are learned as measured: remove the rows, or give NaN (wrf_mi.Record)"
 
 
-def _strengths(record: Record) -> Found:
+def _strengths(record: Record) -> NamedTexts:
     observed = list(map(_in_dbm, record.observation))
     received = np.array(list(map(len, observed)))
     by_receiver = list(map(suspicious_values, observed))
@@ -89,7 +89,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.3g} %" if share >= 0.995 else f"{100 * share:.2g} %"
 
 
-def few_rows(record: Record) -> Found:
+def few_rows(record: Record) -> NamedTexts:
     """Receivers that received too few training rows to be fitted, of the official split or of all rows."""
     strengths = task_of(record).in_decibel
     least = FEW_ROWS if strengths else LEAST_ROWS
@@ -112,7 +112,7 @@ def named_rows(rows: IntArray) -> str:
     return f"row{'s' if len(rows) > 1 else ''} {listed(str(row + 1) for row in rows)}"
 
 
-def repeated_rows(record: Record) -> Found:
+def repeated_rows(record: Record) -> NamedTexts:
     """Rows with position, conditions and observation of an earlier row, and test rows among the training rows."""
     received = _received_values(record) >= (FEWEST_STRENGTHS if record.task == "rssi" else 1)
     per_receiver = (record.observation, record.n_readings, record.std)
@@ -133,19 +133,7 @@ def repeated_rows(record: Record) -> Found:
         yield "repeated-rows", f"{what}: {named_rows(repeated)}; remove them, or give what was measured there"
 
 
-def repeated_observations(record: Record) -> Found:
-    """Spectra and channels that are those of a row elsewhere."""
-    if record.task == "rssi" or not record.has_positions:
-        return
-    first = _first_equal([np.moveaxis(record.observation, 1, 0)])
-    elsewhere = (record.tx_pos_m != record.tx_pos_m[first]).any(axis=1) & (_received_values(record) > 0)
-    copied = np.flatnonzero(elsewhere)
-    if len(copied) and len(np.unique(first)) > 1:
-        what = f"{len(copied)} of {len(record)} rows have the observation of an earlier row at another position"
-        yield "repeated-observations", f"{what}: {named_rows(copied)}; give what was measured there"
-
-
-def constant_observations(record: Record) -> Found:
+def constant_observations(record: Record) -> NamedTexts:
     """Receivers whose observations are all the same, and spectra of a single grey value."""
     if len(record) < 2:
         return
@@ -161,13 +149,6 @@ def constant_observations(record: Record) -> Found:
             if len(blank):
                 what = f"spectra of a single grey value in {named_rows(blank)}"
                 yield "constant", f"receiver {receiver.name}: {what}; give what was measured, or remove the rows"
-
-
-def single_position(record: Record) -> Found:
-    """A single position of the transmitter."""
-    if len(record) > 1 and record.has_positions and (record.tx_pos_m == record.tx_pos_m[0]).all():
-        place = ", ".join(f"{value:g}" for value in record.tx_pos_m[0])
-        yield "single-position", f"all {len(record)} transmitters are at ({place}); give the position of each row"
 
 
 def _received_values(record: Record) -> IntArray:

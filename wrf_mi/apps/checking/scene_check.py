@@ -45,15 +45,13 @@ from ...synthetic import load_record
 from ...tracing.sionna.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ, in_itu_range
 from ...tracing.sionna.scenes import HIGHEST_M as HIGHEST_SCENE_M
 from ...tracing.sionna.scenes import REFUSALS, quiet_mitsuba, reason
-from .building import device_findings
+from .devices import device_findings
 from .scene_findings import Finding, SceneReport
 from .scene_geometry import ShapePart, between_parts, mesh_file_parts, part_findings, scene_parts
 from .scene_xml_faults import SceneXml, itu_type, read_xml, xml_findings
 
 LIGHT_M_PER_S = 299_792_458.0
 PHASE_SHARE = 0.01  # share of a wavelength that rounding may move a surface by: 4 degrees of phase
-FEWEST_POINTS = 1000
-"""Points of a scan below which a room's six sides have too few each for a plane's noise."""
 SLENDER = 4.0  # length or width in heights from which a high scene is a city and not a room in centimetres
 SIONNA_HZ = 3.5e9  # carrier of a scene of Sionna RT until another one is set
 VIEWPOINTS = (".e57", ".pcd", ".ptx")  # formats of scans that state where the scanner stood
@@ -359,9 +357,6 @@ def _check_scan(path: Path, name: str, frame: Frame) -> SceneReport:
         kind = "not-finite" if "not finite" in text else "empty-mesh" if "no points" in text else "mesh"
         return SceneReport(name, (Finding(kind, path, "", text, remedy),))
     findings = list[Finding]()
-    if len(points) < FEWEST_POINTS:
-        text = f"{len(points)} points, and planes need some hundred each"
-        findings.append(Finding("few-points", path, "", text, "give a denser scan"))
     findings += _of_points(points, path, frame)
     if path.suffix.lower() not in VIEWPOINTS:
         text = "does not state where the scanner stood"
@@ -372,9 +367,6 @@ def _check_scan(path: Path, name: str, frame: Frame) -> SceneReport:
 
 def _of_points(points: FloatArray, path: Path, frame: Frame) -> Iterator[Finding]:
     """Findings about units, the axis that is up, and steps of points [n, 3]; with all for which a scene is refused."""
-    if (far := float(np.abs(points).max())) >= FARTHEST_M:
-        remedy = "wrf-mi mesh subtracts an origin; state it by --origin X,Y,Z where measurements have the same frame"
-        yield Finding("far-scan", path, "", f"coordinates up to {far:.0f} m", remedy)
     stated = stated_units(path)
     if other := set(stated) - {frame.units}:
         text = f"{units_text(stated)}, and is read in {frame.units}"

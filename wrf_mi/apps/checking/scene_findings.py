@@ -12,16 +12,12 @@ from ...core.files import listed
 Level = Literal["fault", "warning", "note"]
 
 KINDS: Mapping[str, tuple[Level, str]] = {
-    "xml": ("fault", "scene file that is no well-formed XML in UTF-8, has a document type, or is nested too deeply"),
-    "root": ("fault", "scene file that does not begin with the element scene and its version"),
-    "element": ("fault", "element or plugin that a scene file may not have"),
+    "xml": ("fault", "scene file that is no XML in UTF-8, or has elements or plugins that no scene has"),
     "parameter": ("fault", "parameter that is missing, stated twice, or left to the caller"),
     "unknown-parameter": ("fault", "parameter that the shape does not have, such as toWorld for to_world"),
     "missing-file": ("fault", "mesh or texture that is not where the scene file names it"),
     "outside-folder": ("fault", "mesh or texture outside the folder of the scene file"),
-    "odd-name": ("warning", "id or file name with blanks or characters beyond ASCII, which other systems mangle"),
     "duplicate-id": ("fault", "two elements of one id, or of one name as Sionna RT shortens ids"),
-    "reserved-id": ("fault", "shape with the id merged-shapes, which Sionna RT gives the shapes that it joins"),
     "no-material": ("fault", "shape without a BSDF"),
     "two-materials": ("fault", "shape with several BSDFs"),
     "unknown-reference": ("fault", "reference to an id that no element has"),
@@ -54,7 +50,6 @@ KINDS: Mapping[str, tuple[Level, str]] = {
     "double-sheet": ("fault", "sheet so near to another face that paths through both are lost"),
     "party-wall": ("note", "solids so near to each other that paths through both are lost"),
     "far": ("fault", "coordinates so far from the origin that single precision moves surfaces"),
-    "far-scan": ("warning", "scan far from the origin"),
     "coarse-phase": ("warning", "coordinates that single precision rounds by more than a hundredth of a wavelength"),
     "units": ("fault", "extent that looks like millimetres, or that of a scan of more than a building"),
     "doubtful-units": ("warning", "extent that looks like centimetres, or is too small for a room"),
@@ -67,7 +62,6 @@ KINDS: Mapping[str, tuple[Level, str]] = {
     "device-inside": ("warning", "transmitters or receivers inside a solid"),
     "no-floor": ("warning", "some transmitters or receivers without a floor below"),
     "not-opened": ("fault", "scene that Sionna RT refuses for another reason"),
-    "few-points": ("warning", "scan with too few points for its extent"),
     "no-viewpoint": ("note", "scan that does not state where the scanner stood"),
 }
 """Kinds of findings: level and description. A fault does not open in Sionna RT, or gives wrong results."""

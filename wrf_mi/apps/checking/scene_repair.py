@@ -27,7 +27,6 @@ from .scene_xml_faults import ITU, MERGED, short_name
 from .triangle_repair import label, repaired_triangles
 
 DONE: Mapping[str, str] = {
-    "element": "left out",
     "unknown-parameter": "parameter left out; a transform is taken for to_world",
     "missing-file": "file of the same name elsewhere in the folder taken",
     "outside-folder": "file of the same name in the folder taken",
@@ -38,7 +37,6 @@ DONE: Mapping[str, str] = {
     "moved": "to_world applied to the mesh",
     "bsdf-id": "material given an id",
     "two-materials": "the first radio material taken",
-    "root": "written as a scene of version 3.0.0",
 }
 """What repair does about kinds of findings that need no choice."""
 UNREPAIRED = (

@@ -8,28 +8,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from defusedxml.common import DefusedXmlException
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from ...core import InputError
-from ...core.files import MOST_NAME, inside, listed, one_line
-from ...core.memory import require_memory
+from ...core.files import MOST_NAME, inside, listed
 from ...scene.folder import FACTS_FILE
 from ...scene.scattering import SCATTERING, check_scattering, stated_scattering
-from ...scene.xml_file import (
-    DEEPEST,
-    FILES,
-    OVERRULED,
-    PLUGINS,
-    VALUES,
-    named_shapes,
-    overruled,
-    parsed_xml,
-)
+from ...scene.xml_file import FILES, OVERRULED, VALUES, named_shapes, overruled, read_scene_xml
 from .scene_findings import Finding
 
 ITU = tuple(name.removeprefix("itu_") for name in THICKNESS_M)  # materials of ITU-R P.2040 that Sionna RT knows
@@ -52,7 +40,6 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
 ALL_SHAPES = ("to_world", "flip_normals", "face_normals")
 SMOOTH = ("sphere", "cylinder", "disk")  # shapes that Mitsuba does not hold as triangles
 MERGED = "merged-shapes"
-XML_MEMORY = 40  # bytes of elements for each byte of a file
 VERSION = re.compile(r"(\d+)\.\d+\.\d+")
 PICTURES = ("emitter", "sensor", "integrator")
 DASH = "mat-"  # begin of ids of Blender's exporter, which Sionna RT leaves out
@@ -118,34 +105,19 @@ class SceneXml:
 def read_xml(path: Path) -> SceneXml | Finding:
     """Parse a scene file, or say why that fails."""
     try:
-        require_memory(XML_MEMORY * path.stat().st_size, str(path), "remove what is no scene from it")
-        path.read_text("utf-8")
-        root = parsed_xml(path)
-    except DefusedXmlException:
-        return Finding("xml", path, "", "has a document type or entities", "remove them")
-    except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
-        return Finding(
-            "xml", path, "", f"cannot be read as XML in UTF-8: {one_line(error)}", "correct the file, or export it anew"
-        )
-    level = [root]
-    for _ in range(DEEPEST + 1):
-        level = [child for element in level for child in element]
-    if level:
-        return Finding("xml", path, "", f"elements within elements to more than {DEEPEST} levels", "remove them")
-    return SceneXml(path, root)
+        return SceneXml(path, read_scene_xml(path, check_shapes=False))
+    except InputError as error:
+        text, _, remedy = str(error).removeprefix(f"{path}: ").rpartition("; ")
+        return Finding("xml", path, "", text, remedy)
 
 
 def xml_findings(scene: SceneXml) -> Iterator[Finding]:
     """Findings about a scene file, but for its geometry."""
     root, path = scene.root, scene.path
-    if root.tag != "scene" or not VERSION.fullmatch(root.get("version", "")):
-        text = f"begins with <{root.tag[:40]}> and the version {root.get('version')!r}"
-        yield Finding("root", path, "", text, 'write <scene version="3.0.0">')
     if not scene.shapes:
         yield Finding("no-shapes", path, "", "holds no <shape>", "give a scene with surfaces")
     yield from _elements(scene)
     yield from _ids(scene)
-    yield from _odd_ids(scene)
     for number, bsdf in enumerate(root.findall("bsdf"), start=1):
         yield from bsdf_findings(scene, f"<bsdf> {bsdf.get('id') or number}", bsdf)
     for name, shape in scene.shapes:
@@ -158,17 +130,13 @@ def xml_findings(scene: SceneXml) -> Iterator[Finding]:
 
 
 def _elements(scene: SceneXml) -> Iterator[Finding]:
-    """Elements and plugins that are unknown, parameters that are left open, and files."""
+    """Parameters that are left open, and files."""
     for element, name, is_converted in _walk(scene):
-        tag, plugin, value = element.tag, element.get("type", ""), element.get("value", "")
-        known = PLUGINS.get(tag, "").split()
-        if tag != "shape" and (plugin not in known if plugin else tag not in VALUES):
-            what = f"plugin {plugin[:40]!r} of <{tag}>" if known else f"element <{tag[:40]}>"
-            yield Finding("element", scene.path, name, f"{what} is unknown in scenes", "remove or replace it")
+        value = element.get("value", "")
         if "$" in value:
             text = f"the value {value[:40]} is left to the caller and has no <default>"
             yield Finding("parameter", scene.path, name, text, "write the value in its place")
-        elif tag == "string" and element.get("name") in FILES and not is_converted:
+        elif element.tag == "string" and element.get("name") in FILES and not is_converted:
             yield from _file(scene, name, value)
 
 
@@ -201,13 +169,6 @@ def _file(scene: SceneXml, name: str, stated: str) -> Iterator[Finding]:
         also = "" if other is None else f", but {other.relative_to(scene.path.parent).as_posix()} is"
         text = f"{stated[:MOST_NAME]!r} is not in its place{also}"
         yield Finding("missing-file", scene.path, name, text, "correct the name (with / between folders)")
-    elif odd_name(stated):
-        yield Finding("odd-name", scene.path, name, f"the file name {stated!r}", "rename the file (--repair does)")
-
-
-def odd_name(name: str) -> bool:
-    """Whether a name has blanks, or characters beyond ASCII."""
-    return not name.isascii() or any(character.isspace() for character in name)
 
 
 def similar_file(folder: Path, stated: str) -> Path | None:
@@ -233,16 +194,6 @@ def _ids(scene: SceneXml) -> Iterator[Finding]:
                 yield Finding("duplicate-id", scene.path, name, text, OWN_ID)
             short.setdefault(short_name(identifier), identifier)
         first.setdefault(identifier, element)
-
-
-def _odd_ids(scene: SceneXml) -> Iterator[Finding]:
-    """Ids that Sionna RT has for itself, or that other systems mangle."""
-    for element, name in _with_ids(scene):
-        identifier, tag = element.get("id", ""), element.tag
-        if tag == "shape" and identifier == MERGED:
-            yield Finding("reserved-id", scene.path, name, "Sionna RT has this id for itself", "give it another id")
-        if odd_name(identifier) and tag in ("shape", "bsdf"):
-            yield Finding("odd-name", scene.path, name, f"the id {identifier!r}", "rename it (--repair does)")
 
 
 def _with_ids(scene: SceneXml) -> list[tuple[Element, str]]:

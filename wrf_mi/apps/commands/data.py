@@ -38,8 +38,6 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--strict", action="store_true", help="exit status 1 if there is a suspicion")
     text = "suspicion that is not reported, see docs/data.md; repeatable"
     parser.add_argument("--ignore", action="append", default=[], metavar="NAME", help=text)
-    text = "draw each measured antenna pattern into a PNG file in this folder"
-    parser.add_argument("--antennas", metavar="FOLDER", help=text)
 
 
 def _add_import(data: Any) -> None:
@@ -75,7 +73,6 @@ def _add_import(data: Any) -> None:
     add("--anchor-height", dest="anchor_height_m", **metres, help="height of receivers without z (default: 2.5)")
     text = "carrier of all rows (default: of the table, or 2.44e9)"
     add("--frequency", type=float, dest="frequency_hz", metavar="HZ", help=text)
-    add("--merge-radios", action="store_true", default=None, help="make networks of one radio (BSSIDs) one receiver")
     text = "leave out receivers with fewer training rows (default: 1)"
     add("--min-rows", type=int, dest="min_heard", metavar="N", help=text)
 
@@ -165,15 +162,7 @@ def check_command(a: Arguments) -> int:
     from ..checking import check_data
 
     report = check_data(a.dataset, a.ignore, progress=True)
-    facts, lines = report.as_dict(), report.lines()
-    if a.antennas is not None and report.record is not None:
-        from ..checking.antennas import draw_antennas
-
-        facts["pictures"] = [str(file) for file in draw_antennas(report.record, Path(a.antennas))]
-        if not facts["pictures"]:
-            raise InputError(f"{a.dataset}: no measured antenna pattern; omit --antennas")
-        lines = [*facts["pictures"], *lines]
-    show(a.json, facts, "\n".join(lines))
+    show(a.json, report.as_dict(), "\n".join(report.lines()))
     return exit_status(report.ok, a.strict and report.suspicions)
 
 

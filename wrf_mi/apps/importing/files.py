@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections import Counter
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
 from ...core.files import listed, one_line, readable
+from ...core.memory import require_memory
 from ...datasets.folder_files import SINGLE_MAX
 from ...datasets.receivers_file import plain_id
 
@@ -26,7 +29,8 @@ SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas"}
 """In the order of trial: a table with a decimal comma has commas in every line, too."""
 SPACES = r"\s+"
 SAMPLE = 50  # lines from which separator and decimal mark are read
-MOST_FIELDS = 300_000_000  # largest number of rows times columns of all files: 2.4 GB of numbers in double precision
+TEXT_MEMORY, FIELD_MEMORY = 6, 16  # bytes of memory for each byte of a text file and its lines, and for each field
+THIN = "remove columns or thin its rows"
 EMPTY = ("-", "--", "?")  # fields that are empty beside those that pandas knows (NaN, NA, null, None)
 FRACTION = re.compile(r"[+-]?\d*\.\d+(?:[eE][+-]?\d+)?|[+-]?\d+\.")
 COMMA_FRACTION = re.compile(r"[+-]?\d+,\d+")
@@ -36,14 +40,9 @@ FIELD_UNIT = re.compile(r"([+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?)\s*([a-
 MOST_PREAMBLE = 20  # lines above the header that name the program, the device or the survey
 CONVERSIONS = {
     ".json": "write its points as a table with a row for each reading: x,y,bssid,rssi",
-    ".geojson": "write its points as a table with a row for each reading: lon,lat,bssid,rssi",
-    ".kml": "write its points as a table with a row for each reading: lon,lat,bssid,rssi",
-    ".kmz": "write its points as a table with a row for each reading: lon,lat,bssid,rssi",
+    **dict.fromkeys((".geojson", ".kml", ".kmz"), "write its points as a table of readings: lon,lat,bssid,rssi"),
     ".gpx": "write its track as a table time,lat,lon and give it by --positions",
-    ".xls": "save it as .xlsx or .csv",
-    ".xlsb": "save it as .xlsx or .csv",
-    ".ods": "save it as .xlsx or .csv",
-    ".numbers": "save it as .xlsx or .csv",
+    **dict.fromkeys((".xls", ".xlsb", ".ods", ".numbers"), "save it as .xlsx or .csv"),
     **dict.fromkeys((".sqlite", ".db"), "export its table of readings as .csv"),
     **dict.fromkeys((".pcap", ".pcapng", ".cap"), "export time, address and strength of each frame as .csv"),
     **dict.fromkeys((".zip", ".gz", ".7z"), "unpack it"),
@@ -129,7 +128,8 @@ def read_table(path: str | Path, sheet: str = "") -> Table:
 
     Raises:
         InputError: missing or damaged file, another format, a workbook of several sheets without ``sheet``, rows with
-            more or fewer fields than the first, a column named twice, or more fields than `MOST_FIELDS`.
+            more or fewer fields than the first, a column named twice, or more fields than memory
+            holds.
     """
     path, pandas = Path(path), package("pandas")
     missing = DataFault(path, "missing; give a file that exists")
@@ -200,113 +200,72 @@ def _check_names(path: Path, names: list[str]) -> None:
 
 
 def _check_size(path: Path, rows: int, columns: int) -> None:
-    if rows * columns > MOST_FIELDS:
-        text = f"{rows} rows of {columns} columns are more than the {MOST_FIELDS} fields that fit into memory"
-        raise DataFault(path, f"{text}; remove columns or thin its rows")
+    require_memory(FIELD_MEMORY * rows * columns, f"{path}: {rows} rows of {columns} columns", THIN)
     if not rows:
         raise DataFault(path, "no rows; give one per measurement")
 
 
-@dataclass
-class _Lines:
-    """A text file: numbers of its lines without a row, its first rows, the comment above them, and its length.
-
-    ``numbers`` are those of the first rows' lines, ``preamble`` those of lines above the header.
-    """
-
-    encoding: str
-    numbers: list[int] = field(default_factory=list)
-    preamble: list[int] = field(default_factory=list)
-    skipped: list[int] = field(default_factory=list)
-    sample: list[str] = field(default_factory=list)
-    comment: str = ""
-    count: int = 0
-
-    @property
-    def first(self) -> int:
-        """Number of the line of the first row."""
-        return self.numbers[0]
-
-
 def _read_text(path: Path) -> Table:
+    """A table of text, whose separator, decimal mark and header are recognised from its first lines."""
     missing = DataFault(path, "missing; give a file that exists")
     with readable(path, missing, "give a table as text (CSV), Parquet (.parquet) or Excel (.xlsx)"):
-        lines = _scan(path)
-    if not lines.sample:
+        encoding, text = _decoded(path)
+    # Numbers and texts of the lines of rows, and the comment above the first of them.
+    rows, comment = list[tuple[int, str]](), ""
+    for number, line in enumerate(text.split("\n"), start=1):
+        plain = line.strip()
+        if plain and not plain.startswith(COMMENTS):
+            rows.append((number, line))
+        elif plain and not rows:
+            comment = plain
+    if not rows:
         raise DataFault(path, "empty; give a row per measurement")
-    separator = _without_preamble(lines)
-    rows = [_fields(line, separator) for line in lines.sample]
-    decimal = _decimal_mark(rows)
-    has_header, named = _header(lines, rows[0], separator, decimal)
+
+    # Separator and decimal mark, without lines above the header.
+    separator, above = _separator_below([line for _, line in rows[:SAMPLE]])
+    rows = rows[above:]
+    sample = [_fields(line, separator) for _, line in rows[: SAMPLE - above]]
+    decimal = _decimal_mark(sample)
+
+    # The header is the first line, the comment above it, or absent.
+    header, named = "in its first line", sample[0]
+    if _is_row(named, decimal):
+        header, named = "in a comment", _fields(comment.lstrip("#%/ "), separator)
+        if len(named) != len(sample[0]) or _is_row(named, decimal):
+            header, named = "absent", [str(number + 1) for number in range(len(sample[0]))]
     names = [name.strip() or f"column_{number + 1}" for number, name in enumerate(named)]
     _check_names(path, names)
-    skipped = [*lines.skipped, *lines.preamble]
-    skipped += [lines.first] if has_header == "in its first line" else []
-    _check_size(path, lines.count - len(skipped), len(names))
-    _check_widths(path, lines, separator, len(names))
+
+    # Fields: pandas fills missing ones silently.
+    for number, line in rows if separator != SPACES else ():
+        if (fields := line.count(separator) + 1) != len(names) and '"' not in line:
+            text = f"{fields} fields, but the first line has {len(names)}; correct or remove the line"
+            raise DataFault(path, text, line=number)
+    rows = rows[header == "in its first line" :]
+    _check_size(path, len(rows), len(names))
     with readable(path, missing, "correct the line"):
         frame = package("pandas").read_csv(
-            path,
-            **{"sep": separator, "decimal": decimal, "encoding": lines.encoding, "skiprows": skipped},
-            **{"header": None, "names": names, "index_col": False, "na_values": EMPTY},
-            **{"skipinitialspace": True, "low_memory": False},
+            io.StringIO("\n".join(line for _, line in rows)),
+            **{"sep": separator, "decimal": decimal, "header": None, "names": names, "index_col": False},
+            **{"na_values": EMPTY, "skipinitialspace": True, "low_memory": False},
         )
+
+    # What was recognised, in words.
     form = f"separated by {SEPARATORS.get(separator, 'blanks')}" + ", decimal comma" * (decimal == ",")
-    form += f", encoding {lines.encoding}" * (lines.encoding != "utf-8-sig")
-    note = f"{path.name}: {len(frame)} rows, {form}, header {has_header or 'absent'}"
-    if lines.preamble:
-        note += f"; {len(lines.preamble)} lines above it are left out"
-    return Table(_with_units(frame), ((path, len(frame)),), (note,), bool(has_header))
+    form += f", encoding {encoding}" * (encoding != "utf-8-sig")
+    note = f"{path.name}: {len(frame)} rows, {form}, header {header}"
+    note += f"; {above} lines above it are left out" * bool(above)
+    return Table(_with_units(frame), ((path, len(frame)),), (note,), header != "absent")
 
 
-def _header(lines: _Lines, first: list[str], separator: str, decimal: str) -> tuple[str, list[str]]:
-    """Where the header is, "" without one, and the names of the columns."""
-    if not _is_row(first, decimal):
-        return "in its first line", first
-    commented = _fields(lines.comment.lstrip("#%/ "), separator)
-    if len(commented) == len(first) and not _is_row(commented, decimal):
-        return "in a comment", commented
-    return "", [str(number + 1) for number in range(len(first))]
-
-
-def _scan(path: Path) -> _Lines:
-    """Lines of a text file in UTF-8, UTF-16 with its mark, or else Windows' code page 1252."""
-    with path.open("rb") as stream:
-        marked = stream.read(2) in (b"\xff\xfe", b"\xfe\xff")
-    for encoding in ["utf-16"] if marked else ["utf-8-sig", "cp1252"]:
-        try:
-            return _scan_as(path, encoding)
-        except UnicodeDecodeError:
-            continue
+def _decoded(path: Path) -> tuple[str, str]:
+    """Encoding and text of a file in UTF-8, UTF-16 with its mark, or else Windows' code page 1252."""
+    require_memory(TEXT_MEMORY * path.stat().st_size, f"{path}", THIN)
+    content = path.read_bytes()
+    for encoding in ["utf-16"] if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ["utf-8-sig", "cp1252"]:
+        with suppress(UnicodeDecodeError):
+            return encoding, content.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
     raise DataFault(path, "not text; save it as UTF-8")
-
-
-def _scan_as(path: Path, encoding: str) -> _Lines:
-    lines = _Lines(encoding)
-    with path.open(encoding=encoding) as stream:
-        for number, line in enumerate(stream):
-            text = line.strip()
-            if not text or text.startswith(COMMENTS):
-                lines.skipped.append(number)
-                lines.comment = text if text and not lines.sample else lines.comment
-            elif len(lines.sample) < SAMPLE:
-                lines.numbers.append(number)
-                lines.sample.append(line.rstrip("\n"))
-            lines.count = number + 1
-    return lines
-
-
-def _check_widths(path: Path, lines: _Lines, separator: str, columns: int) -> None:
-    """Refuse a line with more or fewer fields than the first: pandas fills missing fields silently."""
-    if separator == SPACES:
-        return
-    skipped = {*lines.skipped, *lines.preamble}
-    with path.open(encoding=lines.encoding) as stream:
-        for number, line in enumerate(stream):
-            fields = line.count(separator) + 1
-            if fields != columns and number not in skipped and '"' not in line:
-                text = f"{fields} fields, but the first line has {columns}; correct or remove the line"
-                raise DataFault(path, text, line=number + 1)
 
 
 def _fields(line: str, separator: str) -> list[str]:
@@ -315,22 +274,15 @@ def _fields(line: str, separator: str) -> list[str]:
     return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
 
 
-def _without_preamble(lines: _Lines) -> str:
-    """The separator of a file; lines above its header, which have other numbers of fields, leave the sample."""
-    separator = _separator(lines.sample)
-    for first in range(1, min(MOST_PREAMBLE, len(lines.sample) - 2) + 1):
-        if separator[1]:
-            break
-        after = _separator(lines.sample[first:])
-        fields = _fields(lines.sample[first], after[0])
-        if after[1] and not _is_row(fields, "."):  # where a row begins the rest, a row before it is damaged
-            lines.preamble, lines.numbers, lines.sample = (
-                lines.numbers[:first],
-                lines.numbers[first:],
-                lines.sample[first:],
-            )
-            separator = after
-    return separator[0]
+def _separator_below(lines: list[str]) -> tuple[str, int]:
+    """The separator of a table's first lines, and how many above its header have other numbers of fields."""
+    separator, is_certain = _separator(lines)
+    for above in range(1, min(MOST_PREAMBLE, len(lines) - 2) + 1) if not is_certain else ():
+        below, is_certain = _separator(lines[above:])
+        # Where a row begins the others, a row before it is damaged.
+        if is_certain and not _is_row(_fields(lines[above], below), "."):
+            return below, above
+    return separator, 0
 
 
 def _separator(sample: list[str]) -> tuple[str, bool]:

@@ -20,8 +20,8 @@ from ...core.files import listed, one_line
 from ...core.types import IntArray
 from ...datasets.ble_folder import CARRIER_HZ, write_ble_folder
 from ...datasets.unknown import SENT, name_words
-from .columns import HERTZ, described, find_columns, parsed_columns, unit_of
 from .files import Table, joined, read_table
+from .forms import HERTZ, described, find_columns, parsed_columns, unit_of, without_slots
 from .options import ImportOptions, option_name
 from .picture import plan_picture
 from .places import (
@@ -40,17 +40,13 @@ from .places import (
 from .readings import (
     Means,
     Readings,
-    chosen,
     file_offsets,
     further_columns,
     mean_strengths,
-    merged,
     read_readings,
-    virtual_networks,
     without_not_heard,
 )
 from .receivers_table import read_receivers
-from .slots import without_slots
 
 FACTS, PICTURE = "import.yml", "plan.png"  # files beside the tables: what the import assumed, and a plan of the rows
 MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
@@ -135,29 +131,38 @@ class _Import:
         """Read, average and write."""
         self._check_idle()
         self._check_strengths()
+
+        # Positions of the rows, and single readings without numbers for "not heard".
         frame, xyz_m = self._positions()
         readings, notes, not_heard = without_not_heard(read_readings(self.table, self.columns), self.options.not_heard)
         self.notes += notes
         if not len(readings.dbm):
             raise DataFault(self.table.files[0][0], "no reading was heard; correct --columns or --not-heard")
         self._check_sent(readings)
+
+        # Rows of one position, heading, carrier, run and part of the split are averaged.
         conditions = self._conditions(readings)
         keys = {"z": xyz_m[:, 2], **conditions, "part": self.is_test}
         place = place_numbers(keys, xyz_m[:, :2], self.options.place_m)
         count = np.bincount(place)
         self.notes += file_offsets(readings, place, self._file, [path.name for path, _ in self.table.files])
         first = np.unique(place, return_index=True)[1]
-        readings, means = self._means(readings, place, len(count))
+        ids, means = self._means(readings, place, len(count))
         position_m = np.column_stack([np.bincount(place, axis) / count for axis in xyz_m.T]).round(POSITION_DIGITS)
-        receivers, notes = self._receivers(readings, frame)
+
+        # The record, with what its rows state.
+        receivers, notes = self._receivers(ids, frame)
         self.notes += notes
         record = self._record(means, position_m, receivers)
         record = self._with_conditions(record, {name: values[first] for name, values in conditions.items()})
         record = self._with_split(record, self.is_test[first])
-        further, notes = further_columns(self.table, self.columns, readings, place)
+
+        # Files: tables, facts and picture.
+        if further := further_columns(self.table, self.columns, place):
+            self.notes.append(f"kept as columns that no model uses: {listed(further)}")
         fixed = one_line(self.columns.of.get("id", "the columns of strengths"))
         text = f"the fixed ends, named by {fixed}, are the receivers, and the moving end is the transmitter"
-        self.notes += [*notes, f"{text}: by reciprocity it does not matter who sends"]
+        self.notes.append(f"{text}: by reciprocity it does not matter who sends")
         lines = described(self.table, self.columns, self.units)
         self.facts |= {"columns": lines, "frame": frame.facts(), "not_heard_dbm": not_heard, "notes": self.notes}
         extra: dict[str, str | bytes] = {
@@ -170,6 +175,8 @@ class _Import:
     def _read(self, files: Sequence[str | Path]) -> tuple[Table, NDArray[np.bool_]]:
         """All rows with their positions, and which of them test."""
         options = self.options
+
+        # Tables, each with positions of another file, if any.
         paths = [*files, *options.test]
         tables, positions = ([read_table(path, options.sheet) for path in part] for part in (paths, options.positions))
         if len(positions) not in (0, 1, len(paths)):
@@ -180,6 +187,8 @@ class _Import:
             pairs = [with_positions(*pair, self.stated) for pair in zip(tables, positions, strict=True)]
             tables = [table for table, _ in pairs]
             self.notes.append(f"positions of {options.positions[0]} are matched {pairs[0][1]}")
+
+        # One table of all rows that are chosen, and the number of each row's file.
         tables = [without_slots(table) for table in tables]
         self._file = np.repeat(np.arange(len(paths)), list(map(len, tables)))
         table = joined(tables)
@@ -225,7 +234,10 @@ class _Import:
         if "z" in of:
             self.units["z"] = self.columns.unit("z") or options.units.replace("deg", "m") or "m"
             return finite_columns(table, [of["z"]])[:, 0] * unit_scale(self.units["z"], "--units")
-        height_m = self._stated_heights_m()[self._file]
+        count, stated_m = int(self._file.max()) + 1, np.atleast_1d(np.asarray(options.height_m, float))
+        if len(stated_m) not in (1, count):
+            raise InputError(f"--height: {len(stated_m)} heights for {count} tables; give one for each, or one for all")
+        height_m = np.broadcast_to(stated_m, count)[self._file]
         if "floor" in of:
             floors = floor_numbers(table, of["floor"])
             names = dict(zip(table.frame[of["floor"]].astype(str), floors * options.storey_m, strict=True))
@@ -238,13 +250,6 @@ class _Import:
         text = "all rows are" if len(heights_m) == 1 else "rows are"
         self.notes.append(f"no column z: {text} {listed([f'{z:g}' for z in heights_m])} m above the floor (--height)")
         return height_m
-
-    def _stated_heights_m(self) -> FloatArray:
-        """Height above the floor of the rows of each table."""
-        count, stated = int(self._file.max()) + 1, np.atleast_1d(np.asarray(self.options.height_m, float))
-        if len(stated) not in (1, count):
-            raise InputError(f"--height: {len(stated)} heights for {count} tables; give one for each, or one for all")
-        return np.broadcast_to(stated, count)
 
     def _check_strengths(self) -> None:
         """Refuse strengths in per cent, whose scale is that of each program."""
@@ -302,21 +307,13 @@ class _Import:
             return {}
         return {"frequency_hz": carriers_hz}
 
-    def _means(self, readings: Readings, place: IntArray, places: int) -> tuple[Readings, Means]:
-        """Readings of the receivers that remain, and their means at each place."""
+    def _means(self, readings: Readings, place: IntArray, places: int) -> tuple[list[str], Means]:
+        """Ids of the receivers that remain, and the means of their readings at each place."""
         options = self.options
         if places * len(readings.ids) > MOST_CELLS:
             text = f"{places} places of {len(readings.ids)} receivers do not fit into memory ({MOST_CELLS} values do)"
             raise InputError(f"{self.out}: {text}; average by --place, or leave receivers out by --receivers")
         means = mean_strengths(readings, place, places, options.average)
-        groups = virtual_networks(readings.ids, means.dbm)
-        if groups:
-            names = listed(readings.ids[number] for number in groups[0])
-            text = f"{sum(map(len, groups))} addresses are networks of {len(groups)} radios (the first: {names})"
-            self.notes.append(text + (": merged" if options.merge_radios else "; --merge-radios makes them one"))
-            if options.merge_radios:
-                readings = merged(readings, groups)
-                means = mean_strengths(readings, place, places, options.average)
         trains = ~self.is_test[np.unique(place, return_index=True)[1]]
         heard = (means.count[:, trains] > 0).sum(axis=1)
         remaining = np.flatnonzero(heard >= max(1, options.min_heard))
@@ -327,15 +324,15 @@ class _Import:
         if not len(remaining):
             text = f"no receiver was heard in {options.min_heard} training rows; lower --min-rows"
             raise InputError(f"{self.out}: {text}")
-        readings = chosen(readings, remaining)
-        return readings, Means(means.dbm[remaining], means.count[remaining], means.std[remaining])
+        ids = [readings.ids[number] for number in remaining]
+        return ids, Means(means.dbm[remaining], means.count[remaining], means.std[remaining])
 
-    def _receivers(self, readings: Readings, frame: LocalFrame) -> tuple[tuple[Receiver, ...], list[str]]:
+    def _receivers(self, ids: Sequence[str], frame: LocalFrame) -> tuple[tuple[Receiver, ...], list[str]]:
         """Receivers with the carriers of their readings, if these state any."""
         options = self.options
         table = None if options.anchors is None else read_table(options.anchors, options.sheet)
-        receivers, notes = read_receivers(table, readings.ids, frame, options.units, options.anchor_height_m)
-        pairs = list(zip(readings.ids, receivers, strict=True))
+        receivers, notes = read_receivers(table, ids, frame, options.units, options.anchor_height_m)
+        pairs = zip(ids, receivers, strict=True)
         carriers = [self.carrier_of.get(name, receiver.frequency_hz) for name, receiver in pairs]
         if None in carriers or options.frequency_hz:  # one carrier for all
             carriers = [None] * len(carriers)

@@ -12,8 +12,8 @@ import numpy as np
 from ...core import DataFault
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .columns import Columns, find_columns
 from .files import Table, read_table
+from .forms import Columns, find_columns
 from .places import LocalFrame, finite_columns, place_numbers, plane_columns, unit_scale
 from .readings import mean_strengths, read_readings, without_not_heard
 

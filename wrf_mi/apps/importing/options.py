@@ -27,8 +27,8 @@ class ImportOptions:
 
     Attributes:
         columns: columns by meaning (x, y, z, lat, lon, floor, heading, time, run, split, frequency, id, rssi, or cell,
-            whose texts are coordinates, as (3.5, 2.0), or end with the numbers floor, x and y, as L4-31-2), a mapping
-            or text such as ``"x=X,y=Y"``; the name ``-``: there is none.
+            whose texts are coordinates, as (3.5, 2.0)), a mapping or text such as ``"x=X,y=Y"``; the name ``-``: there
+            is none.
         sheet: name of the sheet of workbooks with several.
         receivers: patterns of the columns of strengths of a wide table, such as ``"AP* RSS(dBm)"``.
         test: files with the test rows.
@@ -46,7 +46,6 @@ class ImportOptions:
         storey_m: height of a storey, where rows have a floor and no z.
         anchor_height_m: height of receivers without z.
         frequency_hz: carrier of all rows; 0: that of the table, or 2.44 GHz.
-        merge_radios: whether networks of one radio become one receiver.
         min_heard: training rows in which a receiver was heard at least; others are left out.
     """
 
@@ -68,7 +67,6 @@ class ImportOptions:
     storey_m: float = 3.0
     anchor_height_m: float = 2.5
     frequency_hz: float = 0.0
-    merge_radios: bool = False
     min_heard: int = 1
 
     def __post_init__(self) -> None:

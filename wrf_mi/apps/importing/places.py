@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
 from ...core.files import one_line
-from .columns import METRES, MOST_FLOORS, named_columns, shown_names, unit_of
 from .files import Table, package
+from .forms import METRES, named_columns, shown_names, unit_of
 
 DEGREES = "EPSG:4326"
 FAR_M = 10_000.0  # largest coordinate without a shift: single precision resolves a millimetre to 16 km
 ROUND_M, ROUND_DEG = 10.0, 1e-4  # origins are rounded to these
 POSITION_DIGITS = 6  # decimals of metres that are written: the mean of equal positions is not exactly theirs
-WIDEST_DEG, AWAY = 1.0, 20.0
-"""Largest extent of a place in degrees, and its least distance from the origin in extents, where x and y are not called
-longitude and latitude: a room in metres is not a metre wide and twenty metres away."""
+LONGITUDE, LATITUDE, WIDEST_DEG = 180.0, 90.0, 1.0  # largest angles, and largest extent of a place in degrees
+AWAY = 20.0
+"""Least distance of a place in degrees from the origin in its extents, 1 km at 0.2 degrees: a room in metres is not a
+metre wide and twenty metres away."""
 FULL_TURN = 4 * np.pi  # largest heading in radians where its unit is not stated; headings may count a turn
 COMPASS = ("bearing", "azimuth", "course", "compass")  # words of headings that run clockwise from north, in degrees
 MOST_OUTSIDE = 0.5  # share of rows outside the time of the positions above which the times are not in one unit
@@ -32,6 +33,7 @@ PAIR = re.compile(
     r"\D{0,2}?([+-]?\d+(?:\.\d*)?)\s*[,;\s]\s*([+-]?\d+(?:\.\d*)?)(?:\s*[,;\s]\s*([+-]?\d+(?:\.\d*)?))?\D{0,2}"
 )
 """Coordinates x, y and, if stated, z in one text, as in ``(3.5, -2.0)``."""
+MOST_FLOORS = 20  # numbers of a third column without name from which it is no floor
 PLACES = ("x", "y", "z", "lat", "lon", "floor", "heading")
 
 
@@ -105,23 +107,24 @@ def find_frame(xy: FloatArray, geographic: bool, unit: str, scale_m: float, crs:
 def _guessed_crs(xy: FloatArray, geographic: bool, unit: str) -> tuple[str, bool, list[str]]:
     """The reference system of degrees or "", whether x is the latitude, and what was assumed."""
     largest = np.abs(xy).max(axis=0)
-    if largest.max() > 180 or largest.min() > 90:
+    if largest.max() > LONGITUDE or largest.min() > LATITUDE:
         text = "longitude and latitude are no degrees: taken for metres of a map projection; state it by --crs"
         text += " (EPSG:3857 for web maps), as its metres may be longer than those of the ground"
         return "", False, [text] if geographic else []
-    swapped = bool(largest[1] > 90)
+    swapped = bool(largest[1] > LATITUDE)
     if geographic or unit.startswith("deg"):
         return DEGREES, swapped, []
-    if unit not in ("", "m") or not _is_fine(xy):
+    if unit not in ("", "m") or not is_geographic(xy):
         return "", False, []
     order = "latitude, longitude" if swapped else "longitude, latitude"
     return DEGREES, swapped, [f"x and y are taken for {order} in degrees; --units m: they are metres"]
 
 
-def _is_fine(xy: FloatArray) -> bool:
-    """Whether coordinates in the range of degrees are those of a place on the globe rather than of a room."""
-    extent = float(np.ptp(xy, axis=0).max())
-    return 0 < extent <= WIDEST_DEG and bool(np.abs(xy).max() >= AWAY * extent)
+def is_geographic(xy: FloatArray) -> bool:
+    """Whether coordinates [n, 2] may be degrees of a place on the globe rather than metres of a room."""
+    extent, largest = float(np.ptp(xy, axis=0).max()), np.abs(xy).max(axis=0)
+    in_range = largest.max() <= LONGITUDE and largest.min() <= LATITUDE
+    return bool(in_range and 0 < extent <= WIDEST_DEG and largest.max() >= AWAY * extent)
 
 
 def _projected(xy: FloatArray, crs: str, scale_m: float, swapped: bool) -> LocalFrame:
@@ -290,29 +293,16 @@ def _interpolated(values: Table, time: str, positions: Table, other: str, new: S
 
 
 def with_cells(table: Table, column: str) -> Table:
-    """A table with the columns x, y, and z or floor if stated, from the numbers in the texts of a column.
-
-    Texts are coordinates, ``(3.5, -2.0)``, or names of cells whose last whole numbers are floor, x and y, ``L4-31-2``.
-    """
+    """A table with the columns x, y, and z if stated, from the coordinates in a column's texts, ``(3.5, -2.0)``."""
     if column not in table.frame:
         raise DataFault(table.files[0][0], f"no column {one_line(column)}; correct --columns", line=1)
     texts = table.frame[column].astype(str).str.strip()
-    pairs = texts.str.extract(f"^{PAIR.pattern}$")
-    if pairs[1].notna().all():
-        names = ["x", "y", "z"][: 3 if pairs[2].notna().all() else 2]
-        return replace(
-            table, frame=table.frame.assign(**{name: pairs[k].astype(float) for k, name in enumerate(names)})
-        )
-    numbers = texts.str.findall(r"\d+")
-    # A decimal point joins two numbers to one, so that the last whole numbers are no x and y.
-    wrong = (numbers.str.len() < 2) | texts.str.contains(r"\d\.\d")
-    if wrong.any():
+    parts = texts.str.extract(f"^{PAIR.pattern}$").astype(float)
+    if (wrong := parts[1].isna().to_numpy()).any():
         row = int(np.argmax(wrong))
-        text = f"{one_line(column)} is {texts.iloc[row][:40]!r}"
-        raise table.fault(f"{text}; give a text such as (3.5, 2.0), or whole numbers as in L4-31-2", row)
-    names = ["floor", "x", "y"][-int(numbers.str.len().min()) :]
-    columns = {name: numbers.str[place - len(names)].astype(float) for place, name in enumerate(names)}
-    return replace(table, frame=table.frame.assign(**columns))
+        raise table.fault(f"{one_line(column)} is {texts.iloc[row][:40]!r}; give a text such as (3.5, 2.0)", row)
+    names = ["x", "y", "z"][: 3 if parts[2].notna().all() else 2]
+    return replace(table, frame=table.frame.assign(**{name: parts[k] for k, name in enumerate(names)}))
 
 
 def seconds(table: Table, column: str) -> FloatArray:

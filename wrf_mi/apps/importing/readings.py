@@ -1,38 +1,31 @@
-"""Readings of a table: numbers for "not heard", virtual networks of one radio, means of places, and other columns."""
+"""Readings of a table: numbers for "not heard", means of places, and other columns."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ...core.angles import FloatArray
-from ...core.files import listed, one_line
+from ...core.files import one_line
 from ...core.types import IntArray
 from ...datasets.receivers_file import plain_id
 from ...datasets.sentinels import CUSTOMARY_DBM, suspicious_values
-from .columns import MAC, METRES, RANGES, Columns, unit_of
 from .files import Table, package
+from .forms import MAC, Columns
 
 POOLED_READINGS = 4.0
 """Weight, in readings, of all places' variance in that of a place, of which few readings tell little."""
 LEAST_STD_DB = 0.05  # noise of a mean of whole dB is not below this
-FEWEST_SHARED, LEAST_CORRELATION, MOST_DIFFERENCE_DB = 5, 0.8, 3.0
-"""Places at which two networks were heard, correlation and median difference from which they are one radio's: the bands
-of one access point differ by more, and so do neighbouring access points."""
 FEWEST_COMPARED, LEAST_OFFSET_DB, OFFSET_STANDARD_ERRORS = 10, 2.0, 4.0
 """Places and receivers that files share, and the difference of their strengths, from which it is said: one in 16,000
 files differs by four standard errors by chance, and a quantisation to whole dB by less than 2 dB."""
 RESERVED = ("x", "y", "z", "heading", "frequency_hz", "run", "split")
 PREFIXES = ("rssi_", "count_", "std_")  # columns of the layout, which kept columns must not be taken for
-FEWEST_EQUAL = 3
 SEPARATOR = "|"
 
 
@@ -202,99 +195,15 @@ def file_offsets(readings: Readings, place: IntArray, file: IntArray, names: Seq
     return notes
 
 
-def virtual_networks(ids: Sequence[str], dbm: FloatArray) -> list[list[int]]:
-    """Groups of receivers that are networks of one radio, by their hardware addresses and strengths [n_rx, n].
-
-    Addresses of a radio's networks differ in the last digit or in the first byte, which marks local administration.
-    """
-    by_address: dict[str, list[int]] = {}
-    for number, name in enumerate(ids):
-        if MAC.fullmatch(name):
-            by_address.setdefault(re.sub("[^0-9a-f]", "", name.lower())[2:-1], []).append(number)
-    candidates = [pair for numbers in by_address.values() for pair in combinations(numbers, 2)]
-    pairs = [pair for pair in candidates if _is_one_radio(dbm[pair[0]], dbm[pair[1]])]
-    if not pairs:
-        return []
-    graph = coo_array((np.ones(len(pairs)), np.array(pairs).T), shape=(len(ids), len(ids)))
-    radio = connected_components(graph, directed=False)[1]
-    return [np.flatnonzero(radio == number).tolist() for number in np.flatnonzero(np.bincount(radio) > 1)]
-
-
-def _is_one_radio(first_dbm: FloatArray, second_dbm: FloatArray) -> bool:
-    both = ~np.isnan(first_dbm) & ~np.isnan(second_dbm)
-    first, second = first_dbm[both], second_dbm[both]
-    if len(first) < FEWEST_SHARED or np.abs(np.median(first - second)) > MOST_DIFFERENCE_DB:
-        return False
-    if not np.ptp(first) or not np.ptp(second):
-        return bool(not np.ptp(first) and not np.ptp(second))
-    return bool(np.corrcoef(first, second)[0, 1] >= LEAST_CORRELATION)
-
-
-def merged(readings: Readings, groups: Sequence[Sequence[int]]) -> Readings:
-    """Readings in which each group of receivers is its first one."""
-    number = np.arange(len(readings.ids))
-    for first, *others in groups:
-        number[others] = first
-    remaining = np.unique(number)
-    ids = tuple(readings.ids[k] for k in remaining)
-    return replace(readings, ids=ids, receiver=np.searchsorted(remaining, number)[readings.receiver])
-
-
-def chosen(readings: Readings, receivers: IntArray) -> Readings:
-    """Readings of some receivers."""
-    number = np.full(len(readings.ids), -1)
-    number[receivers] = np.arange(len(receivers))
-    renumbered = number[readings.receiver]
-    part = renumbered >= 0
-    ids = tuple(readings.ids[k] for k in receivers)
-    return Readings(ids, readings.row[part], renumbered[part], readings.dbm[part])
-
-
-def further_columns(
-    table: Table, columns: Columns, readings: Readings, place: IntArray
-) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Kept columns [places] by name, and what they are in words.
-
-    Numbers are averaged over the rows of a place, lengths in metres; different texts are joined by a bar.
-    """
+def further_columns(table: Table, columns: Columns, place: IntArray) -> dict[str, NDArray[Any]]:
+    """Kept columns [places] by name: means of numbers over the rows of a place, its different texts joined by a bar."""
     values: dict[str, NDArray[Any]] = {}
-    notes: list[str] = []
     if "time" in columns.of:
         values["time"] = table.frame[columns.of["time"]].to_numpy()[np.unique(place, return_index=True)[1]]
-    for name, (quantity, receiver) in columns.others.items():
-        numbers, unit = table.numbers(name), ""
-        if quantity in RANGES:
-            numbers, mark = _without_mark(numbers)
-            numbers, unit = numbers * METRES.get(unit_of(name), 1.0), "_m"
-            notes += [f"{number:g} is no {quantity}: empty fields" for number in mark]
-        means = {receiver: _means(numbers, place)} if receiver else _by_receiver(numbers, readings, place)
-        values |= {f"{quantity}_{normal_id(receiver_id)}{unit}": column for receiver_id, column in means.items()}
-    values |= {one_line(name): _of_places(table, name, place) for name in columns.kept}
-    if values:
-        notes.append(f"kept as columns that no model uses: {listed(values)}")
-    return {_free(name): column for name, column in values.items()}, list(dict.fromkeys(notes))
-
-
-def _by_receiver(numbers: FloatArray, readings: Readings, place: IntArray) -> dict[str, FloatArray]:
-    places, columns = int(place.max()) + 1, {}
-    for number, receiver in enumerate(readings.ids):
-        rows = readings.row[readings.receiver == number]
-        columns[receiver] = _means(numbers[rows], place[rows], places)
-    return columns
-
-
-def _free(name: str) -> str:
-    return f"source_{name}" if name in RESERVED or name.startswith(PREFIXES) else name
-
-
-def _without_mark(values: FloatArray) -> tuple[FloatArray, list[float]]:
-    """Ranges without a number that stands for none: equal in several rows and further away than all others spread."""
-    distinct, counts = np.unique(values[~np.isnan(values)], return_counts=True)
-    for end, inner in ((-1, slice(None, -1)), (0, slice(1, None))):
-        others = distinct[inner]
-        if len(others) > 1 and counts[end] >= FEWEST_EQUAL and abs(distinct[end] - others[end]) > np.ptp(others):
-            return np.where(values == distinct[end], np.nan, values), [float(distinct[end])]
-    return values, []
+    for name in columns.kept:
+        free = f"source_{name}" if name in RESERVED or name.startswith(PREFIXES) else name
+        values[one_line(free)] = _of_places(table, name, place)
+    return values
 
 
 def _means(values: FloatArray, place: IntArray, places: int | None = None) -> FloatArray:
@@ -307,12 +216,9 @@ def _means(values: FloatArray, place: IntArray, places: int | None = None) -> Fl
 
 
 def _of_places(table: Table, name: str, place: IntArray) -> NDArray[Any]:
-    """Means of numbers, or the different texts of each place in the order of its rows."""
+    """Means of numbers, NaN without any, or the different texts of each place in the order of its rows."""
     if table.is_numeric(name):
         return _means(table.numbers(name), place)
-    frame = package("pandas").DataFrame({"place": place, "text": table.frame[name].astype("object")}).dropna()
-    frame = frame.drop_duplicates()
-    texts = np.full(int(place.max()) + 1, "", object)
-    for number, part in frame.groupby("place", sort=False)["text"]:
-        texts[number] = SEPARATOR.join(one_line(text) for text in part)
-    return texts
+    texts = table.frame[name].astype("object").set_axis(place).dropna().map(one_line)
+    joined = texts.groupby(level=0).agg(lambda part: SEPARATOR.join(dict.fromkeys(part)))
+    return np.asarray(joined.reindex(range(int(place.max()) + 1), fill_value=""), object)

@@ -17,8 +17,8 @@ from ...core.files import listed
 from ...datasets.folder_files import CsvTable
 from ...datasets.receivers_file import COLUMNS, TX_COLUMNS, read_antennas, read_orientations, receiver_of
 from ...datasets.unknown import RECEIVER, name_words
-from .columns import named_columns, shown_names, unit_of
 from .files import Table
+from .forms import named_columns, shown_names, unit_of
 from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale
 from .readings import id_key, normal_id
 

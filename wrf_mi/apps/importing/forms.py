@@ -1,0 +1,309 @@
+"""Forms of tables: how they are recognised, their columns by meaning, and units.
+
+`FORMS` lists the forms, `MEANINGS` the columns that all of them may have, by name and unit. Names are compared in small
+letters without unit, blanks and marks (`ColumnName`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+
+import numpy as np
+
+from ...core import DataFault, InputError
+from ...core.files import listed, one_line
+from ...datasets.unknown import RECEIVER, SENT, STRENGTH, long_columns, name_words, preferred
+from .files import Frame, Table, package
+
+METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048, "inch": 0.0254}
+HERTZ = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
+UNITS = (*METRES, *HERTZ, "deg", "degrees", "rad", "dbm", "mw", "s", "ms", "%")
+MARKED_UNIT = re.compile(r"[(\[]\s*([A-Za-z]+|%)\s*[)\]]|[_ ]([A-Za-z]+|%)$")
+AFFIXES = ("", "coord", "coordinate", "pos", "position", "loc", "location", "point", "p", "gt", "true", "tag")
+"""Words before or after x, y and z in names of coordinates."""
+AXES = {"x": "|easting|east|ecoord", "y": "|northing|north|ncoord", "z": "|height"}
+MEANINGS = {
+    **{axis: "|".join(f"{affix}{axis}|{axis}{affix}" for affix in AFFIXES) + other for axis, other in AXES.items()},
+    "lat": "lat|latitude|gpslat|gpslatitude|currentlatitude",
+    "lon": "lon|lng|long|longitude|gpslon|gpslongitude|currentlongitude",
+    "floor": "floor|floorid|floornumber|storey|level",
+    "heading": "heading|yaw|orientation|bearing|azimuth|course|compass",
+    "time": "time|timestamp|ts|datetime|date|rxtime|unixtime|epoch|t|firstseen",
+    "run": "run|session|visit|campaign|trajectory|track|walk",
+    "split": "split|subset",
+    "frequency": "frequency|freq|carrier|carrierfrequency|primaryfrequency|centerfreq|centrefrequency|centerfrequency",
+}
+"""Names of the columns of each meaning, in all forms."""
+STATED = (*MEANINGS, "id", "rssi", "cell")  # meanings of `parsed_columns`
+RANGES = ("rtt", "range", "distance", "dist", "tof")
+QUANTITIES = frozenset({*RANGES, "rsrq", "snr", "sinr", "std", "count", "variance", "noise", "quality"})
+"""Words of columns that hold another quantity of a receiver, which is kept and not used."""
+NEVER_STRENGTHS = frozenset({0.0, 1.0, 100.0, 127.0})
+"""Numbers above or at 0 dBm that columns of strengths hold where nothing was heard."""
+LOWEST_DBM = -150.0
+MAC = re.compile(r"(?:[0-9a-f]{2}[:_-]){5}[0-9a-f]{2}", re.IGNORECASE)
+DIGITS = re.compile(r"\d+")
+FEWEST_SLOTS = 2
+MOST_SHOWN = 6
+
+
+@dataclass(frozen=True)
+class ColumnName:
+    """What the name of a column says."""
+
+    text: str
+
+    @property
+    def words(self) -> set[str]:
+        """Words in small letters."""
+        return name_words(self.text)
+
+    @property
+    def unit(self) -> str:
+        """Unit that the name ends with, as in ``x_mm`` and ``X (m)``."""
+        units = [(first or second).lower() for first, second in MARKED_UNIT.findall(self.text)]
+        return next((unit for unit in units if unit in UNITS), "")
+
+    @property
+    def without_unit(self) -> str:
+        """The name without its unit."""
+        return MARKED_UNIT.sub("", self.text).strip() if self.unit else self.text
+
+    @property
+    def plain(self) -> str:
+        """The name in small letters without unit, blanks and marks."""
+        return re.sub("[^a-z0-9]", "", self.without_unit.lower())
+
+    @property
+    def is_strength(self) -> bool:
+        """Whether the column may hold strengths that were received."""
+        return bool(self.words & STRENGTH) and not self.words & {*QUANTITIES, *SENT}
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether the column may name receivers."""
+        return bool(self.words & {*RECEIVER}) and not self.words & {*STRENGTH, *QUANTITIES}
+
+    @property
+    def receiver(self) -> str:
+        """What the name has beside quantity and unit; "" where nothing is left."""
+        words = "|".join({*STRENGTH, *QUANTITIES})
+        short = re.sub(r"\(.*?\)|\[.*?\]", " ", self.text)
+        short = re.sub(rf"(?<![a-z])(?:{words})(?![a-z])", " ", short, flags=re.IGNORECASE)
+        return re.sub(r"\s+", " ", short).strip(" _.-:")
+
+    @property
+    def stem(self) -> str:
+        """The name without its number; one stem for all hardware addresses."""
+        return "MAC address" if MAC.fullmatch(self.text.strip()) else DIGITS.sub("#", self.text)
+
+    @property
+    def without_slot(self) -> str:
+        """The name without the number of its slot and what surrounds it, its unit in brackets behind it."""
+        stem = re.sub(r"[\s_\-.#:()\[\]]+", " ", DIGITS.sub(" ", self.without_unit)).strip()
+        if name_words(stem) & STRENGTH:  # "Cell RSRP" is the RSRP of the cell, whose identity is another column
+            stem = " ".join(word for word in stem.split() if word.lower() not in RECEIVER)
+        return stem + (f" ({self.unit})" if self.unit else "")
+
+
+def unit_of(name: str) -> str:
+    """Unit that a column's name ends with; "" without."""
+    return ColumnName(name).unit
+
+
+@dataclass
+class Columns:
+    """Columns by meaning.
+
+    Attributes:
+        of: name of the column of each meaning, of `STATED`.
+        strengths: id of the receiver of each column of strengths of a wide table; empty for a long one.
+        kept: further columns.
+    """
+
+    of: dict[str, str] = field(default_factory=dict)
+    strengths: dict[str, str] = field(default_factory=dict)
+    kept: list[str] = field(default_factory=list)
+
+    def unit(self, meaning: str) -> str:
+        """Unit in the name of a meaning's column, or ""."""
+        return unit_of(self.of[meaning]) if meaning in self.of else ""
+
+
+def parsed_columns(text: str) -> dict[str, str]:
+    """Columns by meaning from ``x=X,y=Y,rssi=level``; the name ``-`` means that there is none."""
+    pairs = [part.partition("=") for part in text.split(",") if part.strip()]
+    for meaning, equals, name in pairs:
+        if meaning.strip() not in STATED or not equals or not name.strip():
+            text = f"--columns: {one_line(meaning)!r} is not understood; give MEANING=COLUMN with a meaning of"
+            raise InputError(f"{text} {', '.join(STATED)}")
+    return {meaning.strip(): name.strip() for meaning, _, name in pairs}
+
+
+def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[str] = ()) -> Columns:
+    """Meanings of a table's columns, by the first of `FORMS` that it has.
+
+    Args:
+        table: the table.
+        stated: columns by meaning that are not guessed; ``-``: there is none.
+        receivers: patterns of the columns of strengths, with ``*``.
+
+    Raises:
+        InputError: no such column, or none that can be strengths.
+    """
+    names = list(table.frame.columns)
+    # A unit that all fields of a column have stands in its name, where whoever states the column does not know of it.
+    with_unit = {ColumnName(name).without_unit: name for name in names if unit_of(name)}
+    stated = {meaning: name if name in names else with_unit.get(name, name) for meaning, name in stated.items()}
+    if lacking := set(stated.values()) - {*names, "-"}:
+        text = f"no column {one_line(min(lacking))} (columns: {shown_names(names)})"
+        raise DataFault(table.files[0][0], f"{text}; correct --columns", line=1)
+    of = named_columns([name for name in names if not _in_pattern(name, receivers)], stated)
+    for columns_of in FORMS.values():
+        if (columns := columns_of(table, of, receivers)) is not None:
+            columns.kept = list(table.frame.columns.drop([*columns.of.values(), *columns.strengths]))
+            return columns
+    text = f"no column of signal strengths among {shown_names(names)}"
+    remedy = "name it by --columns rssi=...,id=... or by --receivers 'PATTERN*'"
+    raise DataFault(table.files[0][0], f"{text}; {remedy}", line=1)
+
+
+def shown_names(names: Sequence[str]) -> str:
+    """The first names of columns, for a message."""
+    return one_line(listed(names))
+
+
+def named_columns(names: Sequence[str], stated: Mapping[str, str]) -> dict[str, str]:
+    """Columns by meaning that are stated, or have one of the names in `MEANINGS`."""
+    of = {meaning: name for meaning, name in stated.items() if name != "-"}
+    for meaning, words in MEANINGS.items():
+        candidates = [name for name in names if ColumnName(name).plain in words.split("|") and name not in of.values()]
+        if candidates and meaning not in stated:
+            of[meaning] = candidates[0]
+    return of
+
+
+def _readings(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Columns | None:
+    """A row for each reading: a column that names receivers, and one of strengths."""
+    if patterns:
+        return None
+
+    def is_free(name: str) -> bool:
+        """Whether a column may name the receivers or hold the strengths."""
+        column = ColumnName(name)
+        if "rssi" in of and column.words & STRENGTH:
+            return False
+        # "level" is a strength in tables of Android and a storey elsewhere.
+        return name not in of.values() or column.plain == "level"
+
+    alias = {of[meaning]: word for meaning, word in (("id", "bssid"), ("rssi", "rssi")) if meaning in of}
+    long = long_columns([alias.get(name, name) for name in table.frame.columns if name in alias or is_free(name)])
+    if long is None:
+        return None
+    chosen = {"id": of.get("id", long[0]), "rssi": of.get("rssi", long[1])}
+    return Columns(chosen | {meaning: name for meaning, name in of.items() if name not in chosen.values()})
+
+
+def _by_pattern(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Columns | None:
+    """A column for each receiver, whose name a pattern states."""
+    return _wide(of, [name for name in table.frame.columns if _in_pattern(name, patterns)])
+
+
+def _by_name(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Columns | None:
+    """A column for each receiver, with a word such as RSSI in its name."""
+    names = [name for name in table.frame.columns if name not in of.values() and ColumnName(name).is_strength]
+    # Of several quantities of receivers one counts: RSRP and RSSI of a cell are not two receivers.
+    by_receiver: dict[str, list[str]] = {}
+    for name in names:
+        by_receiver.setdefault(ColumnName(name).receiver, []).append(name)
+    if any(len(columns) > 1 for columns in by_receiver.values()):
+        first = {preferred(columns)[0] for columns in by_receiver.values()}
+        names = [name for name in names if name in first]
+    return None if patterns else _wide(of, names)
+
+
+def _by_values(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Columns | None:
+    """A column for each receiver, named alike, whose numbers are dBm or marks of "not heard"."""
+    by_stem: dict[str, list[bool | None]] = {}
+    names = [] if patterns else [name for name in table.frame.columns if name not in of.values()]
+    for name in names:
+        by_stem.setdefault(ColumnName(name).stem, []).append(_is_dbm(table, name))
+    stems = {stem for stem, verdicts in by_stem.items() if any(verdicts) and False not in verdicts}
+    columns = map(ColumnName, names)
+    return _wide(of, [column.text for column in columns if column.stem in stems and not column.words & QUANTITIES])
+
+
+def _wide(of: dict[str, str], names: Sequence[str]) -> Columns | None:
+    """Columns of a wide table; ids are the names of columns where these differ only in the quantity or its unit."""
+    ids = [ColumnName(name).receiver or name.strip() for name in names]
+    ids = ids if len(set(ids)) == len(ids) else list(names)
+    return Columns(of, dict(zip(names, ids, strict=True))) if names else None
+
+
+FORMS: Mapping[str, Callable[[Table, dict[str, str], Sequence[str]], Columns | None]] = {
+    "readings": _readings,
+    "receivers by stated patterns": _by_pattern,
+    "receivers by names of columns": _by_name,
+    "receivers by values of columns": _by_values,
+}
+"""Forms in the order of trial, and how their columns are found from meanings that are known and patterns of receivers.
+
+Tables of slots (`without_slots`) become tables of readings first.
+"""
+
+
+def without_slots(table: Table) -> Table:
+    """A table with a row for each slot that heard a cell, or the table itself without such columns.
+
+    In ``PCI - 1, RSRP - 1, PCI - 2, RSRP - 2``, as drive-test programs write, slot k holds the k-th strongest cell,
+    which is another one from row to row: a receiver is a cell, not a slot. Columns without a slot are repeated.
+    """
+    columns_of: dict[str, dict[str, str]] = {}
+    for name in table.frame.columns if table.has_header else ():
+        if len(numbers := DIGITS.findall(name)) == 1:
+            columns_of.setdefault(numbers[0], {})[ColumnName(name).without_slot] = name
+    slots = [columns for columns in columns_of.values() if _is_slot([*map(ColumnName, columns)])]
+    if len(slots) < FEWEST_SLOTS:
+        return table
+    shared = table.frame.drop(columns=[name for columns in slots for name in columns.values()])
+    parts = [shared.join(table.frame[list(columns.values())].set_axis(list(columns), axis=1)) for columns in slots]
+    frame: Frame = package("pandas").concat(parts)
+    identities = [stem for stem in frame.columns.drop(list(shared)) if ColumnName(stem).is_identity]
+    frame = frame.dropna(subset=identities, how="all").sort_index(kind="stable")
+    note = f"{table.files[0][0].name}: {len(slots)} slots of cells in each row, {len(frame)} readings of cells"
+    return replace(table, frame=frame, notes=(*table.notes, f"{note} by identity"))
+
+
+def _is_slot(columns: Sequence[ColumnName]) -> bool:
+    return any(column.is_identity for column in columns) and any(column.is_strength for column in columns)
+
+
+def _is_dbm(table: Table, name: str) -> bool | None:
+    """Whether a column holds strengths; None where nothing was heard."""
+    if not table.is_numeric(name):
+        return False
+    values = np.unique(table.numbers(name))
+    values = values[~np.isnan(values) & ~np.isin(values, list(NEVER_STRENGTHS)) & (values > LOWEST_DBM)]
+    return bool(values[-1] < 0) if len(values) else None
+
+
+def _in_pattern(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatchcase(name, pattern.replace("[", "[[]")) for pattern in patterns)
+
+
+def described(table: Table, columns: Columns, units: Mapping[str, str]) -> list[str]:
+    """Lines of a table: column, meaning, unit and number of values; columns of many receivers in one line."""
+    groups = [(meaning, units.get(meaning, ""), [name]) for meaning, name in columns.of.items()]
+    groups.append(("strength of a receiver", "dBm", list(columns.strengths)))
+    groups.append(("kept, not used", "", columns.kept))
+    rows = [("column", "meaning", "unit", "values")]
+    for meaning, unit, names in groups:
+        values = int(table.frame[names].notna().to_numpy().sum())
+        few = len(names) <= MOST_SHOWN
+        shown = one_line(", ".join(names) if few else f"{names[0]} ... {names[-1]} ({len(names)})")
+        rows += [(shown, meaning, unit, str(values))] if names else []
+    wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, wide, strict=True)).rstrip() for row in rows]
