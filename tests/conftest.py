@@ -86,6 +86,15 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
     return Command(capsys)
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Comparisons write a grey image in place of each picture, which takes half a second to draw."""
+    from PIL import Image
+
+    grey = Image.new("L", (4, 3))
+    monkeypatch.setattr("wrf_mi.runs.compare.write_figure", lambda path, figure: grey.save(path, format="png"))
+
+
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     """Chromium; for a module, as its client keeps an event loop running in which no other can run."""

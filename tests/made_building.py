@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from calling import SMALL
 
 from wrf_mi.core import Receiver, Record
+from wrf_mi.runs.api import Run, train
 
 PLACES_M = {"hall": (0.5, 0.5, 2.5), "stairs": (11.5, 0.5, 2.5), "lab": (6.0, 7.5, 2.5)}
 """Receivers that received every row."""
@@ -18,8 +20,10 @@ TRAINED, TESTED = 40, 12
 FITS = dict.fromkeys(("idw", "kriging", "mri", "trees", "hybrid"), ()) | {
     "wrf-gs+": tuple(SMALL),
     "nerf2": ("steps=2", "validate_every=2"),
+    "trees": ("trees=20",),
 }
 """Settings of short fits of the models of strengths that need no scene."""
+WITH_INTERVALS = ("idw", "trees")
 
 
 def building(**received: tuple[int, ...]) -> Record:
@@ -42,6 +46,12 @@ def building(**received: tuple[int, ...]) -> Record:
     official = np.arange(TRAINED), np.arange(TRAINED, rows)
     hz = np.array([2.44e9])
     return Record("building", "rssi", tx_pos_m, receivers, observation, official=official, frequencies_hz=hz)
+
+
+@cache
+def fitted(model: str) -> Run:
+    """A fit to the receivers of `PLACES_M` alone, once for all tests of a process."""
+    return train(building(), model, settings=FITS[model], intervals=model in WITH_INTERVALS)
 
 
 def silent_in(record: Record, rows: list[int], *names: str) -> Record:

@@ -1,6 +1,5 @@
 """Correction of scenes with known errors, from channels; and of scenes without."""
 
-import json
 import re
 import shutil
 from dataclasses import replace
@@ -11,7 +10,7 @@ from typing import Any
 import correction_rooms
 import numpy as np
 import pytest
-from calling import call, contents, refused
+from calling import contents
 from correction_rooms import CARRIER_HZ, TRUE_MATERIALS, channels, stated_scene, true_scene
 from wrf_mi_scenes import scenes
 from wrf_mi_scenes.build_laboratory import sheet
@@ -362,23 +361,20 @@ def test_derivatives_are_those_of_finite_differences(task, tmp_path):
         (["--out", "."], "exists; remove it, choose another folder, or give --replace"),
     ],
 )
-def test_command_refuses_in_one_line(arguments, message, tmp_path, capsys):
-    refused(
-        ["correct", "laboratory", "--scene", "laboratory", "--out", tmp_path / "corrected", *arguments], message, capsys
-    )
+def test_command_refuses_in_one_line(arguments, message, tmp_path, command):
+    words = ["correct", "laboratory", "--scene", "laboratory", "--out", tmp_path / "corrected", *arguments]
+    command.refused(words, message)
     assert not (tmp_path / "corrected").exists()
 
 
-def test_command_corrects_by_spectra(tmp_path, capsys):
+def test_command_corrects_by_spectra(tmp_path, command):
     """Materials of the laboratory, all stated as wood: held-out scores rise."""
     stated, xml = tmp_path / "stated", scenes()["laboratory"].xml.name
     shutil.copytree(scenes()["laboratory"].folder, stated)
     text = (stated / xml).read_text()
     (stated / xml).write_text(re.sub(r'<ref id="mat-itu_\w+"', '<ref id="mat-itu_wood"', text))
     words = ["correct", "laboratory", "--scene", stated, "--out", tmp_path / "corrected", "--calibrate", "materials"]
-    status, out, _ = call([*words, "--depth", "2", "--rays", "4096", "--n-train", "60", "--json"], capsys)
-    assert status == 0
-    facts = json.loads(out)
+    facts = command.json([*words, "--depth", "2", "--rays", "4096", "--n-train", "60"])
     assert facts["kept"] == "materials"
     scores = facts["held_out_scores"]
     assert scores["materials"]["mean"] > scores["as stated"]["mean"] + 0.02

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import call, refused, stored
+from calling import stored
 from changed_folders import error_line, refusal
+from commands import Command
 from small_fits import official, settings
 
 from wrf_mi.apps.checking.rows import few_rows
@@ -186,7 +187,14 @@ def test_a_fold_that_is_refused_leaves_the_paths_of_fitted_folds(
 @pytest.mark.parametrize(("module", "stage"), [(ray_tracing, "fit_offsets"), (runs, "score_part")])
 @pytest.mark.parametrize("split", ["official", "blocked"])
 def test_a_stopped_trace_goes_on_with_its_paths(
-    module: Any, stage: str, split: str, flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
+    module: Any,
+    stage: str,
+    split: str,
+    flat_folder: Path,
+    room: Path,
+    tmp_path: Path,
+    monkeypatch: Any,
+    command: Command,
 ) -> None:
     def stopped(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
@@ -198,10 +206,9 @@ def test_a_stopped_trace_goes_on_with_its_paths(
             train(flat_folder, "ray-tracing", out=out, scene=room, settings=DIRECT, split=split)
     written = (out / "paths.npz").stat().st_mtime_ns  # an hour's work may lie there
     again = ["train", flat_folder, "--model", "ray-tracing", "--scene", room, "--paths", "line-of-sight", "--depth", 0]
-    refused([*again, "--out", out], f"{out}: exists and is not empty; choose another --out", capsys)
-    refused(["compare", out, "--out", tmp_path / "page"], "no metrics.json, so no finished run; finish it", capsys)
-    status, _, err = call(["train", "--resume", out], capsys)
-    assert status == 0, err
+    command.refused([*again, "--out", out], f"{out}: exists and is not empty; choose another --out")
+    command.refused(["compare", out, "--out", tmp_path / "page"], "no metrics.json, so no finished run; finish it")
+    command.done(["train", "--resume", out])
     assert (out / "paths.npz").stat().st_mtime_ns == written
     assert read_run(out).metrics["paths"] > 0
 

@@ -55,11 +55,26 @@ def again(folder: Path, record: Record) -> Record:
     return read_spectrum_folder(write_spectrum_folder(folder, record))
 
 
-@pytest.mark.parametrize("gateways", [1, 3])
-@pytest.mark.parametrize(("height", "width"), [(5, 8), (1, 1), (40, 13)])
-def test_written_record_is_read_again(tmp_path: Path, gateways: int, height: int, width: int):
-    record = make_record(4, gateways, height, width)
+ONE, TWO = make_record(4), make_record(4, gateways=2)
+CARRIERS_HZ = np.array([915e6, 2.44e9, 915e6, 5.1e9])
+RUNS = np.array(["day 1", "day 1", "2", "with, comma"])
+DIRECTED = zip(TWO.receivers, (Antenna("dipole", "H"), Antenna("tr38901", "V", "array")), strict=True)
+ANTENNAS = {"receivers": tuple(replace(one, antenna=own) for one, own in DIRECTED)}
+
+
+@pytest.mark.parametrize(
+    ("record", "columns"),
+    [
+        *((make_record(4, gateways, *size), "") for gateways in (1, 3) for size in ((5, 8), (1, 1), (40, 13))),
+        (replace(TWO, **ANTENNAS, tx_antenna=Antenna("hw_dipole", "H")), ""),
+        (ONE.at_carriers(CARRIERS_HZ), ",frequency_hz"),
+        (replace(ONE, runs=RUNS), ",run"),
+        (replace(ONE, runs=RUNS).at_carriers(CARRIERS_HZ), ",frequency_hz,run"),
+    ],
+)
+def test_written_record_is_read_again(tmp_path: Path, record: Record, columns: str):
     assert_same(again(tmp_path / "made-up", record), record)
+    assert (tmp_path / "made-up" / POS).read_text().splitlines()[0] == f"x,y,z{columns}"
 
 
 def test_sixteen_bits_keep_sixteen_bits(tmp_path: Path):
@@ -118,17 +133,9 @@ WRONG = {  # each is refused, see test_faults.py
     "colour image": (image("spectrum/00006.png", np.zeros((5, 8, 3), np.uint8)), "00006.png", "row 6: image mode RGB"),
     "position missing": (text(POS, r"^[^,x]+,.*\n", ""), "00012.png", "12 images for 11 rows"),
     "NaN position": replaced(POS, r"^[^,x]+,", "nan,", "row 1: x is 'nan'"),
-    "infinite position": replaced(POS, r"^[^,x]+,", "-inf,", "row 1: x is '-inf'; give a finite"),
-    "position of words": replaced(POS, r"^[^,x]+,", "here,", "row 1: x is 'here'; give a finite"),
     "position of two numbers": replaced(POS, r"^[^,x]+,", "", "row 1: 2 fields, but"),
-    "position of one number": replaced(POS, r"^[^,x]+,[^\n]*", "5", "row 1: 1 field, but"),
-    "position of four numbers": replaced(POS, r"^[^,x]+,", "1,2,", "row 1: 4 fields, but"),
     "no header": replaced(POS, r"^x,y,z\n", "", "line 1: header"),
-    "no rows": rewritten(POS, "x,y,z\n", "no rows below the header"),
-    "empty positions file": rewritten(POS, "", "empty; give a header"),
-    "not text": rewritten(POS, b"\xff\xfe\x00", "cannot be read"),
     "not YAML": rewritten(YML, "a: [1\nb: }", "not YAML"),
-    "no receiver": rewritten(YML, "dataset_name: a", "no receiver"),
     "YAML list": rewritten(YML, "- 1", "no receiver"),
     "receiver that climbs": replaced(YML, "gateway1", "../up", "cannot name a folder"),
     "quaternion not unit": replaced(YML, "0.8", "0.9", "gateway1: quaternion of norm"),
@@ -136,36 +143,26 @@ WRONG = {  # each is refused, see test_faults.py
     "NaN receiver": replaced(YML, r"position: \[", "position: [.nan, ", "position is"),
     "row zero": replaced("train_index.txt", r"^\d+", "00000", "line 1: row 0 is out of range"),
     "row beyond the end": replaced("test_index.txt", r"^\d+", "00013", "line 1: row 13 is out of"),
-    "row of words": replaced("test_index.txt", r"^\d+", "12a", "line 1: '12a' is not a whole number"),
     "negative row": replaced("test_index.txt", r"^\d+", "-1", "line 1: '-1' is not a whole number"),
-    "no test rows": rewritten("test_index.txt", "\n", "no rows"),
     "row twice": replaced("test_index.txt", r"^(\d+)\n\d+", r"\1\n\1", "line 2: row .* line 1 already"),
     "fold missing": replaced("blocked_folds.txt", r"^0\n", "", "11 folds for 12 rows"),
     "fold of words": replaced("blocked_folds.txt", r"^1", "one", "line 2: 'one' is not"),
     "fold without rows": replaced("blocked_folds.txt", r"^2", "4", "fold 3 has no row"),
-    "fold far away": replaced("blocked_folds.txt", r"^2", "9" * 15, "fold 3 has no row"),
     "one fold": rewritten("blocked_folds.txt", "0\n" * 12, "one fold only"),
     **{
         line: (append(YML, line), YML, message)
         for line, message in (
             ("frequency_hz: 0", "frequency_hz is 0; give the carrier in Hz"),
-            ("frequency_hz: .inf", "frequency_hz is inf"),
             ("frequency_hz: fast", "frequency_hz is 'fast'"),
             ("frequency_hz: [1, x]", r"frequency_hz is \[1, 'x'\]"),
             ("array: 16", "array is '16'; give rows, columns and spacing_m, or elements_m"),
-            ("array: {rows: 4, columns: 4}", "array is .*; give rows, columns and spacing_m"),
-            ("array: {rows: 4.5, columns: 4, spacing_m: 1}", "array is"),
             ("array: {rows: 0, columns: 4, spacing_m: 1}", "array is"),
-            ("array: {rows: 4, columns: 4, spacing_m: .nan}", "array is"),
             ("array: {elements_m: [[0, 1], [0, 2]]}", "array is"),
-            ("array: {elements_m: [[0, 1, .nan]]}", "array is"),
-            ("array: {elements_m: []}", "array is"),
             (
                 "frequency_hz: [915e6, 2.4e9]",
                 r"frequency_hz is \[.*or those of rows in tx_pos\.csv, column frequency_hz",
             ),
             ("tx_antenna: {frame: array}", "tx_antenna is .*; give some of pattern, polarization"),
-            (f"{ANTENNA}V", "gateway9: antenna is 'V'; give some of pattern, polarization, frame"),
             (f"{ANTENNA}{{polarisation: V}}", "gateway9: antenna is .*; give some of pattern, polarization, frame"),
             (f"{ANTENNA}{{polarization: vertical}}", "polarization is 'vertical'; choose from V, H"),
             (f"{ANTENNA}{{pattern: tr38901}}", "state frame array"),
@@ -179,10 +176,7 @@ WRONG = {  # each is refused, see test_faults.py
         )
         for row, message in (
             ("1,2,3,0", "row 2: frequency_hz is 0; give the carrier in Hz"),
-            ("1,2,3,-1", "row 2: frequency_hz is -1"),
             ("1,2,3,nan", "row 2: frequency_hz is 'nan'; give a finite"),
-            ("1,2,3", "row 2: 3 fields, but the header has 4"),
-            ("1,2,3,many", "row 2: frequency_hz is 'many'; give a finite number"),
         )
     },
     "quaternion beyond the tolerance": replaced(YML, "0.8", "0.8025", r"norm 1\.002"),
@@ -226,19 +220,6 @@ def test_the_real_data_are_read_quickly():
     assert np.bincount(record.folds).tolist() == [77, 16, 19, 50, 38]
 
 
-def test_antennas_are_read_and_written(tmp_path: Path):
-    plain = make_record(4, gateways=2)
-    antennas = (Antenna("dipole", "H"), Antenna("tr38901", "V", "array"))
-    receivers = tuple(replace(one, antenna=a) for one, a in zip(plain.receivers, antennas, strict=True))
-    told = replace(plain, receivers=receivers, tx_antenna=Antenna("hw_dipole", "H"))
-    for name, record in (("told", told), ("plain", plain)):
-        assert_same(again(tmp_path / name, record), record, "name")
-
-
-ONE = make_record(4)
-CARRIERS_HZ = np.array([915e6, 2.44e9, 915e6, 5.1e9])
-
-
 def named(name: str) -> tuple[Receiver, ...]:
     return (replace(ONE.receivers[0], name=name),)
 
@@ -268,24 +249,14 @@ def test_attributes_beyond_the_layout_are_not_written(tmp_path: Path, case: str)
     assert not (tmp_path / "a").exists()
 
 
-def test_the_carrier_of_each_row_is_kept(tmp_path: Path):
-    folder, record = tmp_path / "made-up", make_record(4).at_carriers(CARRIERS_HZ)
-    assert_same(again(folder, record), record)
+def test_equal_carriers_of_rows_are_one(tmp_path: Path):
+    folder = write_spectrum_folder(tmp_path / "made-up", ONE)
     (folder / POS).write_text("x,y,z,frequency_hz\n" + "1,2,3,868e6\n" * 4)
     one = read_spectrum_folder(folder)
     np.testing.assert_array_equal(one.frequencies_hz, [868e6])
     assert one.carriers_hz is None
     append(YML, "frequency_hz: 868e6")(folder)
     refusal(read_spectrum_folder, folder, r"tx_pos.csv: line 1: column frequency_hz, but gateway_info.yml states a car")
-
-
-@pytest.mark.parametrize("several", [True, False])
-def test_the_run_of_each_row_is_kept(tmp_path: Path, several: bool):
-    record = replace(make_record(4), runs=np.array(["day 1", "day 1", "2", "with, comma"]))
-    record = record.at_carriers(CARRIERS_HZ) if several else record
-    assert_same(again(tmp_path / "made-up", record), record)
-    header = (tmp_path / "made-up" / POS).read_text().splitlines()[0]
-    assert header == ("x,y,z,frequency_hz,run" if several else "x,y,z,run")
 
 
 @pytest.mark.parametrize("columns", ["vx,vy,vz", "t"])

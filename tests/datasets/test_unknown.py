@@ -1,12 +1,11 @@
 """Folders and files that are no data set are refused with what they hold and the layout that is wanted."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from calling import call, refused
 from changed_folders import refusal
+from commands import Command
 from made_flat import write_flat
 
 from wrf_mi.datasets import load
@@ -27,7 +26,7 @@ WANTED = r"columns x,y and rssi_<id> of each receiver, in train\.csv and test\.c
     ("asked", "separator"),
     [("file", ","), ("file", ";"), ("folder", ","), ("folder", "\t"), ("folder in the layout", ",")],
 )
-def test_a_table_of_readings_is_told_its_import(asked: str, separator: str, tmp_path: Path, capsys: Any) -> None:
+def test_a_table_of_readings_is_told_its_import(asked: str, separator: str, tmp_path: Path, command: Command) -> None:
     pytest.importorskip("pandas")
     folder = tmp_path / "office"
     folder.mkdir()
@@ -38,9 +37,9 @@ def test_a_table_of_readings_is_told_its_import(asked: str, separator: str, tmp_
         (folder / "test_robot_df.csv").write_text("x,y,rssi_aa:01,rssi_aa:02\n1,2,-60,-61\n")
     (folder / name).write_text(SCANS.replace(",", separator))
     dataset = folder / name if asked == "file" else folder
-    refused(["train", dataset, "--model", "idw", "--out", tmp_path / "run"], WANTED, capsys)
-    refused(["data", "info", dataset], rf"wrf-mi data import {name} --out FOLDER$", capsys)
-    assert call(["data", "import", folder / name, "--out", tmp_path / "made"], capsys)[0] == 0
+    command.refused(["train", dataset, "--model", "idw", "--out", tmp_path / "run"], WANTED)
+    command.refused(["data", "info", dataset], rf"wrf-mi data import {name} --out FOLDER$")
+    command.done(["data", "import", folder / name, "--out", tmp_path / "made"])
     expected = np.array([[-60, -62, np.nan, -64], [-70, np.nan, -75, np.nan]], np.float32)
     np.testing.assert_array_equal(load(tmp_path / "made").observation, expected)
 
@@ -62,7 +61,7 @@ def test_columns_of_a_table_of_readings(header: str, columns: tuple | None) -> N
     assert long_columns(header.split(",")) == columns
 
 
-def test_other_content_is_named_with_what_is_wanted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_content_is_named_with_what_is_wanted(tmp_path: Path, command: Command) -> None:
     for name in ("empty", "documents", "wide", "parent"):
         (tmp_path / name).mkdir()
     (tmp_path / "documents" / "scans.xlsx").write_bytes(b"PK")
@@ -79,7 +78,7 @@ def test_other_content_is_named_with_what_is_wanted(tmp_path: Path, capsys: pyte
         ("parent", r"holds office and is no data set itself; give .*parent/office$"),
         ("nowhere", "no such folder; give a folder or a known data set's name"),
     ):
-        refused(["data", "info", tmp_path / dataset], message, capsys)
+        command.refused(["data", "info", tmp_path / dataset], message)
 
 
 def test_an_incomplete_layout_names_the_missing_file(tmp_path: Path) -> None:

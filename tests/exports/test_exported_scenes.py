@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from calling import refused
 from changed_folders import error_line
+from commands import Command
 from traced_rooms import SHOEBOX, write_xml
 
 from wrf_mi import backend
@@ -156,7 +156,7 @@ def test_corrected_scene_of_a_run_is_exported(flat_folder: Path, room: Path, tmp
         assert values == pytest.approx(expected[name], rel=SINGLE)
 
 
-def test_bare_mesh_needs_a_material_and_a_scene_a_carrier(tmp_path: Path, capsys: Any) -> None:
+def test_bare_mesh_needs_a_material_and_a_scene_a_carrier(tmp_path: Path, command: Command) -> None:
     mesh = tmp_path / "box.stl"
     trimesh.creation.box((4, 3, 2.5)).export(mesh)
     out = tmp_path / "x"
@@ -167,7 +167,7 @@ def test_bare_mesh_needs_a_material_and_a_scene_a_carrier(tmp_path: Path, capsys
         ("no-such", "glb", "no such file or name"),
     ):
         suffix = "" if layout == "sionna" else f".{layout}"
-        refused(["export", source, "--format", layout, "--out", f"{out}{suffix}"], message, capsys)
+        command.refused(["export", source, "--format", layout, "--out", f"{out}{suffix}"], message)
     assert export(mesh, "glb", f"{out}.glb", ExportOptions(material="brick"))["materials"] == 1
     error_line(export, mesh, "obj", out, "unknown; choose from 3dgs")
 

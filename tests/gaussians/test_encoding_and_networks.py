@@ -14,7 +14,7 @@ from made_fields import Float64
 from scipy.special import expit
 
 from wrf_mi.backend.device import to_tensor
-from wrf_mi.core import InputError, Receiver
+from wrf_mi.core import Receiver
 from wrf_mi.gaussians import FIELDS, Encoding, WrfGs, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.network import dense, dense_of_pairs, encode, encoded_size, init_layer, linear, unambiguous_scale
 
@@ -277,9 +277,3 @@ def test_field_without_transmitter_octaves_is_constant(model):
     g = field.gaussians(params, to_tensor(np.random.default_rng(1).random((3, 2)).astype(np.float32)))
     for part in g.signal:
         np.testing.assert_array_equal(part.numpy()[:5], part.numpy()[5:])
-
-
-def test_factorised_field_refuses_zero_transmitter_octaves():
-    """It has nothing else to tell one transmitter from another."""
-    with pytest.raises(InputError, match=r"encoding\.tx_octaves: 0 leaves factorised nothing to see"):
-        FIELDS["factorised"](encoding=Encoding(tx_octaves=0))

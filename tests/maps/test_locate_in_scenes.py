@@ -16,7 +16,7 @@ from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi.apps.maps import locate_calibration
 from wrf_mi.apps.maps.grid import candidates_of
 from wrf_mi.apps.maps.locate import locate
-from wrf_mi.apps.maps.locate_calibration import FILE, FOLDER, predict_candidates
+from wrf_mi.apps.maps.locate_calibration import FILE, FOLDER
 from wrf_mi.core import Prediction, Record
 from wrf_mi.datasets import write_ble_folder
 from wrf_mi.models import Inputs
@@ -30,7 +30,7 @@ from wrf_mi.stages import strengths as of_strengths
 from wrf_mi.stages.fitted import FittedMixture
 from wrf_mi.tracing import TraceOptions, power_map
 from wrf_mi.tracing.tracer import RayTracer
-from wrf_mi.training.session import Interrupted, quiet
+from wrf_mi.training.session import Interrupted
 
 HZ = np.array([2.44e9])
 PLAIN = TraceOptions(transmission=True, depth=1, rays=1 << 12)
@@ -107,22 +107,19 @@ def test_each_candidate_is_traced_once_for_all_receivers_and_folds(anew: Run, tr
     assert (np.abs(places[:, None] - candidates).max(axis=2).min(axis=0) == 0).all()
 
 
-def test_candidates_are_traced_in_chunks(anew: Run, traced: list, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(locate_calibration, "TOGETHER", 16)
-    located = locate(anew, observed_of(anew), step_m=STEP_M)
-    assert len(located.candidates.positions_m) > 64
-    assert max(len(tx_pos_m) for tx_pos_m, _ in traced) <= 16
-
-
 def test_no_stage_is_fitted_anew_to_choose_the_likelihood(anew: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(locate_calibration, "fit_fold", None)
     assert locate(anew, observed_of(anew), step_m=STEP_M).calibration.rows > 0
 
 
-def test_estimates_are_those_of_predictions_one_by_one(anew: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estimates_of_chunks_are_those_of_predictions_one_by_one(
+    anew: Run, traced: list, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(locate_calibration, "TOGETHER", 7)
     observed = observed_of(anew)
     located = locate(anew, observed, step_m=STEP_M)
+    assert len(located.candidates.positions_m) > 64
+    assert max(len(tx_pos_m) for tx_pos_m, _ in traced) <= 7
     fitted, places = open_run(anew.folder).fitted, located.candidates.positions_m
     predictions = [fitted.predict(Inputs(places), number) for number in range(3)]
     mean, std = (np.stack(values)[None] for values in zip(*((p.mean, p.std) for p in predictions), strict=True))
@@ -242,11 +239,3 @@ def test_map_traces_a_chunk_for_all_receivers_together(anew: Run, traced: list) 
     one = anew.map(step_m=STEP_M, receivers=["anchor1"])
     np.testing.assert_allclose(one["power_dbm"][0], mapped["power_dbm"][1], atol=SINGLE_DB)
     assert {count for _, count in traced} == {1, 3}
-
-
-def test_chunks_of_candidates_agree(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    candidates, predictions = candidates_of(run, STEP_M), []
-    for together in (5, 1000):
-        monkeypatch.setattr(locate_calibration, "TOGETHER", together)
-        predictions.append(predict_candidates(run.fitted, np.arange(3), 1, candidates, lambda share: quiet("", share)))
-    np.testing.assert_allclose(predictions[0], predictions[1], atol=SINGLE_DB)

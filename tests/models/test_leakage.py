@@ -1,4 +1,4 @@
-"""Arrays of every model: bit for bit the same if test rows hold NaN and infinity, and finite but for stated gaps."""
+"""Arrays of every model: independent of test rows bit for bit, finite but for stated gaps, and enough to predict."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from made_channels import channels
 from wrf_mi.backend import init
 from wrf_mi.core import Record, Split
 from wrf_mi.datasets import load
-from wrf_mi.estimators.model import Arrays, default_settings
+from wrf_mi.estimators.model import Arrays, default_settings, inputs_of
 from wrf_mi.models import MODELS, Problem, Session
 
 STEPS = ("steps=3", "log_every=100", "validate_every=3")
@@ -34,6 +34,8 @@ SETTINGS = {
 TASK = {"ray-tracing": "rssi", "hybrid": "rssi", "nerf2": "rssi", "wrf-gs+": "spectrum"}
 """Task where a model serves several; the first one else."""
 WRONG = np.array([np.nan, np.inf, -np.inf])
+ROUNDING = 1e-5
+"""Sums in single precision, whose order may differ."""
 
 
 def broken(record: Record, rows: np.ndarray) -> Record:
@@ -55,7 +57,16 @@ def fitted_arrays(name: str, record: Record, split: Split, folder: Path) -> Arra
     problem = Problem(record, settings, 0, scene, None if scene is None else "concrete")
     session = Session(folder, folder)
     problem.settings = entry.prepare(problem, [split], session)
-    arrays = entry.fit(problem, split, session).arrays()
+    fitted = entry.fit(problem, split, session)
+    arrays, asked = fitted.arrays(), inputs_of(record, split.train[:2])
+    assert not any(key.startswith("run/") for key in arrays)
+    again = entry.load(arrays, problem, folder)
+    for receiver in range(len(record.receivers)):
+        before, after = (each.predict(asked, receiver) for each in (fitted, again))
+        np.testing.assert_allclose(after.mean, before.mean, rtol=ROUNDING, atol=ROUNDING)
+        assert (after.std is None) == (before.std is None)
+        if before.std is not None:
+            np.testing.assert_allclose(after.std, before.std, rtol=ROUNDING)
     for key, values in arrays.items():
         kept = key.rpartition("/")[2] in entry.gaps or np.asarray(values).dtype.kind not in "fc"
         assert kept or np.isfinite(values).all(), key

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-from calling import refused
 
 import wrf_mi
 from wrf_mi.core import InputError
@@ -19,7 +18,7 @@ OLD = {
 
 
 @pytest.mark.parametrize("kind", OLD)
-def test_runs_of_version_0_1_are_refused_by_every_command(kind: str, tmp_path: Path, capsys) -> None:
+def test_runs_of_version_0_1_are_refused_by_every_command(kind: str, tmp_path: Path, command) -> None:
     run, out, positions = tmp_path / "old", tmp_path / "out", tmp_path / "tx.csv"
     run.mkdir()
     (run / "config.yaml").write_text(OLD[kind])
@@ -33,7 +32,7 @@ def test_runs_of_version_0_1_are_refused_by_every_command(kind: str, tmp_path: P
         ["predict", run, "--tx", positions, "--out", out],
         ["compare", run, "--out", out],
     ):
-        refused(arguments, message, capsys)
+        command.refused(arguments, message)
     for use in (wrf_mi.open_run, wrf_mi.resume, evaluate_run, lambda path: scene_view(path, 0)):
         with pytest.raises(InputError, match="format not stated"):
             use(run)

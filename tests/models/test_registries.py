@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import refused
 from outside_packages import ATTENUATORS, CABLE_DB, NEAREST, STEPS, commands, installed
 from small_fits import stop_after
 from wrf_mi_bench import bench
@@ -19,7 +18,6 @@ from wrf_mi_bench.bench import CHECKS, Check
 
 from wrf_mi import models
 from wrf_mi.core import InputError, Receiver, Record
-from wrf_mi.core.registry import Registry
 from wrf_mi.datasets import load
 from wrf_mi.datasets.ble_folder import write_ble_folder
 from wrf_mi.receivers import registry as receivers
@@ -29,6 +27,7 @@ from wrf_mi.runs.compare import compare
 from wrf_mi.stages.further import FURTHER_STAGES
 from wrf_mi.tasks import LOSSES
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 SETTINGS = ("steps=60", "batch=8", "validate_every=20", "checkpoint_every=20", "initial.gaussians=6")
 SETTINGS += ("network.layers=2", "network.width=8", "view.height=4", "view.columns=8", "deterministic=true")
 FIELD_DB = 50.0  # field strength at one metre
@@ -58,11 +57,11 @@ def attenuated() -> Iterator[None]:
     yield from registered("attenuators", ATTENUATORS, "Attenuated", receivers, receivers.RECEIVERS)
 
 
-def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, flat_folder, tmp_path, capsys) -> None:
+def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, flat_folder, tmp_path, command) -> None:
     out = tmp_path / "run"
     with pytest.raises(Interrupted, match=rf"stopped in nearest rows; go on with: wrf-mi train --resume {out}"):
         train(flat_folder, "nearest", out=out, settings=("neighbours=2",), stop=lambda: True)
-    refused(["evaluate", out], r"model\.npz: missing, the fit was stopped; finish it with train --resume", capsys)
+    command.refused(["evaluate", out], r"model\.npz: missing, the fit was stopped; finish it with train --resume")
     reported: list[tuple[str, float]] = []
     run = resume(out, on_progress=lambda stage, share, _: reported.append((stage, share)))
     assert reported == [("nearest rows", 0.0)]
@@ -79,7 +78,7 @@ def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, fla
     compare([out, other.folder], tmp_path / "page")
     with (tmp_path / "page" / "compare.csv").open(newline="") as file:
         assert [row["model"] for row in csv.DictReader(file)][:2] == ["nearest", "nearest"]
-    refused(["train", flat_folder, "--model", "nearest", "--scene", "x", "--out", "y"], "takes no scene", capsys)
+    command.refused(["train", flat_folder, "--model", "nearest", "--scene", "x", "--out", "y"], "takes no scene")
 
 
 def test_registered_receiver_is_trained_resumed_evaluated_and_compared(attenuated, flat_folder, tmp_path) -> None:
@@ -311,13 +310,3 @@ def test_registered_benchmark_is_listed() -> None:
     finally:
         del bench._CHECKS._known["own"]
     assert {"pixel", "array", "power", "csi"} <= set(RECEIVERS)
-
-
-def test_registry_imports_entries_on_access() -> None:
-    registry: Registry[Any] = Registry("parser", "no.such.group", {"json": "json:loads"})
-    assert list(registry) == ["json"]
-    assert registry["json"] is json.loads
-    registry.add("other", json.dumps)
-    assert len(registry) == 2
-    with pytest.raises(KeyError):
-        registry["none"]

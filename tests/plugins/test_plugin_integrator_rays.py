@@ -31,8 +31,6 @@ STEP = 1e-7
 GRADIENT_TOLERANCE = 1e-7
 """Error of a derivative along a direction of standard normal numbers, relative to the gradient's norm: the standard
 deviation of such derivatives. Rounding of differences is a tenth of it."""
-SPLAT_GRADIENT_TOLERANCE = 0.1
-"""The slope of a footprint is off by as much as its size in angle, some per cent; that of its edge is left out."""
 
 
 def image(parts: tuple[Any, Any]) -> np.ndarray:
@@ -201,22 +199,3 @@ def test_walls_attenuate_gaussians_behind_them(blending):
         expected = expected + (g if product else alpha) * signal[i] * w * passed
         passed = passed * ((1 - g * (1 - delta[i])) if product else 1 - alpha)
     assert_close(traced, expected)
-
-
-def test_gradients_match_splatting_for_small_gaussians():
-    """Gradients of both ways agree as their images do: Gaussians of 1 degree, axes up to 2 : 1."""
-    rng, field, pose = np.random.default_rng(7), any_field(120, 8, 0.0), pose_of()
-    depth = np.linalg.norm(field["position"] - RECEIVER.position_m, axis=1)
-    field["scale"] = np.maximum(np.radians(1.0) * depth[:, None] * rng.uniform(0.5, 1, (120, 3)), 1e-3)
-    bundles, plane = bundles_of(pixel_directions(90, 360)), perception_plane(90, 360, Float64)
-    weight = [Float64(rng.standard_normal(90 * 360)) for _ in range(2)]
-    gradients = []
-    for evaluate in (lambda g: brute(g, pose, bundles), lambda g: splat(g, pose, plane)):
-        gaussians = gaussians_of(field, "alpha")
-        parameters = [*gaussians.position, *gaussians.scale, *gaussians.signal, gaussians.opacity]
-        dr.enable_grad(parameters)
-        re, im = evaluate(gaussians)
-        dr.backward(dr.sum(re * weight[0] + im * weight[1]))
-        gradients.append([dr.grad(a).numpy() for a in parameters])
-    for traced, splatted in zip(*gradients, strict=True):
-        assert np.linalg.norm(traced - splatted) < SPLAT_GRADIENT_TOLERANCE * np.linalg.norm(splatted)

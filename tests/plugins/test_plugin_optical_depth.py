@@ -118,15 +118,6 @@ def test_depth_through_the_centre_follows_from_opacity(scale, opacity, single):
         np.testing.assert_allclose(depth, -share * np.log1p(-opacity), atol=tolerance)
 
 
-def test_phase_of_attenuation_has_no_effect():
-    rng = np.random.default_rng(2)
-    values = random_values(5, rng)
-    delta = (1 - values["opacity"]) * np.exp(2j * np.pi * rng.random(5))
-    rays = rng.uniform(-1, 1, (20, 3)), units(20, rng)
-    turned = depths(gaussians(values | {"attenuation": delta}), *rays)
-    np.testing.assert_allclose(turned, depths(gaussians(values), *rays), rtol=FLOAT64_TOLERANCE)
-
-
 def test_depth_is_additive_and_reciprocal():
     rng = np.random.default_rng(3)
     of = gaussians(random_values(8, rng))

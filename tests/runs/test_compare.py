@@ -22,6 +22,7 @@ from wrf_mi.runs.compare_tables import COLUMNS
 from wrf_mi.runs.results import read_run
 from wrf_mi.tasks.scores import ssim, summary
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 SHAPE = (10, 24)
 
 
@@ -63,7 +64,6 @@ def write_log(path):
             file.write(json.dumps(entry | {"validation_score": 0.2 * step if step else None}) + "\n")
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_table_contains_the_metrics_of_the_runs(tmp_path):
     good, bad = make_run(tmp_path / "good", seed=3), make_run(tmp_path / "bad", model="idw", noise=0.5, trained=False)
     page = compare([good, bad], tmp_path / "out")
@@ -81,7 +81,8 @@ def test_table_contains_the_metrics_of_the_runs(tmp_path):
     assert page == tmp_path / "out" / "index.html"
 
 
-def test_page_shows_every_picture_that_was_written(tmp_path):
+def test_page_shows_every_picture_that_was_written(tmp_path, monkeypatch):
+    monkeypatch.setattr("wrf_mi.runs.compare.write_figure", write_figure)  # draws
     make_run(tmp_path / "a<b")
     page = compare([tmp_path / "a<b"], tmp_path / "out").read_text()
     assert "a&lt;b" in page
@@ -149,7 +150,6 @@ def test_runs_without_common_rows_leave_plots_empty(tmp_path, monkeypatch):
         assert of_b is None
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_reference_is_drawn_once_for_equal_rows(tmp_path, monkeypatch):
     calls = captured(monkeypatch, "score_cdf")
     runs = [make_run(tmp_path / "a"), make_run(tmp_path / "b", noise=0.2), make_run(tmp_path / "c", rows=[3, 4])]
@@ -172,7 +172,6 @@ def test_several_receivers_are_pooled_and_named(tmp_path, monkeypatch):
     assert all(re.fullmatch(r"row \d, gateway[01]", name) for name, _ in pictures[-1][0])
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_runs_of_equal_names_get_different_names(tmp_path):
     compare([make_run(tmp_path / "x" / "run"), make_run(tmp_path / "y" / "run")], tmp_path / "out")
     assert [row["run"] for row in rows_of(tmp_path / "out" / "compare.csv")][:2] == ["x/run", "y/run"]
@@ -211,7 +210,16 @@ UNFINISHED_LOG = '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": t
         (edit_metrics(n_test=...), "no n_test"),
         (edit_metrics(reference={}), "no reference idw4"),
         (edit_arrays(lambda arrays: arrays.pop("reference_idw4")), "reference_idw4"),
-        (edit_arrays(lambda arrays: arrays.update(truth=arrays["truth"][:-1])), "shapes do not fit"),
+        (edit_metrics(task="colour"), "task 'colour'; known are spectrum, rssi, csi"),
+        *(
+            (edit_arrays(change), "shapes do not fit together .*; run evaluate to write it anew")
+            for change in (
+                lambda arrays: arrays.update(truth=arrays["truth"][:-1]),
+                lambda arrays: arrays.update(prediction=arrays["prediction"][..., None]),
+                lambda arrays: arrays.update(receiver_name=np.repeat(arrays["receiver_name"], 2)),
+                lambda arrays: arrays.update(tx_pos=arrays["tx_pos"][:, :2]),
+            )
+        ),
     ],
 )
 def test_damaged_run_is_named_in_one_line_and_nothing_is_written(tmp_path, damage, message):
@@ -252,7 +260,6 @@ def test_polar_picture_puts_a_lobe_at_its_azimuth_and_elevation(tmp_path):
     assert row == pytest.approx(middle * (1 - 30 / 90), abs=2)
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_comparison_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     run, out = make_run(tmp_path / "run"), tmp_path / "out"
     compare([run], out)

@@ -43,6 +43,8 @@ from wrf_mi.runs.folder import AntennaOptions, RunRequest, read_config, start_ru
 from wrf_mi.runs.results import Results, warnings_of
 from wrf_mi.runs.run import open_run
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 def strengths(
     name: str,
@@ -233,7 +235,6 @@ def test_commands_parse_and_give_the_same_configuration(folder: Path, flat_folde
         assert again == config, line
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_run_that_the_command_calls_no_better_than_a_constant_is_not_praised(tmp_path: Path) -> None:
     runs = [make_run(tmp_path / name, noise=noise) for name, noise in (("constant", 0.1), ("fine", 0.1))]
     block = {"median": 0.9, "mean": 0.9, "p10": 0.8, "p90": 1.0, "gain": 0.0, "gain_error": 0.1}
@@ -250,7 +251,6 @@ def test_run_that_the_command_calls_no_better_than_a_constant_is_not_praised(tmp
     assert f"constant: {lines[0][0]}" in text
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_settings_of_a_run_are_those_that_differ(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
     steps = [*SMALL, "loss.ssim_weight=0.25"]
     run = train(folder, "wrf-gs+", out=tmp_path / "run", settings=steps, seed=2).folder
@@ -288,7 +288,6 @@ class Tags(HTMLParser):
             assert self.open.pop() == tag
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_page_is_one_well_formed_file_of_several_data_sets(tmp_path: Path) -> None:
     runs = [make_run(tmp_path / "a<b>&"), make_run(tmp_path / "second", noise=0.4, model="idw")]
     other = make_run(tmp_path / "other")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import SET
-from commands import Command, arrays_in
+from commands import Command
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_building import TESTED, TRAINED, building
@@ -184,36 +184,6 @@ def test_rows_that_cannot_be_scored_are_refused():
     truth.observation[1, :30] = np.nan
     with pytest.raises(InputError, match="made-up, receiver anchor1: 30 training rows: none of them was received"):
         evaluate(truth, make_splits(truth, "official")[0], Off(truth))
-
-
-@pytest.mark.parametrize(
-    ("task", "change", "message"),
-    [
-        ("rssi", {"task": "csi"}, "no cea_db or no reference idw4"),
-        ("csi", {"task": "rssi"}, "no abs_error_db or no reference idw100"),
-        ("rssi", {"task": "colour"}, "task 'colour'; known are spectrum, rssi, csi"),
-        ("rssi", {"reference": {"idw4": {"median": 1}}}, "no reference idw100"),
-    ],
-)
-def test_run_folders_of_another_task_are_named(tmp_path: Path, task: str, change: dict, message: str):
-    _, [(metrics, arrays)] = scored(task, 1)
-    with pytest.raises(InputError, match=message):
-        stored(tmp_path / "run", metrics | change, arrays)
-
-
-def test_predictions_of_another_shape_are_named(tmp_path: Path):
-    _, [(metrics, arrays)] = scored("rssi", 2)
-    stored(tmp_path / "run", metrics, arrays)
-    kept = arrays_in(tmp_path / "run" / "predictions.npz")
-    for wrong in (
-        {"truth": kept["truth"][:, 1:]},
-        {"prediction": kept["prediction"][..., None]},
-        {"receiver_name": kept["receiver_name"][:1]},
-        {"tx_pos": kept["tx_pos"][:, :2]},
-    ):
-        np.savez(tmp_path / "run" / "predictions.npz", **kept | wrong)
-        with pytest.raises(InputError, match=r"shapes do not fit together .*; run evaluate to write it anew"):
-            read_run(tmp_path / "run")
 
 
 LINE = r"is no better than predicting "

@@ -1,4 +1,4 @@
-"""Runs of kriging: what is in their folders, the command, and what is refused."""
+"""Runs of kriging, on spectra, and on strengths without headings of anchors with names: folders, commands, tables."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ import pytest
 import yaml
 from calling import contents, scored_again_as_before, stored
 from commands import Command, positions_file, rows_of
+from made_flat import NAMED_ANCHORS_M
 from made_waves import SIZE, wave_record
 
 from wrf_mi.datasets import load, write_spectrum_folder
+from wrf_mi.datasets.folder_files import read_csv
+from wrf_mi.models import Inputs
 from wrf_mi.runs.api import train
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.folder import FORMAT
+from wrf_mi.runs.prediction_file import read_inputs, write_prediction_file
 from wrf_mi.tasks.scores import inside_interval, ssim
 
 QUICK = ("directions=20", "lengths=2")
@@ -62,21 +66,13 @@ def test_run_folder_holds_model_and_standard_deviation(waves: Path, run: Path) -
     assert metrics["peak_memory_mb"] > 10
 
 
-def test_command_trains_as_the_function_does(waves: Path, run: Path, tmp_path: Path, command: Command) -> None:
-    out, settings = tmp_path / "run", [part for setting in QUICK for part in ("--set", setting)]
-    status, table, err = command(["train", waves, "--model", "kriging", "--out", out, *settings])
-    assert status == 0, err
-    lines = table.splitlines()
+def test_evaluation_reproduces_and_prints_the_scores(
+    run: Path, capsys: pytest.CaptureFixture[str], command: Command
+) -> None:
+    scored_again_as_before(run, capsys)
+    lines = command.done(["evaluate", run]).splitlines()
     assert [line.split()[0] for line in lines[:3]] == ["SSIM", "kriging", "IDW"]
     assert "of the test values lie inside the predicted 90 % intervals, continuous ranked" in lines[3]
-    assert lines[-1] == f"results: {out}"
-    assert "one: element signals of spectra" in err.splitlines()
-    for name in ("prediction", "std"):
-        np.testing.assert_allclose(stored(out)[name], stored(run)[name], atol=ROUNDING)
-
-
-def test_evaluation_reproduces_the_scores(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scored_again_as_before(run, capsys)
 
 
 def test_predictions_at_new_positions_have_standard_deviations(run: Path, tmp_path: Path, command: Command) -> None:
@@ -131,26 +127,100 @@ def test_comparison_shows_kriging_and_reference(run: Path, tmp_path: Path) -> No
     assert (tmp_path / "page" / "waves-samples.png").is_file()
 
 
-def test_bad_calls_are_refused(waves: Path, run: Path, tmp_path: Path, command: Command) -> None:
-    out = ["--out", tmp_path / "out"]
-    train = ["train", waves, *out, "--model", "kriging"]
-    for words, message in (
-        ([*train, "--seed", -1], "seed -1"),
-        ([*train, "--set", "lengths=0"], "setting lengths: 0 is out of range, choose 1 or more"),
-        ([*train, "--set", "lengths=many"], "expected int, got 'many'"),
-        ([*train, "--material", "x"], "--material and antenna options belong to a scene that is traced; give --scene"),
-        ([*train, "--scene", tmp_path / "none.xml"], "takes no scene; omit --scene"),
-        ([*train[:-1], "ray-tracing"], "needs a scene; give --scene SCENE, or choose kriging"),
-        ([*train, "--depth", 2], "--depth belongs to --model ray-tracing, not to kriging; omit it"),
-        (["train", waves, "--scene", "x", *out], "x: no such scene file"),
-    ):
-        command.refused(words, message)
-        assert not (tmp_path / "out").exists(), words
+NAMES = list(NAMED_ANCHORS_M)
+MODELS = ["kriging", "trees", "mri"]
 
 
-def test_record_in_memory_and_progress(tmp_path: Path) -> None:
-    heard: list[str] = []
-    known = {"settings": QUICK, "on_progress": lambda stage, *told: heard.append(stage)}
-    run = train(wave_record(36, 10, receivers=1), "kriging", out=tmp_path / "run", **known)
-    assert set(heard) == {"one: element signals of spectra", "one: signals", "one: weights", "kriging: receivers"}
-    assert stored(run.folder)["std"].shape == (10, *SIZE)  # one receiver: no axis for it
+@pytest.fixture(scope="module")
+def runs(plain_flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder, few = tmp_path_factory.mktemp("runs"), {"trees": ("trees=20",)}
+    return {
+        model: train(plain_flat_folder, model, out=folder / model, settings=few.get(model, ())).folder
+        for model in MODELS
+    }
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_models_work_without_headings(model: str, runs: dict[str, Path], tmp_path: Path, command: Command) -> None:
+    run, before = runs[model], stored(runs[model])
+    assert list(json.loads((run / "metrics.json").read_text())["receivers"]) == NAMES
+    command.done(["evaluate", run])
+    np.testing.assert_array_equal(stored(run)["prediction"], before["prediction"])
+    found = command.predicted(run, positions_file(tmp_path / "tx.csv", before["tx_pos"]))
+    assert found["receiver_name"].tolist() == NAMES
+    np.testing.assert_allclose(found["prediction"], before["prediction"], atol=1e-4)
+    if model != "mri":  # the others use the height
+        found = command.predicted(run, positions_file(tmp_path / "tx.csv", [[0.6, 0.6, 0.3], [0.6, 0.6, 1.9]]))
+        assert (np.abs(np.diff(found["prediction"], axis=1)) > 1e-3).any()
+
+
+@pytest.mark.parametrize("model", ["mri", "kriging"])
+def test_csv_predictions_equal_npz_predictions(
+    model: str, runs: dict[str, Path], tmp_path: Path, command: Command
+) -> None:
+    tx_pos_m = [[0.1, 2, 0.5], [3, 1, 1.75]]
+    heading = np.array([0.3, -1]) if model == "mri" else None  # strengths were kriged without headings
+    positions = positions_file(tmp_path / "tx.csv", tx_pos_m, heading)
+    arrays, out = command.predicted(runs[model], positions), tmp_path / "out.CSV"
+    printed = command.json(["predict", runs[model], "--tx", positions, "--out", out])
+    assert printed["arrays"]["prediction"] == [2, 2]
+    assert ("std" in arrays) == (model == "kriging")
+    units = {"prediction": "dbm"} | ({"std": "std_db", "std_mean": "std_mean_db"} if model == "kriging" else {})
+    table = read_csv(out)
+    given = positions.read_text().splitlines()[0].split(",")
+    assert table.header == [*given, *(f"{name}_{unit}" for unit in units.values() for name in NAMES)]
+    for key, unit in units.items():
+        for r, name in enumerate(NAMES):
+            np.testing.assert_array_equal(table.numbers(f"{name}_{unit}").astype(arrays[key].dtype), arrays[key][r])
+    # The table begins with the columns that `predict --tx` reads.
+    asked = read_inputs(out, None)
+    np.testing.assert_array_equal(asked.tx_pos_m, tx_pos_m)
+    if heading is not None:
+        np.testing.assert_array_equal(asked.tx_heading_rad, heading)
+
+
+def test_table_of_one_receiver_has_empty_fields_where_nothing_is_received(tmp_path: Path) -> None:
+    """And names that CSV quotes."""
+    inputs = Inputs(np.arange(6.0).reshape(2, 3))
+    observations = {"prediction": np.array([[-50.25, np.nan]], np.float32)}
+    written = write_prediction_file(tmp_path / "out.csv", inputs, ['hall, "upper"'], observations)
+    assert written["prediction"].shape == (2,)
+    table = read_csv(tmp_path / "out.csv")
+    np.testing.assert_array_equal(table.numbers('hall, "upper"_dbm', may_be_empty=True), [-50.25, np.nan])
+    assert (tmp_path / "out.csv").read_text().splitlines()[2] == "3.0,4.0,5.0,"
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    return positions_file(tmp_path / "tx.csv", [[0.1, 2, 0.5]])
+
+
+@pytest.mark.parametrize("name", ["out", "out.txt", "out.csv.gz", "out.npy"])
+def test_files_of_other_forms_are_refused(
+    name: str, runs: dict[str, Path], place: Path, tmp_path: Path, command: Command
+) -> None:
+    words = ["predict", runs["mri"], "--tx", place, "--out", tmp_path / "new" / name]
+    command.refused(words, f"{name}: predictions are written as .npz, or signal strengths as .csv; give such a name")
+    assert not (tmp_path / "new").exists()
+
+
+def test_table_of_spectra_is_refused(folder: Path, place: Path, tmp_path: Path, command: Command) -> None:
+    run = train(folder, "idw", out=tmp_path / "run").folder
+    words = ["predict", run, "--tx", place, "--out", tmp_path / "out.csv"]
+    command.refused(words, r"out\.csv: \.csv holds signal strengths \(rssi\), .* predicts spectrum; give out\.npz")
+    assert not (tmp_path / "out.csv").exists()
+    (run / "metrics.json").unlink()
+    command.refused(words, "no metrics.json, so no finished run")
+
+
+def test_comparison_shows_names_without_formulas(runs: dict[str, Path], tmp_path: Path) -> None:
+    """Also those in which Matplotlib would see a formula, and a wrong one."""
+    compare([runs["mri"]], tmp_path / "out")
+    assert (tmp_path / "out" / "plain-samples.png").exists()
+
+
+def test_length_over_headings_is_refused(plain_flat_folder: Path, tmp_path: Path, command: Command) -> None:
+    assert load(plain_flat_folder).tx_heading_rad is None
+    given = ["train", plain_flat_folder, "--model", "kriging", "--out", tmp_path / "run", "--set", "heading_length=1"]
+    command.refused(given, "setting heading_length=1.0: no effect on kriging of .*: the data have no headings; omit it")
+    assert not (tmp_path / "run").exists()

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import SMALL, stored, strength_commands
+from calling import stored, strength_commands
 from commands import Command
-from made_building import PLACES_M, TRAINED, building, silent_in
+from made_building import FITS, PLACES_M, TRAINED, WITH_INTERVALS, building, fitted, silent_in
 
 from wrf_mi.core import InputError, Split
 from wrf_mi.datasets import load, write_ble_folder
@@ -20,8 +20,6 @@ from wrf_mi.scene.make import make_scene
 NAMES = list(PLACES_M)
 ROUNDING_DB = 1e-3
 """Difference of two equal fits of few steps: threads add gradients in any order, in single precision."""
-FITS: dict[str, tuple[str, ...]] = {"wrf-gs": tuple(SMALL), "wrf-gs+": tuple(SMALL)}
-FITS |= {"nerf2": ("steps=2", "validate_every=2"), "trees": ("trees=20",)}
 NONE = np.zeros(0, np.int64)
 
 
@@ -53,11 +51,11 @@ def test_where_no_receiver_has_two_rows_one_is_enough() -> None:
         fitted_receivers(silent_in(record, [4], *NAMES), [split])
 
 
-@pytest.mark.parametrize("model", ["idw", "kriging", "mri", "hybrid", *FITS])
+@pytest.mark.parametrize("model", FITS)
 def test_a_run_is_as_without_the_receivers(model: str, tmp_path: Path) -> None:
-    known = {"settings": FITS.get(model, ()), "intervals": model in ("idw", "trees")}
-    with_them = train(building(attic=(3, 45, 46), cellar=()), model, out=tmp_path / "run", min_rows=2, **known)
-    without = train(building(), model, out=tmp_path / "clean", **known)
+    known = {"settings": FITS[model], "intervals": model in WITH_INTERVALS, "min_rows": 2}
+    with_them = train(building(attic=(3, 45, 46), cellar=()), model, out=tmp_path / "run", **known)
+    without = fitted(model)
     assert with_them.metrics["receivers_left_out"] == {"attic": 1, "cellar": 0}
     assert with_them.metrics.keys() - {"receivers_left_out"} == without.metrics.keys()
     assert list(with_them.metrics["receivers"]) == NAMES
@@ -100,7 +98,7 @@ def test_held_out_receivers_of_a_given_split_keep_their_place(tmp_path: Path) ->
 def test_two_and_three_training_rows_are_enough_also_for_intervals(model: str, tmp_path: Path) -> None:
     """Parts of the training rows that are held out leave the receivers one row or none, and them out."""
     record = building(attic=(3, 7, 45), cellar=(5, 6, 9))
-    run = train(record, model, out=tmp_path / "run", intervals=True, settings=FITS.get(model, ()))
+    run = train(record, model, out=tmp_path / "run", intervals=True, settings=FITS[model])
     assert "receivers_left_out" not in run.metrics
     assert run.metrics["receivers"]["attic"]["n_test"] == 1
     assert np.isfinite(run.predict([[1, 2, 1.3]], "cellar").stated_std).all()
@@ -141,6 +139,7 @@ def office(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_ble_folder(tmp_path_factory.mktemp("data") / "office", record)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_commands_take_a_run_without_them(office: Path, tmp_path: Path, command: Command) -> None:
     run = tmp_path / "run"
     metrics = command.json(["train", office, "--model", "kriging", "--min-rows", "2", "--out", run])

@@ -18,6 +18,8 @@ from wrf_mi.core.files import write_csv
 from wrf_mi.runs.compare_tables import OTHER_ROWS, TIE, differences
 from wrf_mi.runs.results import read_runs
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 @pytest.fixture(scope="module")
 def flat(flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Record, Path]:
@@ -31,7 +33,6 @@ def predicted(run: Path) -> dict[str, Any]:
         return dict(arrays)
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_predictions_of_a_run_have_its_scores_under_another_name(flat: tuple[Record, Path], tmp_path: Path) -> None:
     record, run = flat
     own = open_run(run).metrics
@@ -58,7 +59,6 @@ def read_config_text(folder: Path) -> str:
     return (folder / "config.yaml").read_text()
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_other_numbers_of_training_rows_are_not_compared(flat: tuple[Record, Path], tmp_path: Path) -> None:
     record, run = flat
     file = run / "predictions.npz"
@@ -87,7 +87,6 @@ def test_rows_are_found_by_number_or_position_in_any_order(by: str, flat: tuple[
     assert np.isnan(other["train_seconds"]) if by == "csv" else other["train_seconds"] == 7
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_folds_are_pooled(flat: tuple[Record, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record, _ = flat
     file = tmp_path / "all.npz"

@@ -239,17 +239,6 @@ def test_finished_run_is_only_scored_again(finished: Path, tmp_path: Path) -> No
     assert_same_arrays(arrays_of(run), arrays_of(finished))
 
 
-def test_damaged_models_are_refused(finished: Path, tmp_path: Path) -> None:
-    run = copied(finished, tmp_path / "run")
-    model = (run / "model.npz").read_bytes()
-    for content in (model[: len(model) // 2], b"", b"no archive"):
-        (run / "model.npz").write_bytes(content)
-        for use in (lambda run: open_run(run).predictor(), resume, evaluate_run):
-            with pytest.raises(InputError, match=r"model\.npz: not readable") as caught:
-                use(run)
-            assert "\n" not in str(caught.value)
-
-
 def test_damaged_configurations_are_refused(finished: Path, tmp_path: Path) -> None:
     run = copied(finished, tmp_path / "run")
     earlier = rf"config\.yaml: format {FORMAT - 1}, this version reads {FORMAT}"

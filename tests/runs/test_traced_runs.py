@@ -146,22 +146,6 @@ def test_calibration_is_kept_and_scores_again(run: Path, calibrated: Path) -> No
     assert evaluate_run(calibrated, "random")["split"] == "random (rows unseen by official)"
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (["steps=5"], "^setting steps=5: of a training, and nothing is calibrated"),
-        (["patience=2"], "^setting patience=2: of a training, and nothing is calibrated"),
-        (["calibration=gain", "holdout_steps_fraction=2"], r"fraction: 2\.0 is out of range, choose 0 to 1"),
-        (["calibration=everything"], "everything: choose of gain, materials, planes, patterns, pose, surface"),
-    ],
-)
-def test_bad_settings_of_a_calibration_are_refused(
-    settings: list[str], message: str, flat_folder: Path, room: Path, tmp_path: Path
-) -> None:
-    with pytest.raises(InputError, match=message):
-        traced(flat_folder, room, tmp_path / "run", settings)
-
-
 def test_calibrated_planes_are_stored_as_a_scene(flat_folder: Path, room: Path, tmp_path: Path) -> None:
     run = traced(flat_folder, room, tmp_path / "run", ["calibration=planes", "steps=3"])
     before, after = (scene_surfaces(open_scene(place, 2.4e9)) for place in (room, run / "corrected"))
@@ -212,32 +196,6 @@ def test_train_and_trace_give_equal_scores(
     named = ["train", flat_folder, "--model", "ray-tracing", "--out", tmp_path / "run", "--scene", room]
     metrics = command.json([*named, "--paths", "line-of-sight", "--depth", "0"])
     assert metrics["abs_error_db"] == read_run(run).metrics["abs_error_db"]
-
-
-def test_refused_trace_writes_nothing(
-    folder: Path, flat_folder: Path, room: Path, run: Path, tmp_path: Path, command: Command
-) -> None:
-    out, trace = ["--out", tmp_path / "out"], ["trace", flat_folder, "--scene", room]
-    train = ["train", flat_folder, "--model", "ray-tracing"]
-    for words, message in (
-        ([*train, *out], "ray-tracing needs a scene; give --scene SCENE"),
-        ([*train, "--scene", room, "--set", "beta=1", *out], "unknown setting beta"),
-        (["train", flat_folder, "--depth", "1", *out], "--depth belongs to --model ray-tracing"),
-        (
-            ["trace", folder, "--scene", "laboratory", *out],
-            "carrier frequency unknown; state frequency_hz in its gateway_info",
-        ),
-        (["trace", flat_folder, "--scene", tmp_path / "no.xml", *out], "no such scene file"),
-        (["trace", tmp_path / "none", "--scene", room, *out], "no such folder"),
-        ([*trace, "--material", "brick", *out], "has radio materials of its own"),
-        ([*trace, "--paths", "echo", *out], "kind of path 'echo': unknown"),
-        ([*trace, "--rays", "many", *out], "give a whole number"),
-        ([*trace, "--depth", "99", *out], "depth 99"),
-        ([*trace, "--reflections", "-3", *out], "reflections -3"),
-        ([*trace, "--out", run], "exists and is not empty"),
-    ):
-        command.refused(words, message)
-        assert not (tmp_path / "out").exists(), words
 
 
 def test_comparison_shows_the_scene_while_it_exists(

@@ -15,7 +15,6 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi.core import Receiver, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.datasets import make_splits
-from wrf_mi.receivers import antenna_csi
 from wrf_mi.receivers.channel import array_channels, received_power
 from wrf_mi.synthetic import furnished_room as furnished
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER
@@ -70,18 +69,6 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 ARRAY_M = planar_array(4, 4, 0.16)
-
-
-def test_specular_signals_are_reciprocal(bare: Any) -> None:
-    tx = np.array([[2.0, 3.0, 1.2], [4.5, 1.0, 1.7]])
-    ends = [Receiver(str(i), place, np.array([0.0, 0.0, 0.0, 1.0])) for i, place in enumerate(tx)]
-    options = TraceOptions(depth=2, rays=1 << 14)
-    # The array's antennas are polarised along its y axis, which is up to a thousandth.
-    there = trace_paths(bare, tx, RECEIVER, options).paths
-    back = trace_paths(bare, RECEIVER.position_m, ends, options).paths
-    expected = antenna_csi(there, RECEIVER, ARRAY_M, FREQUENCY_HZ)[0, ..., 0]
-    found = array_channels(back, RECEIVER, ARRAY_M, FREQUENCY_HZ)[..., 0]
-    assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()
 
 
 def test_scattered_waves_come_from_their_last_point(bare: Any) -> None:

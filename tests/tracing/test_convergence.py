@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from calling import refused
 from scipy.constants import speed_of_light
 from traced_rooms import FREQUENCY_HZ, PARTITION, inside, receiver, room
 
@@ -70,10 +69,10 @@ def test_remainder_of_a_geometric_series():
     assert [remainder(changes) for changes in series] == pytest.approx([0.5, 0, np.inf, np.inf])
 
 
-def test_command_refuses_depth_or_rays_beside_a_target(tmp_path, capsys):
+def test_command_refuses_depth_or_rays_beside_a_target(tmp_path, command):
     asked = ["trace", "laboratory", "--scene", "laboratory", "--out", tmp_path / "run", "--target-error"]
     for words, message in ((["2", "--depth", "2"], "--depth"), (["2", "--rays", "auto"], "--rays"), (["0"], "error")):
-        refused([*asked, *words], message, capsys)
+        command.refused([*asked, *words], message)
     assert not (tmp_path / "run").exists()
 
 

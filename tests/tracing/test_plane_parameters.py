@@ -17,7 +17,7 @@ from wrf_mi.graph.settings import TRACED_NAMES, TracedConfig
 from wrf_mi.receivers.receiver_models import CsiReceiver
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.paths.corrected_scene import write_corrected_scene
-from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT, PlaneTables, read_materials
+from wrf_mi.tracing.paths.scene_parameters import SHIFT, TILT, read_materials
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.training.config import calibration_config
@@ -85,15 +85,6 @@ def test_paths_at_moved_planes_are_those_of_a_moved_mesh(tmp_path, shift_m, tilt
     assert len(paths[0]) == 8
     assert_same_paths(paths, strongest(moved, {}))
     assert np.abs(paths[0] - strongest(stated, {})[0]).max() > 0.005
-
-
-def test_planes_move_as_in_numpy(box):
-    surfaces = scene_surfaces(box)
-    change = np.random.default_rng(0).normal(0, 0.05, (len(surfaces.normal), 3))
-    expected = surfaces.moved_planes(change[:, 0], change[:, 1:])
-    normal, offset = PlaneTables.of(surfaces).moved({SHIFT: Tensor64(change[:, 0]), TILT: Tensor64(change[:, 1:])})
-    np.testing.assert_allclose(np.stack([c.numpy() for c in normal], axis=1), expected[0], atol=1e-14)
-    np.testing.assert_allclose(offset.numpy(), expected[1], atol=1e-14)
 
 
 def test_zero_parameters_leave_paths_unchanged(box):

@@ -8,7 +8,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
-from calling import refused
 from PIL import Image
 from traced_rooms import FREQUENCY_HZ, SHOEBOX, THICKNESS_M, receiver, write_xml
 from wrf_mi_scenes.build_laboratory import sheet
@@ -176,13 +175,13 @@ RADIO = '<bsdf type="radio-material" id="b"><float name="depth" value="1"/></bsd
         (shape_of("cube", '<ref id="none"/>', ""), r"2 \(cube, no id\): .*unresolved reference to \"none\""),
     ],
 )
-def test_refused_shapes_are_named_with_the_remedy(shape, words, tmp_path, capsys):
+def test_refused_shapes_are_named_with_the_remedy(shape, words, tmp_path, command):
     path = scene_file(tmp_path, f'<shape type="cube" id="good">{USED}</shape>{shape}')
     with pytest.raises(InputError, match=f"^{path}: shape {words}") as error:
         open_scene(path, FREQUENCY_HZ)
     message, out = str(error.value), tmp_path / "out.ply"
     assert "; " in message
-    refused(["export", path, "--format", "ply", "--out", out], f"{re.escape(message)}$", capsys)
+    command.refused(["export", path, "--format", "ply", "--out", out], f"{re.escape(message)}$")
     assert not out.exists()
 
 

@@ -11,12 +11,10 @@ from hypothesis import strategies as st
 from traced_rooms import HEIGHT, LENGTH, SHOEBOX, WIDTH, image_lengths, inside, receiver, room
 from wrf_mi_scenes.build_laboratory import sheet
 
-from wrf_mi.backend.device import to_vectors
 from wrf_mi.tracing import TraceOptions, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.search.chains import TRANSMISSION
-from wrf_mi.tracing.search.images import displaced
-from wrf_mi.tracing.search.surfaces import ENLARGED, OVERLAP, enlarged, find_planes, screens
+from wrf_mi.tracing.search.surfaces import ENLARGED, OVERLAP, enlarged, find_planes
 
 LONG, WIDE, HIGH, WALL = 8.0, 4.0, 2.5, 4.0  # Two rooms side by side, metres, and where the wall between them stands
 OPAQUE = TraceOptions(transmission=False)
@@ -200,15 +198,6 @@ def test_direct_path_is_traced_at_any_distance_but_none(shoebox):
         assert np.isfinite(paths.gain).all()
 
 
-def test_displacement_is_that_of_the_pair_in_both_directions():
-    a, b = np.random.default_rng(0).integers(-3, 4, (2, 50, 3)).astype(float)
-    there, back = displaced(5.0, a, b), displaced(5.0, b, a)
-    different = (a != b).any(axis=1)
-    np.testing.assert_array_equal(there[0][different], back[1][different])
-    np.testing.assert_array_equal(there[1][different], back[0][different])
-    assert np.linalg.norm(there[0] - a, axis=1).max() < 5 * 1.5 * 1e-5
-
-
 SCALE_M = 5.0  # Scale of a room of four metres
 
 
@@ -226,23 +215,6 @@ def test_faces_are_enlarged_at_free_and_sharp_edges_alone():
     assert np.abs(enlarged(sliver, SCALE_M) - sliver).max() < 10 * margin
     np.testing.assert_array_equal(enlarged(point, SCALE_M), point)
     assert enlarged(point[:0], SCALE_M).shape == (0, 3, 3)
-
-
-def test_no_ray_passes_at_an_edge_within_a_surface():
-    """Aimed at the diagonals of rectangles, along the axes and askew, whose corners are moved and rounded."""
-    import mitsuba as mi
-
-    rng, count = np.random.default_rng(0), 5000
-    for along_axes in (True, False) * 3:
-        normal, u, v = np.eye(3) if along_axes else np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        (a, b), corner = np.round(rng.uniform(0.5, 5, 2), 1), np.round(rng.uniform(-3, 3, 3), 1)
-        outline = corner + np.array([0 * u, a * u, a * u + b * v, b * v])
-        scene = screens(outline[[[0, 1, 2], [0, 2, 3]]], 2 * SCALE_M)
-        at = outline[0] + rng.uniform(0, 1, (count, 1)) * (outline[2] - outline[0])
-        away = rng.normal(size=(count, 3))
-        away = away[np.abs(away @ normal) > 0.2]
-        ray = mi.Ray3f(to_vectors(at[: len(away)] - 3 * away, mi.Point3f), to_vectors(away, mi.Vector3f))
-        assert scene.ray_intersect_preliminary(ray, coherent=False).is_valid().numpy().all()
 
 
 def slab(*extent):

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from calling import call, refused
 from scipy.spatial.transform import Rotation
 
 from wrf_mi.core import Antenna, AntennaOptions, InputError, Receiver, Record, Split
@@ -77,7 +76,7 @@ def test_turning_the_frame_about_its_normal_rolls_the_spectrum(polar):
     assert np.abs(np.roll(framed[0], -turned, axis=-1) - framed[1]).max() > 0.1
 
 
-def test_cross_polarised_data_warn_and_name_the_option(shoebox_xml, turned_folder, tmp_path, caplog, capsys):
+def test_cross_polarised_data_warn_and_name_the_option(shoebox_xml, turned_folder, tmp_path, caplog, command):
     def traced(name, *words):
         caplog.clear()
         asked = [
@@ -93,8 +92,7 @@ def test_cross_polarised_data_warn_and_name_the_option(shoebox_xml, turned_folde
             tmp_path / name,
             *words,
         ]
-        status, _, err = call(asked, capsys)
-        assert status == 0, err
+        command.done(asked)
         return median(tmp_path / name)
 
     wrong = traced("wrong", "--rx-frame", "array")
@@ -106,8 +104,7 @@ def test_cross_polarised_data_warn_and_name_the_option(shoebox_xml, turned_folde
     stated = yaml.safe_load((tmp_path / "right" / "config.yaml").read_text())["antennas"]
     assert (stated["rx_frame"], stated["rx_polarization"]) == ("array", "H")
     assert load_trace(tmp_path / "right" / "paths.npz").receivers[0].antenna == Antenna("iso", "H", "array")
-    status, _, err = call(["evaluate", tmp_path / "right"], capsys)
-    assert status == 0, err
+    command.done(["evaluate", tmp_path / "right"])
     assert median(tmp_path / "right") > 0.85
     for name, words in (("world", ["--rx-frame", "world"]), ("default", [])):
         assert traced(name, *words) > 0.99
@@ -166,9 +163,9 @@ def test_run_predicts_with_its_antennas(shoebox_xml, turned_folder, tmp_path):
     ("model", "option"),
     [("wrf-gs+", "--rx-polarization=H"), ("kriging", "--tx-pattern=dipole"), ("hybrid", "--rx-polarization=H")],
 )
-def test_antenna_options_are_refused_where_nothing_is_traced(turned_folder, tmp_path, capsys, model, option):
+def test_antenna_options_are_refused_where_nothing_is_traced(turned_folder, tmp_path, command, model, option):
     asked = ["train", turned_folder, "--model", model, option, "--out", tmp_path / "run"]
-    refused(asked, "antenna options belong to a scene that is traced", capsys)
+    command.refused(asked, "antenna options belong to a scene that is traced")
     assert not (tmp_path / "run").exists()
 
 

@@ -18,9 +18,6 @@ from wrf_mi.graph.settings import TracedConfig
 from wrf_mi.tracing import TraceOptions, load_trace, open_scene, recompute, save_trace, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
 from wrf_mi.tracing.search.chains import SPECULAR, TRANSMISSION
-from wrf_mi.tracing.search.surfaces import scene_surfaces
-from wrf_mi.tracing.search.visibility import unobstructed
-from wrf_mi.tracing.sionna.path_solver import field_of, to_buffer
 
 SINGLE = 1e-5  # Relative to the largest; other widths of vector instructions
 OPTIONS = TraceOptions(transmission=True, rays=1 << 13)
@@ -156,42 +153,6 @@ def test_recomputed_gains_of_dipoles_have_their_pattern(traced, scene):
     np.testing.assert_allclose(np.abs(dipole / direct.paths.gain), pattern, rtol=1e-3)  # of the rounded 1.643
 
 
-def test_reversed_legs_have_reversed_interactions(traced, scene):
-    legs = traced.legs(scene_surfaces(scene))
-    back = legs.reverse()
-    for index in np.flatnonzero(traced.paths.bounces == 3)[:5]:
-        np.testing.assert_array_equal(back.vertices_m[index], legs.vertices_m[index, ::-1])
-    for name in ("interactions", "face", "vertices_m", "source", "target"):
-        np.testing.assert_array_equal(getattr(back.reverse(), name), getattr(legs, name))
-
-
-@pytest.mark.gradcheck
-def test_derivatives_by_materials_are_central_differences(traced, scene):
-    """Single precision leaves three digits."""
-    import drjit as dr
-    import mitsuba as mi
-
-    surfaces, material = scene_surfaces(scene), scene.radio_materials["itu_brick"]
-    buffer = to_buffer(traced.legs(surfaces), surfaces)
-    material.frequency_update_callback = None
-    names = "relative_permittivity", "conductivity", "thickness"
-    stated = {name: float(np.ravel(getattr(material, name))[0]) for name in names}
-
-    def power(**changes):
-        for name, value in stated.items():
-            setattr(material, name, changes.get(name, mi.Float(value)))
-        real, imaginary = field_of(scene, buffer, traced.ends(), traced.rays, loop_mode="evaluated")
-        return dr.sum(dr.square(real) + dr.square(imaginary)) * 1e6
-
-    variables = {name: mi.Float(value) for name, value in stated.items()}
-    dr.enable_grad(variables)
-    dr.backward(power(**variables))
-    for name, value in stated.items():
-        step = 2e-3 * value  # a slab of half a wavelength resonates
-        high, low = (float(power(**{name: mi.Float(value + sign * step)})[0]) for sign in (1, -1))
-        assert float(dr.grad(variables[name])[0]) == pytest.approx((high - low) / (2 * step), rel=2e-2), name
-
-
 SHORT_M = 0.01  # Sionna RT's least distance of interactions
 AT_M = 1e-9  # Rounding of float64 at a few metres, with a margin of a million
 TWO_SHEETS = {
@@ -282,14 +243,3 @@ def test_paths_are_those_of_all_sequences_of_planes(sheets, seed, passes):
     assert len(found) == len(paths) > 25
     behind = paths.objects[:, 1] == paths.object_names.index("behind")
     assert (behind & (paths.interactions[:, :3] == [4, 1, 4]).all(axis=1)).any() == passes
-
-
-def test_every_target_is_reached_where_there_are_no_surfaces(sheets):
-    """In a scene without surfaces, and without candidates."""
-    surfaces = Prepared(sheets).surfaces
-    none = replace(surfaces, triangles=surfaces.triangles[:0], plane=surfaces.plane[:0])
-    ends = np.array([[[0.0, 0, 0], [1, 2, 2]], [[0, 0, 0], [0.005, 0, 0]]])
-    met = unobstructed(none, ends, np.zeros((2, 0), np.int64), 3, True)
-    assert met.candidate.tolist() == [0, 1]
-    assert not met.interactions.any()
-    assert not len(unobstructed(surfaces, ends[:0], np.zeros((0, 0), np.int64), 3, True).candidate)

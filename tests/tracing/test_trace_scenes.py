@@ -26,7 +26,7 @@ from wrf_mi.scene.materials import read_materials
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tracing import RayTracer, TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.search.devices import before_surfaces, check_devices, clear_m, winding_number
+from wrf_mi.tracing.search.devices import before_surfaces, check_devices, clear_m
 from wrf_mi.tracing.search.surfaces import find_planes, scene_surfaces
 
 
@@ -210,14 +210,6 @@ def test_solid_is_named_by_its_mesh_file_where_its_id_is_another(tmp_path):
         refused_inside(open_scene(xml, FREQUENCY_HZ), called + r" \(column.ply\)")
     column.export(tmp_path / "pillar.stl")
     refused_inside(open_scene(tmp_path / "pillar.stl", FREQUENCY_HZ, material="wood"), "'pillar'")
-
-
-def test_winding_number_is_one_inside_and_zero_outside():
-    rng, sphere = np.random.default_rng(0), trimesh.creation.icosphere(subdivisions=2)
-    within = rng.normal(size=(50, 3))
-    within *= 0.9 * rng.uniform(size=(50, 1)) / np.linalg.norm(within, axis=1, keepdims=True)
-    places = np.concatenate([within, [[0.99, 0.99, 0], [3, 0, 0]]])
-    np.testing.assert_allclose(winding_number(sphere.triangles, places), [1] * 50 + [0, 0], atol=1e-9)
 
 
 def test_coplanar_faces_share_a_plane():

@@ -30,7 +30,6 @@ from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.paths import solve as solve_module
 from wrf_mi.tracing.search import chains as search_module
 from wrf_mi.tracing.search import images as images_module
-from wrf_mi.tracing.search.images import image_sources, meeting_point
 from wrf_mi.tracing.sionna.materials import perfect_reflector
 from wrf_mi.tracing.sionna.path_solver import corrected
 
@@ -88,19 +87,6 @@ def test_phases_in_large_halls_are_those_of_the_mirror_images(hz, size_m, tmp_pa
         exact, lengths_m = image_lengths(position_m, rx[0], 2, size_m), np.sort(paths.length_m[paths.tx == row])
         np.testing.assert_allclose(wavenumber * (lengths_m - exact), 0, atol=1e-3)
         assert wavenumber * np.abs(exact.astype(np.float32) - exact).max() > 1e-3
-
-
-def test_images_in_a_corner_and_points_of_reflection():
-    """Three perpendicular planes reflect a point through their corner; a chain may end, or begin, without a plane."""
-    normal, offset = np.eye(3)[[2, 0, 1]], np.array([3.0, 1.0, 2.0])
-    source, target = np.array([0.2, 0.3, 0.5]), np.array([[0.7, 1.1, 1.4]])
-    images = image_sources(normal, offset, np.array([[0, 1, 2], [1, -1, -1], [-1, -1, 1]]), source)
-    np.testing.assert_allclose(images[0, [0, 1, 3]], [source, [0.2, 0.3, 5.5], [1.8, 3.7, 5.5]], rtol=1e-15)
-    np.testing.assert_allclose(images[1:, -1], [[1.8, 0.3, 0.5]] * 2, rtol=1e-15)
-    point, near, far = meeting_point(target, images[1:2, -1], normal[[1]], offset[[1]])
-    np.testing.assert_allclose([near, far], [[-0.3], [0.8]], rtol=1e-14)
-    np.testing.assert_allclose(point, target + 3 / 11 * (images[1, -1] - target), rtol=1e-14)
-    np.testing.assert_array_equal(meeting_point(target, target + np.eye(3)[1], normal[[1]], offset[[1]])[0], target)
 
 
 def test_points_of_reflection_lie_on_their_walls(shoebox):
@@ -270,22 +256,6 @@ def test_diffracted_paths_are_those_of_sionna_rt(divided):
     # The bent wave reaches where nothing else does.
     dark = trace_paths(divided, [[2.9, 1.0, 0.5]], receiver([3.1, 1.0, 0.5]), replace(options, depth=1)).paths
     assert (dark.interactions == 8).any()
-
-
-def test_scattering_takes_power_from_reflections(shoebox):
-    tx, rx = inside(3), receiver([1.0, 1.0, 1.0])
-    plain = traced(shoebox, tx, rx, depth=1)
-    options = replace(UPRIGHT, depth=1, scattering=True, scattering_coefficient=0.6, rays=10_000)
-    found = trace_paths(shoebox, tx, rx, options)
-    diffuse = (found.paths.interactions == 2).any(axis=1)
-    mirrored = found.paths.select(~diffuse)
-    np.testing.assert_allclose(mirrored.length_m, plain.length_m, rtol=0, atol=EXACT_M)
-    expected = np.where(plain.bounces == 1, np.sqrt(1 - 0.6**2), 1)
-    np.testing.assert_allclose(np.abs(mirrored.gain / plain.gain), expected, rtol=SINGLE)
-    power = np.bincount(found.paths.tx[diffuse], np.abs(found.paths.gain[diffuse]) ** 2, 3)
-    assert ((power > 0) & (power < np.abs(plain.gain[plain.bounces == 0]) ** 2)).all()
-    assert all(float(m.scattering_coefficient[0]) == 0 for m in shoebox.radio_materials.values())
-    np.testing.assert_allclose(recompute(found, shoebox).paths.gain, found.paths.gain, rtol=1e-6)
 
 
 def test_wrong_arguments_are_refused(empty):

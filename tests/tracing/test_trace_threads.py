@@ -116,11 +116,6 @@ def test_threads_that_share_a_scene_keep_their_carriers(divided):
 
 
 @pytest.mark.parametrize("options", [OPTIONS, SCATTERED, DIFFRACTED], ids=["specular", "scattered", "diffracted"])
-def test_repeated_trace_has_the_same_paths(divided, options):
-    assert_equal(traced(divided, options), traced(divided, options))
-
-
-@pytest.mark.parametrize("options", [OPTIONS, SCATTERED, DIFFRACTED], ids=["specular", "scattered", "diffracted"])
 def test_transmitter_alone_has_the_paths_of_a_batch(divided, options):
     batch = traced(divided, options)
     for row, place in enumerate(TX):

@@ -16,7 +16,6 @@ from sionna.rt.utils import itu_coefficients_single_layer_slab
 from wrf_mi.backend.device import to_uint
 from wrf_mi.core import Antenna, InputError
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
-from wrf_mi.tracing.paths import traced_field as traced_field_module
 from wrf_mi.tracing.paths.instrument_parameters import pattern_factor, receiver_pose
 from wrf_mi.tracing.paths.scene_parameters import QUANTITIES
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
@@ -256,15 +255,6 @@ def test_kernels_are_smaller_without_faint_paths(box):
     assert sizes[1] < 0.8 * sizes[0]
 
 
-def test_free_space_gain_is_that_of_friis_in_double_precision(empty):
-    """An empty scene, vertical antennas of the same height."""
-    traced = TracedField(empty, [[3.0, 4.0, 1.0]], receiver(position=(0.0, 0.0, 1.0)), TracedOptions(TraceOptions()))
-    gain, length, arrival = existing(traced, tensors(traced))
-    np.testing.assert_allclose(gain, [speed_of_light / traced.frequency_hz / (4 * np.pi * 5)], rtol=DOUBLE)
-    np.testing.assert_allclose(length, [5.0], rtol=DOUBLE)
-    np.testing.assert_allclose(arrival, [[0.6, 0.8, 0.0]], atol=DOUBLE)
-
-
 def test_transmitter_without_a_path_has_no_gain_and_finite_derivatives(tmp_path):
     """A transmitter behind metal."""
     options = TracedOptions(TraceOptions(depth=1, rays=1024, transmission=False))
@@ -295,16 +285,3 @@ def test_wrong_arguments_are_refused(box):
     for places, headings, name in (([[1.0, 2.0]], None, "tx_pos_m"), (transmitters(2), [0.0], "tx_heading_rad")):
         with pytest.raises(ValueError, match=f"{name} has shape"):
             TracedField(box, places, receiver(), TracedOptions(OPTIONS), headings)
-
-
-def test_gains_that_are_not_numbers_are_refused(box, monkeypatch):
-    """They would all count as faint, and no path would be left."""
-    evaluate = traced_field_module.evaluate_paths
-
-    def broken(*given):
-        (real, imaginary), *others = evaluate(*given)
-        return (real * dr.nan, imaginary), *others
-
-    monkeypatch.setattr(traced_field_module, "evaluate_paths", broken)
-    with pytest.raises(InputError, match="gains that are not numbers"):
-        field(box, 2, faint=1e-3)

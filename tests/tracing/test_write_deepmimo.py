@@ -6,7 +6,6 @@ from itertools import product
 
 import numpy as np
 import pytest
-from calling import call, refused
 from made_scenarios import package_channels, package_dataset
 from scipy.constants import speed_of_light
 from traced_rooms import FREQUENCY_HZ, THICKNESS_M, inside, receiver
@@ -134,7 +133,7 @@ def test_what_cannot_be_written_is_refused(traced, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"there"}
 
 
-def test_command_writes_the_traced_paths(room, flat_folder, tmp_path, capsys):
+def test_command_writes_the_traced_paths(room, flat_folder, tmp_path, command):
     asked = [
         "trace",
         flat_folder,
@@ -148,13 +147,12 @@ def test_command_writes_the_traced_paths(room, flat_folder, tmp_path, capsys):
         "--out",
         tmp_path / "run",
     ]
-    refused([*asked, "--deepmimo", tmp_path / "Flat"], "choose small letters", capsys)
+    command.refused([*asked, "--deepmimo", tmp_path / "Flat"], "choose small letters")
     asked += ["--deepmimo", tmp_path / "flat"]
     message = "--deepmimo has no effect beside --calibrate, which trains in one process and stores no paths"
-    refused([*asked, "--calibrate", "gain"], message, capsys)
+    command.refused([*asked, "--calibrate", "gain"], message)
     assert not (tmp_path / "run").exists()
-    status, _, err = call(asked, capsys)
-    assert status == 0, err
+    command.done(asked)
     traced = load_trace(tmp_path / "run" / "paths.npz")
     record = read_deepmimo(tmp_path / "flat", params={"base_stations": "all"})
     expected = csi(traced.paths, [traced.frequency_hz])

@@ -152,12 +152,6 @@ def test_reach_of_zero_and_infinity_give_weights_zero_and_one():
     assert not Reach((np.zeros((0, 3)),), 1.0).weight(places, 0).any()  # a receiver without observations
 
 
-@given(st.floats(0.01, 100), st.floats(0.01, 100), st.floats(0, 100))
-def test_weight_rises_with_the_reach(one, other, distance):
-    low, high = (float(Reach(ORIGIN, r).weight(at(distance), 0)[0]) for r in sorted((one, other)))
-    assert 0 <= low <= high <= 1
-
-
 @given(st.integers(2, 80), st.integers(0, 20), st.integers(0, 99))
 @example(20, 14, 20)  # a cluster of most rows
 def test_held_out_groups_keep_training_rows(train, validation, seed):

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wrf_mi.core import InputError
-from wrf_mi.core.settings import describe, settings_from, with_settings
+from wrf_mi.core.settings import settings_from, with_settings
 from wrf_mi.training.config import PRESETS, TrainConfig
 from wrf_mi.training.fields import make_field
 
@@ -75,7 +75,7 @@ def configurations(draw):
 
 
 @given(configurations())
-@settings(deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_a_configuration_survives_a_dictionary_a_file_and_settings_as_text(config):
     """Values as they are typed after ``--set key=``."""
     assert read(asdict(config)) == config
@@ -171,9 +171,7 @@ def test_ends_of_ranges_are_accepted():
     [
         ({"stepz": 1}, "config.yaml, setting stepz: unknown; known here: steps, batch,"),
         ({"density": {"evry": 1}}, "config.yaml, setting density.evry: unknown; known here: density.every,"),
-        ({"density": 3}, "config.yaml, setting density: expected a mapping, got 3"),
         (None, "config.yaml, setting top: expected a mapping, got None"),
-        ({"steps": "3"}, "config.yaml, setting steps: expected int, got '3'"),
     ],
 )
 def test_invalid_files_are_refused(values, message):
@@ -207,9 +205,3 @@ def test_zero_scale_distinguishes_all_training_transmitters(extent_m, scale_m):
     assert own.resolved(tx).encoding.tx_scale_m == 0.25
     with pytest.raises(InputError, match=r"encoding\.tx_scale_m: 0 is resolved by the training transmitters"):
         make_field(TrainConfig())
-
-
-def test_description_names_every_setting_and_can_be_set():
-    lines = describe(TrainConfig()).splitlines()
-    assert [line.partition("=")[0] for line in lines] == list(DEFAULTS)
-    assert with_settings(TrainConfig(steps=7, seed=9), lines) == TrainConfig()

@@ -1,4 +1,4 @@
-"""The hold-out of signal strengths: as far from the other rows as test rows are from training rows, places together."""
+"""Held-out rows of strengths and validation rows of Gaussians: as far from training rows as test rows are."""
 
 from dataclasses import replace
 
@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_spectra import RECEIVERS, spectra
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+from small_fits import settings as quick
 
 from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
-from wrf_mi.training.selection import cells, hold_out
+from wrf_mi.tasks.scores import ssim
+from wrf_mi.training.fit_plan import FitPlan
+from wrf_mi.training.selection import FAR_POSITIONS, HELD_OUT, cells, hold_out, hold_out_far
+from wrf_mi.training.trainer import Trainer
 
 FACTOR = 1.6
 """Of medians of distances, either way: cells are halved, so that their sides are right within the root of two, and a
@@ -86,3 +92,108 @@ def test_wanted_positions_shape_the_hold_out_in_place_of_test_rows() -> None:
     assert fold is not None
     assert by_test is not None
     assert away_m(tx_pos_m, fold.test, fold.all_train) > 1.5 * away_m(tx_pos_m, by_test.test, by_test.all_train)
+
+
+def walk(count: int) -> np.ndarray:
+    """Positions [count, 3] along a closed curve, metres."""
+    turn = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return np.column_stack([np.sin(2 * turn), 2 * np.cos(turn), 0.2 * np.sin(3 * turn)])
+
+
+def nearest_m(tx_pos_m: np.ndarray, rows: np.ndarray, known: np.ndarray) -> np.ndarray:
+    return cdist(tx_pos_m[rows], tx_pos_m[known]).min(axis=1)
+
+
+def blocked(tx_pos_m: np.ndarray, test: np.ndarray, seed: int = 0) -> Split:
+    """A split with a tenth of the other rows for validation."""
+    rest = np.random.default_rng(seed).permutation(np.setdiff1d(np.arange(len(tx_pos_m)), test))
+    count = max(1, len(rest) // 10)
+    return Split("blocked", 0, np.sort(rest[count:]), np.sort(rest[:count]), test)
+
+
+@given(count=st.integers(30, 150), share=st.floats(0.02, 0.3), repeats=st.integers(1, 3), seed=st.integers(0, 999))
+@settings(max_examples=60, deadline=None)
+def test_some_validation_rows_are_as_far_from_training_rows_as_test_rows(count, share, repeats, seed):
+    """Positions may repeat."""
+    tx_pos_m = np.repeat(walk(count), repeats, axis=0)
+    split = blocked(tx_pos_m, np.arange(round(share * count) * repeats), seed)
+    far = hold_out_far(split, tx_pos_m)
+    np.testing.assert_array_equal(far.all_train, split.all_train)
+    np.testing.assert_array_equal(far.test, split.test)
+    assert not len(np.intersect1d(far.train, far.validation))
+    assert np.isin(split.validation, far.validation).all()
+    moved = len(split.train) - len(far.train)
+    assert moved <= HELD_OUT * len(split.train)
+    away_m = nearest_m(tx_pos_m, far.validation, far.train)
+    is_far = away_m >= np.median(nearest_m(tx_pos_m, split.test, split.all_train))
+    if moved:
+        assert len(np.unique(tx_pos_m[far.validation[is_far]], axis=0)) >= FAR_POSITIONS
+
+
+@pytest.mark.parametrize(
+    ("rows", "test", "beyond_m"),
+    [(200, np.arange(0, 200, 5), 0), (12, np.arange(4), 0), (200, np.arange(20), 50), (200, np.zeros(0, int), 0)],
+    ids=["near test rows", "few rows", "test rows beyond all others", "no test rows"],
+)
+def test_split_stays_where_no_rows_have_to_move_or_too_many(rows, test, beyond_m):
+    tx_pos_m = walk(rows)
+    tx_pos_m[test] += beyond_m
+    split = blocked(tx_pos_m, test)
+    assert hold_out_far(split, tx_pos_m) is split
+
+
+def test_split_without_validation_rows_keeps_all_training_rows():
+    tx_pos_m = walk(200)
+    split = blocked(tx_pos_m, np.arange(20))
+    every = replace(split, train=split.all_train, validation=split.validation[:0])
+    assert hold_out_far(every, tx_pos_m) is every
+
+
+@pytest.fixture
+def walked() -> tuple[Record, Split]:
+    """Spectra at 60 positions of a walk, the first tenth of which is predicted."""
+    record = spectra(rows=60)[0]
+    record = replace(record, tx_pos_m=walk(60))
+    return record, blocked(record.tx_pos_m, np.arange(6))
+
+
+@pytest.mark.all_threads
+def test_score_in_training_is_that_of_rows_held_out_as_far_as_test_rows(walked):
+    record, split = walked
+    received = []
+    trainer = Trainer(record, split, quick("steps=40", "holdout_steps_fraction=0.5", "validate_every=20"))
+    held_out, joined = trainer.plan.choosing, trainer.schedule.joined
+    moved = np.setdiff1d(held_out.validation, split.validation)
+    assert len(moved)
+    assert not np.isin(trainer.schedule.rows[:joined], held_out.validation).any()
+    assert np.isin(trainer.schedule.rows[joined:], moved).any()
+
+    def compare(progress):
+        if progress.step == joined:
+            rows, at_m = held_out.validation, record.tx_pos_m
+            test_m = np.median(nearest_m(at_m, split.test, split.all_train))
+            far = nearest_m(at_m, rows, held_out.train) >= test_m
+            score = ssim(trainer.predictor()(at_m[rows]), record.observation[0, rows])
+            assert (progress.validation_rows, progress.far_rows) == (len(rows), far.sum())
+            assert progress.far_rows >= FAR_POSITIONS
+            assert progress.test_m == pytest.approx(test_m)
+            assert progress.far_score == pytest.approx(np.median(score[far]), abs=1e-5)
+            assert progress.validation_score == pytest.approx(np.median(score), abs=1e-5)
+        received.append(progress)
+
+    trainer.run(compare)
+    assert {p.step for p in received if p.far_score is not None and p.held_out} == {joined}
+
+
+def test_no_receiver_loses_its_batches_to_far_validation_rows():
+    """The second receiver received what is held out, and of the other rows a single one."""
+    tx_pos_m = walk(60)
+    split = blocked(tx_pos_m, np.arange(6))
+    far = hold_out_far(split, tx_pos_m)
+    strengths = np.full((2, 60), -50, np.float32)
+    strengths[1, far.train[1:]] = np.nan
+    both = Record("made-here", "rssi", tx_pos_m, RECEIVERS, strengths, frequencies_hz=np.array([2.4e9]))
+    for batch, train in ((4, split.train), (1, far.train)):
+        np.testing.assert_array_equal(FitPlan(both, split, quick(f"batch={batch}")).choosing.train, train)
+    every = replace(both, receivers=RECEIVERS[:1], observation=strengths[:1])
+    np.testing.assert_array_equal(FitPlan(every, split, quick("batch=4")).choosing.train, far.train)

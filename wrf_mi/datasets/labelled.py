@@ -130,7 +130,7 @@ def record_of(data: Any) -> Record:
     arrays: dict[str, Any] = {}
     for name in map(str, dataset.data_vars):
         if name in OF_RECEIVERS:
-            dims = (*PAIR, *_observed(task, observation.ndim))
+            dims = (*PAIR, *_observed(task, dataset[name].ndim))
             arrays[name] = ordered(dataset[name], "receiver", *(dim for dim in dims if dim != "receiver"))
         elif name in DIMENSIONS:
             arrays[name] = ordered(dataset[name], *DIMENSIONS[name])

@@ -182,16 +182,6 @@ def test_prediction_is_that_of_a_gaussian_process_and_restored(tmp_path: Path) -
     np.testing.assert_array_equal(again.variance, posterior.variance)
 
 
-def test_prediction_interpolates_rows_and_tends_to_the_prior() -> None:
-    process = process_of(noise=1e-8)
-    at_rows = process.predict(process.tx_pos_m)
-    np.testing.assert_allclose(at_rows.mean, process.signals, atol=1e-4)
-    assert at_rows.ignorance.max() < 1e-6
-    away = process.predict(process.tx_pos_m[:1] + 1000.0)
-    assert np.abs(away.mean).max() < 1e-9
-    assert away.ignorance == pytest.approx([1.0])
-
-
 @pytest.mark.parametrize("radius_m", [0.0, 0.12, 0.25, 100.0])
 def test_held_out_is_a_fit_without_those_rows_or_the_prior_without_any(radius_m: float) -> None:
     process, rows = process_of(), np.array([0, 4, 17])

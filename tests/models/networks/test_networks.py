@@ -16,8 +16,6 @@ from wrf_mi.estimators.networks.dcgan import (
     NORM_FLOOR,
     BatchShape,
     Convolution,
-    DcganSettings,
-    Generator,
     InstanceNorm,
     coarser,
     finer,
@@ -25,7 +23,7 @@ from wrf_mi.estimators.networks.dcgan import (
     resized,
     softplus,
 )
-from wrf_mi.estimators.networks.layers import Coordinates, Module, columns
+from wrf_mi.estimators.networks.layers import Coordinates, Module
 from wrf_mi.estimators.networks.nerf2_march import LEAK, Nerf2Network, Networks, constant_parts, look, march
 from wrf_mi.estimators.networks.training import Network, NetworkSettings, NetworkTrainer
 from wrf_mi.estimators.networks.vae import Vae, VaeSettings, elbo_loss, normal_divergence, pooled
@@ -124,12 +122,6 @@ def test_gradients_of_layouts_and_normalisation():
     padded, grid = resized(doubles(np.ones((1, 4))), BatchShape(1, 2, 2), 3, 3)
     np.testing.assert_array_equal(padded.numpy().reshape(3, 3), [[1, 1, 0], [1, 1, 0], [0, 0, 0]])
     assert grid.pixels == 9
-
-
-def test_columns_by_index():
-    x = np.arange(12.0).reshape(3, 4)
-    for picked in ([2, 0, 2], [1]):
-        np.testing.assert_array_equal(columns(doubles(x), mi.UInt32(picked)).numpy(), x[:, picked])
 
 
 def test_coordinates_are_centred_and_stored():
@@ -261,17 +253,6 @@ def test_divergence_softplus_and_means_over_blocks_equal_their_formulas():
     np.testing.assert_allclose(softplus(doubles(x)).numpy(), np.logaddexp(0, x), atol=EXACT)
     image = np.arange(24.0).reshape(1, 4, 6)
     np.testing.assert_array_equal(pooled(image, 3)[0], image.reshape(2, 2, 3, 2).mean(axis=(1, 3)).ravel())
-
-
-def test_paths_of_weights_are_those_of_attributes_and_lists():
-    vae = Vae(VAE, 4, (2, 3), np.random.default_rng(0))
-    state = vae.state()
-    assert list(state)[:4] == ["q.0.image", "q.0.position", "q.0.bias", "q.1.hidden"]
-    assert {"p.0.latent", "p.1.hidden", "p.out.bias"} <= set(state)
-    generator = Generator(DcganSettings(), (8, 8), np.random.default_rng(0))
-    assert {"in.noise", "norm0.scale", "0.hidden"} <= set(generator.state())
-    other = vae.with_state({path: weight + 1 for path, weight in state.items()})
-    assert (other.p.layers[0].latent == vae.p.layers[0].latent + 1).all()
 
 
 class Numbers(Module):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import refused, stored
+from calling import stored
 from made_channels import ANTENNAS, SUBCARRIERS, channels
 
 from wrf_mi import models
@@ -23,6 +23,7 @@ from wrf_mi.runs.compare import compare
 from wrf_mi.runs.results import read_run
 from wrf_mi.training.session import FitSession
 
+pytestmark = pytest.mark.usefixtures("undrawn")
 ROUNDING = 1e-4  # powers of tens of dBm are stored in single precision
 TURNED_DB = -20 * np.log10(2 * np.sin(0.05))  # A turn by 0.1 rad leaves 2 sin(0.05) of each coefficient
 
@@ -101,7 +102,7 @@ def test_receivers_and_antennas_are_distinguished(tmp_path: Path) -> None:
         assert (run.prediction.shape, run.score.shape) == (shape, shape[:2])
 
 
-def test_uplink_predicts_without_positions(turned: None, tmp_path: Path, capsys) -> None:
+def test_uplink_predicts_without_positions(turned: None, tmp_path: Path, command) -> None:
     data = write_nerf2_csi(tmp_path / "unplaced", channels(positions=False))
     out = train(data, "turned", out=tmp_path / "run").folder
     metrics, arrays = json.loads((out / "metrics.json").read_text()), stored(out)
@@ -121,10 +122,10 @@ def test_uplink_predicts_without_positions(turned: None, tmp_path: Path, capsys)
     with pytest.raises(InputError, match=r"predicts from the uplink; give uplink \[m, antennas, subcarriers\]"):
         opened.predict(np.zeros((1, 3)))
     asked = ["predict", tmp_path, "--input", tmp_path / "none.npz", "--out", tmp_path / "out.npz"]
-    refused(asked, "no such file", capsys)
+    command.refused(asked, "no such file")
 
 
-def test_invalid_uplinks_of_predictions_are_refused(flat_folder, csi_folder, tmp_path: Path, capsys) -> None:
+def test_invalid_uplinks_of_predictions_are_refused(flat_folder, csi_folder, tmp_path: Path, command) -> None:
     run, placed = (train(data, name, out=tmp_path / name) for data, name in ((flat_folder, "mri"), (csi_folder, "idw")))
     good = np.ones((2, ANTENNAS, SUBCARRIERS), np.complex64)
     broken = good.copy()
@@ -140,7 +141,7 @@ def test_invalid_uplinks_of_predictions_are_refused(flat_folder, csi_folder, tmp
     ):
         np.savez(tmp_path / "in.npz", **arrays)
         asked = ["predict", of.folder, "--input", tmp_path / "in.npz", "--out", tmp_path / "out.npz"]
-        refused(asked, message, capsys)
+        command.refused(asked, message)
 
 
 Changed = dict[str, Any]

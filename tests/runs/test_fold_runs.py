@@ -1,9 +1,12 @@
-"""The split ``none``: scores of folds, a model of all rows, and what commands do with such a run."""
+"""Runs of several folds: the split none, and fitted parts that stay where a later one fails."""
 
 from __future__ import annotations
 
+import errno
 import logging
+import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,10 +16,15 @@ import pytest
 from calling import SMALL, scored_again_as_before, strength_commands
 from commands import Command
 from made_channels import channels
+from traced_rooms import LENGTH, SHOEBOX, WIDTH, receiver, write_xml
 
+from wrf_mi.apps.commands.output import Watch
 from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import load, make_splits, write_ble_folder
-from wrf_mi.runs.api import Interrupted, evaluate_run, open_run, resume, train
+from wrf_mi.receivers import rssi_dbm
+from wrf_mi.runs import api
+from wrf_mi.runs.api import evaluate_run, open_run, train
+from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +95,10 @@ GAUSSIANS = (*SMALL, "patience=0")
 
 @pytest.mark.parametrize(
     ("model", "settings"),
-    [("trees", ("trees=10",)), ("mri", ()), ("wrf-gs+", GAUSSIANS), ("hybrid", ("stages=residual",))],
+    [
+        *(("trees", ("trees=10",)), ("mri", ()), ("hybrid", ("stages=residual",))),
+        pytest.param("wrf-gs+", GAUSSIANS, marks=pytest.mark.slow),
+    ],
 )
 def test_models_of_strengths(model: str, settings: tuple[str, ...], strengths: Record, tmp_path: Path):
     run = train(strengths, model, out=tmp_path / "run", split="none", settings=settings)
@@ -111,11 +122,14 @@ def test_models_of_channels(model: str, tmp_path: Path):
 
 
 def test_ray_tracing_keeps_the_paths_of_each_part(room: Path, strengths: Record, tmp_path: Path):
-    run = train(strengths, "ray-tracing", out=tmp_path / "run", scene=room, split="none", settings=["depth=1"])
+    run = train(
+        strengths, "ray-tracing", out=tmp_path / "run", scene=room, split="none", settings=["depth=1", "rays=4096"]
+    )
     assert np.isfinite(run.predict([[1, 2, 1.3]]).mean).all()
     assert evaluate_run(run.folder)["abs_error_db"] == run.metrics["abs_error_db"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_commands_take_such_a_run(run: Path, table: Path, tmp_path: Path, command: Command):
     tx = "x,y,z,heading_rad\n1,2,1.3,0\n"
     for words in strength_commands(run, tmp_path, {"1": "-60", "2": "-70"}, tx):
@@ -146,13 +160,109 @@ def test_a_run_is_opened_from_any_folder(table: Path, tmp_path: Path, monkeypatc
     assert len(open_run("run").problem.record.tx_pos_m) == len(record.tx_pos_m)
 
 
-def test_a_stopped_run_goes_on(strengths: Record, tmp_path: Path):
-    shares = list[float]()
-    known: dict[str, Any] = {"split": "none", "settings": ("stages=residual",)}
-    ends = {"stop": lambda: len(shares) > 4, "on_progress": lambda stage, share, progress=None: shares.append(share)}
-    with pytest.raises(Interrupted):
-        train(strengths, "hybrid", out=tmp_path / "run", **known, **ends)
-    assert not (tmp_path / "run" / "metrics.json").exists()
-    resumed = resume(tmp_path / "run", record=strengths)
-    plain = train(strengths, "hybrid", out=tmp_path / "plain", **known)
+HZ = 2.44e9
+QUICK = ("stages=mean,residual",)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_xml(tmp_path_factory.mktemp("room"), SHOEBOX)
+
+
+@pytest.fixture(scope="module")
+def walked(room: Path) -> Record:
+    """Strengths that are traced in the room, with noise of 1 dB; an official split."""
+    rng = np.random.default_rng(2)
+    places = np.column_stack([rng.uniform(0.5, [LENGTH - 0.5, WIDTH - 0.5], (36, 2)), np.full(36, 1.2)])
+    receivers = (receiver([5.2, 2.4, 2.1], "rx0"), receiver([0.6, 4.2, 2.1], "rx1"))
+    paths = trace_paths(open_scene(room, HZ), places, receivers, TraceOptions(depth=1, rays=1 << 12)).paths
+    observed = np.asarray(rssi_dbm(paths) + rng.normal(0, 1, (2, 36)), np.float32)
+    official = np.arange(30), np.arange(30, 36)
+    return Record("room", "rssi", places, receivers, observed, official=official, frequencies_hz=np.array([HZ]))
+
+
+def failing_at(stage: str, error: BaseException) -> Callable[..., None]:
+    """Progress callback that raises an error at a stage."""
+
+    def on_progress(reported: str, *more: Any) -> None:
+        if reported.startswith(stage):
+            raise error
+
+    return on_progress
+
+
+def stages_of(resumed: Callable[..., Any]) -> tuple[Any, list[str]]:
+    """What a call returns, and the stages that it reports."""
+    stages = list[str]()
+    return resumed(on_progress=lambda stage, *_: stages.append(stage)), stages
+
+
+def assert_noted(error: BaseException, folder: Path) -> None:
+    assert error.__notes__ == [f"what was fitted is kept; go on with: wrf-mi train --resume {folder}"]
+
+
+@pytest.mark.parametrize("kind", [InputError, KeyboardInterrupt])
+def test_folds_that_are_fitted_stay_where_a_later_one_fails(kind, strengths: Record, tmp_path: Path):
+    known: dict[str, Any] = {"model": "mri", "split": "none"}
+    folder, plain = tmp_path / "run", api.train(strengths, out=tmp_path / "plain", **known)
+    with pytest.raises(kind) as raised:
+        api.train(strengths, out=folder, on_progress=failing_at("fold 3", kind("a fault")), **known)
+    assert_noted(raised.value, folder)
+    resumed, stages = stages_of(lambda **how: api.resume(folder, record=strengths, **how))
+    assert not any(stage.startswith(("fold 1", "fold 2")) for stage in stages)
     assert resumed.metrics["abs_error_db"] == plain.metrics["abs_error_db"]
+
+
+def test_stages_that_are_fitted_stay_where_a_later_one_fails(walked: Record, room: Path, tmp_path: Path):
+    """The scene's stages take minutes; then interpolation without the scene fails."""
+    known: dict[str, Any] = {"scene": room, "settings": QUICK, "deterministic": True}
+    folder, plain = tmp_path / "run", api.train(walked, out=tmp_path / "plain", **known)
+    with pytest.raises(InputError, match="a fault") as raised:
+        api.train(walked, out=folder, on_progress=failing_at("kriging", InputError("a fault")), **known)
+    assert_noted(raised.value, folder)
+    stored = {path: path.stat().st_mtime_ns for path in (folder / "parts" / "paths").rglob("*.*")}
+    # Predictions by the options of each stage, and by the chosen ones.
+    assert {"chosen.npz", "as stated+local+default.npz"} <= {path.name for path in stored}
+    resumed = api.resume(folder, record=walked)
+    assert all(path.stat().st_mtime_ns == time for path, time in stored.items() if path.exists())
+    for name in ("abs_error_db", "weights", "held_out"):
+        assert resumed.metrics[name] == plain.metrics[name]
+
+
+@pytest.mark.parametrize("intervals", [False, True])
+def test_no_part_is_fitted_again_where_the_model_could_not_be_stored(intervals, walked, room, tmp_path, monkeypatch):
+    """The disk is full; parts without a weight are removed only after the model is stored."""
+    known: dict[str, Any] = {"model": "kriging"} if intervals else {"scene": room, "settings": QUICK}
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(api, "write_fitted", full)
+        with pytest.raises(OSError, match="No space left") as raised:
+            api.train(walked, out=tmp_path / "run", intervals=intervals, **known)
+    assert_noted(raised.value, tmp_path / "run")
+    _, stages = stages_of(lambda **how: api.resume(tmp_path / "run", record=walked, **how))
+    assert not [stage for stage in stages if ", held-out rows" in stage]
+    left = {path.name for path in (tmp_path / "run").rglob("*") if path.is_dir()}
+    assert not left & {"tried", "held_out"}
+
+
+def test_last_line_of_a_failed_fit_says_how_to_go_on(strengths: Record, tmp_path: Path, command, monkeypatch):
+    data, folder = write_ble_folder(tmp_path / "data", strengths), tmp_path / "run"
+    words = ["train", data, "--model", "mri", "--split", "none", "--out", folder]
+    with monkeypatch.context() as patched:
+        fails = failing_at("fold 3", InputError("a fault in the data"))
+        patched.setattr(Watch, "on_progress", lambda self, *report: fails(*report))
+        status, _, err = command(words)
+    note = f"a fault in the data; what was fitted is kept; go on with: wrf-mi train --resume {folder}"
+    assert (status, err.splitlines()[-1]) == (2, f"wrf-mi: {note}")
+    command.done(["train", "--resume", folder])
+
+
+def test_folder_without_anything_fitted_is_removed(strengths: Record, tmp_path: Path):
+    fault = InputError("a fault in the data")
+    with pytest.raises(InputError, match=re.escape(str(fault))) as raised:
+        api.train(strengths, "kriging", out=tmp_path / "run", split="none", on_progress=failing_at("fold 1", fault))
+    assert not hasattr(raised.value, "__notes__")
+    assert not (tmp_path / "run").exists()
