@@ -285,7 +285,10 @@ def _read_e57(file: Path) -> list[Part]:
 
 
 def _read_pcd(file: Path) -> list[Part]:
-    """Points of a PCD file (https://pointclouds.org/documentation/tutorials/pcd_file_format.html)."""
+    """Points of a PCD file (https://pointclouds.org/documentation/tutorials/pcd_file_format.html).
+
+    Open3D 0.20 reads wrong numbers where binary fields have types of different widths, and takes text that is cut off.
+    """
     header, begin = _pcd_header(file)
     storage = header["DATA"][0]
     count, fields = int(header["POINTS"][0]), header["FIELDS"]
