@@ -114,6 +114,7 @@ _OWN: Mapping[str, Check] = {
         table="unmeasured:table",
         **_STORED,
     ),
+    "ablation": _here("mechanisms of signal strengths", "ablation:main", FLAT, resumes=True, table="ablation:table"),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "fdtd": _here("Maxwell's equations in a toy scene", "fdtd:main", table="fdtd:table"),
     "far-scans": _here("scans off by wavelengths", "far_scans:main", resumes=True, table="far_scans:table"),
