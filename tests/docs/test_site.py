@@ -68,7 +68,7 @@ def test_examples_of_how_to_pages_run(tmp_path, monkeypatch):
         assert wrf_mi.open_run("run").predict([[2.0, 3.0, 1.2]], "kitchen").mean.shape == (1,)
         assert run.metrics["abs_error_db"]["median"] < 5
         kind = receivers.receiver_model("power-pixel", "spectrum")
-        form = receivers.Form("power-pixel", (4, 8))
+        form = receivers.ObservationSpec("power-pixel", (4, 8))
         assert kind.of(form, run.record.receivers[0]).how == "power"
         assert names["main"]()["rows"]
     finally:

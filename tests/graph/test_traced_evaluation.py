@@ -24,7 +24,7 @@ from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.graph.evaluations import EVALUATIONS
 from wrf_mi.graph.graph import Batch, Graph
 from wrf_mi.graph.settings import TracedConfig
-from wrf_mi.receivers.registry import Form
+from wrf_mi.receivers.registry import ObservationSpec
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.tasks.scores import ssim
 from wrf_mi.tracing.paths.instrument_parameters import pose_names, receiver_pose
@@ -113,12 +113,14 @@ def test_traced_gradients_match_the_sum_along_rays(model):
             greys.append(dr.sqrt(re * re + im * im + 1e-8))
         return dr.concat(greys)
 
-    traced = reported(Graph(field, RECEIVERS[:1], Form("pixel", SIZE), evaluation="traced"), TX)
+    traced = reported(Graph(field, RECEIVERS[:1], ObservationSpec("pixel", SIZE), evaluation="traced"), TX)
     assert_close(gradients(values, traced, weights), gradients(values, along_rays, weights), SAME_FOOTPRINT)
 
 
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("form", [Form("pixel", FINE), Form("power", FINE)], ids=lambda form: form.receiver)
+@pytest.mark.parametrize(
+    "form", [ObservationSpec("pixel", FINE), ObservationSpec("power", FINE)], ids=lambda form: form.receiver
+)
 def test_traced_gradients_match_splatting_for_small_gaussians(model, form):
     """Of every parameter, on the hemisphere of spectra and on the full sphere of one antenna."""
     values = parameters(model)
@@ -205,7 +207,7 @@ INSIDE = receiver([2.0, 2.0, 1.0])
 
 def behind_the_ceiling(folder, **traced):
     """Gaussians above a room, seen from inside it by tracing, and its graph."""
-    form = Form("pixel", SIZE, np.array([WALLS_HZ]))
+    form = ObservationSpec("pixel", SIZE, np.array([WALLS_HZ]))
     scene = room(folder)
     graph = Graph(MODELS["wrf-gs+"], [INSIDE], form, scene, TracedConfig(rays=1 << 10, **traced), evaluation="traced")
     values = parameters("wrf-gs+", INSIDE)

@@ -27,7 +27,7 @@ from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.paths import result as result_module
 from wrf_mi.tracing.paths import traced_field as traced_field_module
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
-from wrf_mi.tracing.search.chains import TRANSMISSION, Legs
+from wrf_mi.tracing.search.chains import TRANSMISSION, PathInteractions
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.sionna.materials import CONSTANTS, itu_constants
 from wrf_mi.tracing.sionna.path_solver import SHORT, Devices, apart
@@ -181,7 +181,7 @@ def test_path_that_meets_a_sliver_has_the_gain_of_its_plane(building):
 @given(gaps_m=st.lists(st.floats(0, 4e-3), min_size=1, max_size=3), seed=st.integers(0, 2**16))
 @settings(deadline=None, max_examples=200)
 def test_short_legs_become_longer_and_keep_all_directions(building, gaps_m, seed):
-    """Legs of a straight path through sheets, in single precision."""
+    """PathInteractions of a straight path through sheets, in single precision."""
     surfaces, rng = scene_surfaces(building), np.random.default_rng(seed)
     source, target = rng.uniform(0.2, [[2, 2, 2], [6, 5, 3]])
     direction = (target - source) / np.linalg.norm(target - source)
@@ -189,7 +189,7 @@ def test_short_legs_become_longer_and_keep_all_directions(building, gaps_m, seed
     types = np.full((1, len(vertices)), TRANSMISSION, np.uint8)
     met = types, np.zeros(types.shape, np.int64), vertices[None], np.ones(types.shape, np.float32), {}
     ends = tuple(Devices(end[None], (ANTENNA.mounted(),)) for end in (source, target))
-    moved = apart(Legs(np.zeros(1, int), np.zeros(1, int), *met), surfaces, ends)
+    moved = apart(PathInteractions(np.zeros(1, int), np.zeros(1, int), *met), surfaces, ends)
     legs = np.diff(np.concatenate([source[None], moved.vertices_m[0], target[None]]).astype(np.float32), axis=0)
     length = np.linalg.norm(legs, axis=1)
     assert length.min() > 0.99 * SHORT * surfaces.scale_m

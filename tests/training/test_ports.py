@@ -14,7 +14,7 @@ from wrf_mi.core.arrays import planar_array
 from wrf_mi.graph.graph import Graph
 from wrf_mi.graph.settings import TracedConfig
 from wrf_mi.receivers.instruments import Instrument
-from wrf_mi.receivers.registry import Form
+from wrf_mi.receivers.registry import ObservationSpec
 from wrf_mi.tasks.conditions import scene_carrier
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.tracer import RayTracer
@@ -60,8 +60,8 @@ def graph_of(xml, form, field=None, receivers=None, **config):
     return Graph(field, receivers or (array(),), form, scene, replace(CONFIG, **config))
 
 
-MIDDLE = Form("array", SIZE, [CARRIERS_HZ[1]])
-PORTS = Form("array", SIZE, carriers_hz=np.array(CARRIERS_HZ))
+MIDDLE = ObservationSpec("array", SIZE, [CARRIERS_HZ[1]])
+PORTS = ObservationSpec("array", SIZE, carriers_hz=np.array(CARRIERS_HZ))
 
 
 @pytest.mark.parametrize(("model", "tolerance"), [("array", SINGLE), ("power", SINGLE_DB)])

@@ -23,7 +23,7 @@ from ..core import Record
 from ..core.carriers import rows_by_carrier
 from ..core.types import FloatArray, IntArray
 from ..receivers import minmax_scale
-from ..receivers.registry import RECEIVERS, Form
+from ..receivers.registry import RECEIVERS, ObservationSpec
 from ..tasks.conditions import placed_receivers
 from ..tracing.paths.corrected_scene import MovedSearch
 from ..tracing.paths.instrument_parameters import instrument_parameters
@@ -160,7 +160,9 @@ class Misfit:
         height, width = self._size or (1, 1)
         size = tuple(n // stride for n, stride in zip((height, width), self._strides or (1, 1), strict=True))
         floor_db, outputs = task.floor_db(record.observation[:, rows]), task.outputs(record.observation.shape[2:])
-        form = Form(task.receiver_with_scene, (size[0], size[1]), record.frequencies_hz, outputs, floor_db=floor_db)
+        form = ObservationSpec(
+            task.receiver_with_scene, (size[0], size[1]), record.frequencies_hz, outputs, floor_db=floor_db
+        )
         heading, carriers = (None if p is None else p[rows] for p in (record.tx_heading_rad, record.carriers_hz))
         ports, make = list[_Port](), RECEIVERS[form.receiver].of
         for number, receiver in zip(numbers, self.receivers, strict=True):

@@ -127,7 +127,7 @@ class Decomposition:
     #: what the traced paths of the scene alone predict, [m, ...] as observations, or, of spectra, as magnitudes in a
     #: common unit of both sides; NaN where they are not used. None: the model has one side
     traced: NDArray[Any] | None = None
-    learned: NDArray[Any] | None = None  #: what the side without paths predicts, likewise
+    learned: NDArray[Any] | None = None  #: what the Gaussians alone predict; None without a scene
     paths: PathStatistics | None = None  #: statistics of the traced paths; None: the model traces none
 
 

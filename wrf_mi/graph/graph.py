@@ -35,7 +35,7 @@ from ..gaussians import Factorised, WithAttributes, WrfGs, WrfGsPlus
 from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import TiledPlane
 from ..receivers.device_paths import TracedPaths, draws_on_device, expected_report, spread
-from ..receivers.registry import RECEIVERS, Form
+from ..receivers.registry import RECEIVERS, ObservationSpec
 from ..tracing.options import FACTOR
 from ..tracing.paths.instrument_parameters import receiver_pose
 from ..tracing.paths.solve import Prepared
@@ -77,7 +77,7 @@ class Graph:
         field: field of Gaussians; None: only traced paths.
         receivers: poses, antennas and arrays.
         form: form of the observations.
-        scene: scene from `wrf_mi.tracing.open_scene`, at `Form.carrier_hz`; None: only Gaussians.
+        scene: scene from `wrf_mi.tracing.open_scene`, at `ObservationSpec.carrier_hz`; None: only Gaussians.
         traced: options of tracing, and learning rates.
         tx_antenna: antenna of the transmitters.
         evaluation: evaluation of the Gaussians, a key of `wrf_mi.graph.evaluations.EVALUATIONS`.
@@ -90,7 +90,7 @@ class Graph:
         self,
         field: Field | None,
         receivers: Sequence[Receiver],
-        form: Form,
+        form: ObservationSpec,
         scene: Any | None = None,
         traced: TracedConfig = DEFAULT,
         tx_antenna: Antenna = ANTENNA,
@@ -109,7 +109,7 @@ class Graph:
         self._stated_hz = form.carrier_hz
         self._take(form)
 
-    def _check_data(self, form: Form, receivers: Sequence[Receiver], with_scene: bool) -> None:
+    def _check_data(self, form: ObservationSpec, receivers: Sequence[Receiver], with_scene: bool) -> None:
         # Phases of an array need its elements and a wavelength; paths need a carrier in any case.
         array = self.kind.needs_array and any(receiver.array_m is None for receiver in receivers)
         carrier = (self.kind.needs_carrier or with_scene) and np.isnan(form.carrier_hz)
@@ -124,7 +124,7 @@ class Graph:
         graph._take(replace(self.form, carriers_hz=np.array([carrier_hz])))
         return graph
 
-    def _take(self, form: Form) -> None:
+    def _take(self, form: ObservationSpec) -> None:
         """Take a form, with the receiver model of each port, receiver by receiver."""
         forms = form.of_ports
         self.form, self.carriers = form, len(forms)
@@ -193,7 +193,7 @@ class Graph:
                 side.attach(self.surface)
         return sides
 
-    def cover(
+    def add_surface_gaussians(
         self, sides: Sequence[TracedField | None], fitted: Mapping[str, NDArray[Any]] | None = None
     ) -> dict[str, NDArray[np.float32]]:
         """Put Gaussians on the surfaces that paths of traced sides meet, if the settings train them.

@@ -12,7 +12,7 @@ from ..core import Antenna, Paths, Receiver
 from ..core.antenna import ANTENNA
 from ..core.carriers import by_carrier
 from ..core.types import FloatArray, IntArray
-from .registry import RECEIVERS, Form, ReceiverModel
+from .registry import RECEIVERS, ObservationSpec, ReceiverModel
 
 SIZE = (90, 360)  # elevations and azimuths of a spectrum where none are stated: one each degree
 
@@ -53,7 +53,7 @@ class Instrument:
         """Receiver model of one of the receivers."""
         antennas = () if receiver.array_m is None else (len(receiver.array_m),)
         outputs = (*antennas, len(self.frequencies_hz))
-        form = Form(self.kind, self.size, np.asarray(self.frequencies_hz, float), outputs)
+        form = ObservationSpec(self.kind, self.size, np.asarray(self.frequencies_hz, float), outputs)
         return RECEIVERS[self.kind].of(form, receiver).with_phase_error(self.phase_error)
 
     def observe(self, paths: Paths) -> NDArray[Any]:

@@ -42,7 +42,7 @@ from ..core.types import IntArray
 from .array import bartlett_spectrum, steering_matrix
 from .channel import antenna_csi, csi, rssi_dbm, with_phase_errors
 from .device_paths import ComplexMatrix, Ports, TracedPaths, direction_weights, path_sum, weighted
-from .registry import PIXEL, ComplexArray, Form, ReceiverModel, Slopes, Sums
+from .registry import PIXEL, ComplexArray, ObservationSpec, ReceiverModel, Slopes, Sums
 from .reports import LEAST_POWER, SILENCE, SQUARED_MAGNITUDE_EPS, arrives, minmax_scale, scaled, strength_db
 
 How = Literal["coherent", "power"]
@@ -100,7 +100,7 @@ class PixelReceiver(ReceiverModel):
     sphere, components = False, 1
 
     @classmethod
-    def of(cls, form: Form, receiver: Receiver) -> PixelReceiver:
+    def of(cls, form: ObservationSpec, receiver: Receiver) -> PixelReceiver:
         """Model of a receiver whose observations have a form."""
         return cls(*form.size, _elements(receiver), form.carrier_hz)
 
@@ -154,7 +154,7 @@ class ArrayReceiver(PixelReceiver):
     name, needs_array, needs_carrier = "array", True, True
 
     @classmethod
-    def of(cls, form: Form, receiver: Receiver) -> ArrayReceiver:
+    def of(cls, form: ObservationSpec, receiver: Receiver) -> ArrayReceiver:
         """Model of a receiver whose observations have a form."""
         return cls(*form.size, _elements(receiver), form.carrier_hz, instrument_scale=True)
 
@@ -276,7 +276,7 @@ class CsiReceiver(ReceiverModel):
     levels, complex_valued = True, True
 
     @classmethod
-    def of(cls, form: Form, receiver: Receiver) -> CsiReceiver:
+    def of(cls, form: ObservationSpec, receiver: Receiver) -> CsiReceiver:
         """Model of a receiver whose observations have a form."""
         # Without frequencies no path is evaluated. Narrow channels may state their carrier alone.
         known = 0.0 if form.frequencies_hz is None else form.frequencies_hz
@@ -385,7 +385,7 @@ class PowerReceiver(CsiReceiver):
     name, tasks, complex_valued = "power", ("rssi",), False
 
     @classmethod
-    def of(cls, form: Form, receiver: Receiver) -> PowerReceiver:
+    def of(cls, form: ObservationSpec, receiver: Receiver) -> PowerReceiver:
         """Model of a receiver whose observations have a form: powers of paths are added."""
         frequencies_hz = (0.0 if form.frequencies_hz is None else form.carrier_hz,)
         floor = LEAST_POWER if np.isnan(form.floor_db) else 10 ** (form.floor_db / 10)

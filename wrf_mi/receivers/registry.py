@@ -29,11 +29,14 @@ Slopes = Callable[[ComplexArray, IntArray], FloatArray]
 """Changes of reports by changes [k, values] of signals of the rows ``which`` [k]."""
 Sums = Literal["fields", "elements", "powers"]
 """Sums over paths: of fields at one antenna on each subcarrier, of fields at the elements of an array, or of powers."""
-GAPS = ("frequencies_hz", "floor_db")  # attributes of `Form` that are NaN where they are unknown, or there is none
+GAPS = (
+    "frequencies_hz",
+    "floor_db",
+)  # attributes of a specification that may be NaN: unknown, or none
 
 
 @dataclass(frozen=True)
-class Form:
+class ObservationSpec:
     """Form of observations, beside the receivers' poses, antennas and arrays.
 
     Attributes:
@@ -68,7 +71,7 @@ class Form:
         return {f"form/{name}": np.asarray(value) for name, value in values.items()}
 
     @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> Form:
+    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> ObservationSpec:
         """The form that `arrays` describes."""
         height, width = map(int, arrays["form/size"])
         hz, basis = np.asarray(arrays["form/frequencies_hz"], float), np.asarray(arrays["form/basis"])
@@ -97,7 +100,7 @@ class Form:
         return float("nan") if self.frequencies_hz is None else float(np.mean(self.frequencies_hz))
 
     @property
-    def of_ports(self) -> tuple[Form, ...]:
+    def of_ports(self) -> tuple[ObservationSpec, ...]:
         """Forms at each carrier of rows, or this one alone."""
         if self.carriers_hz is None:
             return (self,)
@@ -121,7 +124,7 @@ class ReceiverModel(ABC):
 
     @classmethod
     @abstractmethod
-    def of(cls, form: Form, receiver: Receiver) -> ReceiverModel:
+    def of(cls, form: ObservationSpec, receiver: Receiver) -> ReceiverModel:
         """Model of a receiver whose observations have a form."""
 
     @property

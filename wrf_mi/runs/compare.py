@@ -69,11 +69,13 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
     >>> compare([run.folder for run in runs], f"{tempfile.mkdtemp()}/page").name
     'index.html'
     """
+    # Runs that share data and task are compared with each other.
     groups = _groups(read_runs(run_dirs))
     out = Path(out)
     if out.exists() and not _is_comparison(out):
         raise InputError(f"{out}: exists and holds something else than a comparison; choose another place")
     with atomic_folder(out, replace=True) as folder:
+        # Scores, paired differences and figures of each group.
         sections, drawn = [], []
         for done, (slug, runs) in enumerate(groups.items()):
             on_progress("comparing", done / len(groups))
@@ -81,6 +83,8 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
             drawn += shown
             files = [(folder / name, title) for name, title, _ in shown]
             sections.append(Section(slug, runs, score_rows(runs), method_rows(runs), differences(runs), files))
+
+        # Tables, pictures, and the page that holds both.
         _write_table(folder / "compare.csv", COLUMNS, (section.scores for section in sections))
         if any(section.methods for section in sections):
             _write_table(folder / "methods.csv", METHODS, (section.methods for section in sections))

@@ -73,7 +73,7 @@ class Results:
     reception: NDArray[np.float32] | None
     # pairs (seconds, score on validation rows while they were held out) by name of the fold, "" without folds
     validation: dict[str, list[tuple[float, float]]]
-    std_mean: NDArray[np.float32] | None = None  # those of the mean, likewise
+    std_mean: NDArray[np.float32] | None = None  # standard deviations of the mean; None: not stated
     splits: Sequence[Split] = ()  # splits with test rows, one or those of the folds; empty: not stored
 
     @cached_property

@@ -60,24 +60,33 @@ def correct_scene(
     Raises:
         InputError: data or a scene that cannot be used, or no path to any receiver.
     """
+    # Paths of the training rows, and which of these rows judge.
     begun = time.perf_counter()
     traced = TracedScene(scene, record, split, options, material, on_stage)
     judging, of_scene, reports = _judging(traced), _SharedScene(traced), _Reports(traced)
     enough = judging.held_receivers or not too_few(traced.record, judging)
     problem = Problem(traced.record, None, split.seed, str(scene), material)
+
+    # Engine: options are fitted without the judging rows, which choose one.
     with TemporaryDirectory() as place:
         session = Session(Path(place), Path(place), lambda stage, share, _=None, /: on_stage(stage, share))
         chosen = Engine(None, (of_scene, reports), problem, judging, session).choose() if enough else None
     if chosen is None:
         text = f"{len(traced.split.train)} training rows are too few to hold some out; give more"
         raise InputError(f"{traced.record.name}: {text}")
+
+    # Phases: known, or uncertain where that is likelier.
     best = chosen.fitted
     assert isinstance(best, _Reported)
     if not moves_planes(best.edit.stage):
         best = _by_uncertain_phases(of_scene.trial, reports, best)
+
+    # Least squares with all rows, from the chosen edit.
     scores = {each.edit.stage: each.scores for each in reports.tried} | {best.edit.stage: best.scores}
     facts = {"held_out": len(best.misfit.rows), "held_out_receivers": reports.out}
     correction: Correction = refit_edit(traced, best.edit, scores, facts)
+
+    # How much smaller errors of known rows are than those of others.
     if correction.data is not None:
         # Rows held out of every choice are few; residuals of rows left out of least squares alone are of all rows.
         after = _with_mean_gain(correction.vector, correction.misfit, reports.heard)

@@ -32,11 +32,11 @@ from ..training.selection import RowDistance, rows_at_receiver
 from .side import FittedInScene, by_stage
 
 LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
-LeftOver = Mapping[int, tuple[IntArray, NDArray[Any]]]
+TrainingResiduals = Mapping[int, tuple[IntArray, NDArray[Any]]]
 """Rows [n] by receiver, and what a model's mean leaves of their observations, [n, ...]."""
 
 
-def left_over(fitted: Fitted, record: Record, split: Split) -> LeftOver:
+def training_residuals(fitted: Fitted, record: Record, split: Split) -> TrainingResiduals:
     """What a fitted model leaves of the observations of its training rows."""
     left: dict[int, tuple[IntArray, NDArray[Any]]] = {}
     for receiver in range(len(record.receivers)):
@@ -61,7 +61,7 @@ class Residuals:
     by_receiver: Mapping[int, Kriged]  # interpolation of each receiver that has enough rows, by its number
 
     @classmethod
-    def of(cls, left: LeftOver, record: Record, split: Split, seed: int) -> Residuals:
+    def of(cls, left: TrainingResiduals, record: Record, split: Split, seed: int) -> Residuals:
         """Residuals that a model left, at the training rows of a split that is the model's or holds out more."""
         by_receiver: dict[int, Kriged] = {}
         for receiver, (rows, residual) in left.items():

@@ -37,7 +37,7 @@ from ..estimators.model import (
 from ..models import MODELS
 from ..training.by_distance import GAPS
 from ..training.selection import away_as
-from .fitted import FIELD_IN_SCENE, PATHS, TRACED, UPLINK_PARTS, FittedMixture, Residuals, left_over
+from .fitted import FIELD_IN_SCENE, PATHS, TRACED, UPLINK_PARTS, FittedMixture, Residuals, training_residuals
 from .further import FURTHER_STAGES, first_of, fit_further, load_further
 from .mixture import MixtureFit, Part
 from .paths import TracedPaths
@@ -168,7 +168,7 @@ def _fitted(problem: Problem, split: Split, session: Session) -> FittedMixture:
             begun = time.perf_counter()  # of the stage residual
             if side.with_residuals is not None and fit.rows is not None:
                 fit.predictions[RESIDUAL] = HeldOutPrediction(side.with_residuals)
-                left = left_over(side, problem.record, split)
+                left = training_residuals(side, problem.record, split)
                 residuals = Residuals.of(left, problem.record, split, problem.seed)
     chosen = fit.weights()
     used, scores = fit.used(chosen), fit.scores(chosen)

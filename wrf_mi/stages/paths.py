@@ -24,7 +24,7 @@ from ..training.config import TrainConfig, calibration_config
 from ..training.trainer import Trainer
 from ..training.validation import HeldOutReports
 from .engine import LEAST_ROWS, Engine, Fold
-from .fitted import Residuals, left_over
+from .fitted import Residuals, training_residuals
 from .scene import (
     CALIBRATION,
     CORRECTED,
@@ -241,7 +241,7 @@ def _with_residuals(problem: Problem, state: State, fold: Fold, mean: FloatArray
     """Predictions of held-out observations, ``mean`` [q, ...] by a state, with what that leaves of the other rows."""
     record, held_out, result = fold.problem.record, fold.held_out, np.array(mean)
     assert state.fitted is not None
-    residuals = Residuals.of(left_over(state.fitted, record, fold.split), record, fold.split, problem.seed)
+    residuals = Residuals.of(training_residuals(state.fitted, record, fold.split), record, fold.split, problem.seed)
     for place, number in enumerate(fold.numbers):
         of_receiver = held_out.receiver == number
         if of_receiver.any():

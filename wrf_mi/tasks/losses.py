@@ -34,7 +34,7 @@ def absolute_error(prediction: Any, truth: Any, *shape: int) -> Any:
 
 
 def squared_error(prediction: Any, truth: Any, *shape: int) -> Any:
-    """Mean squared difference, likewise."""
+    """Mean squared difference of known values."""
     return _mean_error(dr.square, prediction, truth)
 
 

@@ -163,13 +163,13 @@ class ScheduledStep:
     factor: Any  # factor of the learning rates
     decay: Any  # decay of the running mean of the parameters
     number: Any  # number of the step, from 1
-    trouble: NonFiniteReport  # report of the steps before
+    non_finite: NonFiniteReport  # report of the steps before
 
     @classmethod
-    def of(cls, schedule: Schedule, t: int, trouble: NonFiniteReport) -> ScheduledStep:
+    def of(cls, schedule: Schedule, t: int, non_finite: NonFiniteReport) -> ScheduledStep:
         """The step after ``t`` steps of a schedule."""
         factor, decay = (dr.opaque(mi.Float, float(values[t])) for values in (schedule.factor, schedule.decay))
-        return cls(factor, decay, dr.opaque(mi.UInt32, t + 1), trouble)
+        return cls(factor, decay, dr.opaque(mi.UInt32, t + 1), non_finite)
 
 
 def guarded_step(
@@ -183,17 +183,17 @@ def guarded_step(
     dr.backward(loss)
     sums = [dr.detach(loss), *(_health(params[name]) for name in watched_groups(params))]
     fine = [dr.isfinite(s) for s in sums]
-    good, trouble = reduce(operator.and_, fine), step.trouble
-    untroubled = trouble.step == 0
+    good, non_finite = reduce(operator.and_, fine), step.non_finite
+    was_finite = non_finite.step == 0
     # A masked step instead of a branch: whether values are finite is known on the device alone, and reading it here
     # would end the recording.
-    finite = good & untroubled
+    finite = good & was_finite
     adam.step(eval=False, active=finite)
     share = dr.select(finite, step.decay, 1)
     mean = {name: dr.lerp(dr.detach(adam[name]), mean[name], share) for name in mean}
     now = dr.concat([dr.select(f, mi.Float(0), mi.Float(1)) for f in fine])
-    # The first trouble is reported: what follows it has other causes.
+    # The first non_finite is reported: what follows it has other causes.
     report = NonFiniteReport(
-        dr.select(untroubled & ~good, step.number, trouble.step), dr.select(untroubled, now, trouble.groups)
+        dr.select(was_finite & ~good, step.number, non_finite.step), dr.select(was_finite, now, non_finite.groups)
     )
     return mean, report, finite

@@ -32,7 +32,8 @@ KNOTS, KNOT_ROWS = 4, 20
 """Largest number of distances at which weights are chosen, and least number of held-out observations for each."""
 FIRST, STEPS = 3, 12
 """Share of the best single prediction at the start of the forward selection, in steps, and largest number of steps."""
-DOUBT = 2.0  # standard errors of a difference that is clear: by chance five rows exceed one of them one time in five
+CLEAR_GAIN_STANDARD_ERRORS = 2.0
+"""Standard errors required of a gain: by chance five rows exceed one standard error one time in five."""
 
 SIZES, DISTANCES = 8, 4  # largest numbers of groups by size and by distance
 GROUP_ROWS = 12
@@ -165,12 +166,13 @@ class HeldOutScores:
         """One mixture for all distances, by forward selection that starts from equal weights.
 
         Few held-out observations tell predictions of similar scores apart by chance; equal weights hedge against that.
-        Predictions that are worse than the best one by more than `DOUBT` standard errors start without weight.
+        Predictions that are worse than the best one by more than `CLEAR_GAIN_STANDARD_ERRORS` start without
+        weight.
         """
         scores = [self.score(np.broadcast_to(weights, (len(rows), self.count)), rows) for weights in np.eye(self.count)]
         means = [unit_means(values, self.unit[rows]) for values in scores]
         best = max(means, key=np.mean)
-        alike = np.array([not improves(best, mean, True, DOUBT) for mean in means])
+        alike = np.array([not improves(best, mean, True, CLEAR_GAIN_STANDARD_ERRORS) for mean in means])
         return constant(self._selected(rows, np.ones(len(rows)), alike / alike.sum(), int(alike.sum())))
 
     def mixed(self, rows: IntArray) -> Mixture:
@@ -237,7 +239,8 @@ def choose_weights(
 
     Each form is fitted without the observations of a fold and scored on them; a form with more freedom is taken where
     its mean score is better by more than the standard error of the difference over independent units: the receivers of
-    one transmitter have errors in common. A trusted prediction is left for a gain of `DOUBT` errors.
+    one transmitter have errors in common. A trusted prediction is left for a gain of
+    `CLEAR_GAIN_STANDARD_ERRORS`.
 
     Args:
         scores: scores of all held-out observations.
@@ -260,7 +263,7 @@ def choose_weights(
             of_forms[name][out] = scores.score(without[name][out], every[out])
         on_fold((done + 1) / len(folds))
     means = ((name, unit_means(values, scores.unit)) for name, values in of_forms.items())
-    best = last_gain(means, True, {SINGLE: DOUBT})
+    best = last_gain(means, True, {SINGLE: CLEAR_GAIN_STANDARD_ERRORS})
     return best, forms[best](scores, every), without[best]
 
 

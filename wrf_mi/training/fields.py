@@ -14,7 +14,7 @@ from ..datasets.observations import LARGEST, computable
 from ..gaussians import FIELDS, Encoding, random_gaussians
 from ..gaussians.attributes import with_attributes
 from ..graph.graph import Field
-from ..receivers.registry import Form
+from ..receivers.registry import ObservationSpec
 from .config import PATHS_ALONE, NetworkConfig, TrainConfig
 
 BYTES_PER_NEURON, BYTES_PER_PAIR, BYTES_PER_NUMBER = 11, 1000, 24
@@ -24,7 +24,7 @@ Gaussians of the three fields, within a third."""
 MOST_NUMBERS = (1 << 32) - 1  # most numbers of an array of Dr.Jit
 
 
-def field_of(config: TrainConfig, form: Form) -> Field | None:
+def field_of(config: TrainConfig, form: ObservationSpec) -> Field | None:
     """The field for observations of a form (`make_field`); None: paths are trained alone."""
     if config.model == PATHS_ALONE:
         return None

@@ -18,7 +18,7 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..datasets.observations import check_observations, check_rows
 from ..graph.graph import Field, Graph
-from ..receivers.registry import AUTO, Form, receiver_model
+from ..receivers.registry import AUTO, ObservationSpec, receiver_model
 from ..tasks import Loss, known_loss
 from ..tasks.conditions import normalised_uplink, outputs_of, placed_receivers
 from ..tracing.paths.traced_field import TracedField
@@ -135,7 +135,7 @@ def _receiver_of(record: Record, config: TrainConfig, with_scene: bool) -> str:
     return name
 
 
-def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> Form:
+def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArray, with_scene: bool) -> ObservationSpec:
     """Form of a record's observations, whose basis is computed from training ``rows`` (InputError: unsuitable)."""
     task, name = record.task, _receiver_of(record, config, with_scene)
     shape = record.observation.shape[2:]
@@ -146,7 +146,7 @@ def form_of(record: Record, config: TrainConfig, targets: Targets, rows: IntArra
     headings = with_scene and config.traced.pattern_degree > 0 and record.tx_heading_rad is not None
     floor_db = task.floor_db(record.observation[:, rows]) if with_scene else np.nan
     size, carriers_hz = (height, width), targets.carriers_hz
-    return Form(name, size, record.frequencies_hz, outputs, basis, features, headings, floor_db, carriers_hz)
+    return ObservationSpec(name, size, record.frequencies_hz, outputs, basis, features, headings, floor_db, carriers_hz)
 
 
 def _basis(targets: Targets, rows: IntArray, most: int) -> NDArray[np.complex128]:

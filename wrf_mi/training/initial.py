@@ -178,7 +178,7 @@ def starting_values(
         placed = replace(plan.record, receivers=graph.receivers)
         start = initial or initial_gaussians(config.initial, placed, plan.split.train, rng, graph.sphere)
         values = graph.field.init(start, rng)
-    values |= graph.parameters(sides) | graph.cover(sides)
+    values |= graph.parameters(sides) | graph.add_surface_gaussians(sides)
     values |= _gains(plan, sides, values)
     if LEVEL in values:
         # A receiver has one level for all of its carriers: that of the first.

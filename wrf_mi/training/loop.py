@@ -190,7 +190,7 @@ class TrainingLoop(ABC):
     higher_is_better: bool  # direction of the validation score
 
     @abstractmethod
-    def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+    def take_step(self, non_finite: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """Take the step after ``state.step`` steps; returns the loss before it and the report after it."""
 
     @abstractmethod
@@ -231,10 +231,10 @@ class TrainingLoop(ABC):
         """
         self.begin()
         self._origin_s = time.perf_counter() - self.seconds
-        trouble = self._sitting(on_progress, save, stop)
+        non_finite = self._run_session(on_progress, save, stop)
         dr.sync_thread()
         self.seconds = time.perf_counter() - self._origin_s
-        self._require_finite(trouble)
+        self._require_finite(non_finite)
         save()
         return self._is_over
 
@@ -244,41 +244,41 @@ class TrainingLoop(ABC):
         ends = self.until_chosen and (self.state.chosen > 0 or step >= self.schedule.joined)
         return step == self.config.steps or ends
 
-    def _sitting(
+    def _run_session(
         self, on_progress: Callable[[Progress], None], save: Callable[[], None], stop: Callable[[], bool]
     ) -> NonFiniteReport:
         """Steps to the last or until stopped (`run`); returns the report after them."""
-        config, before_s, trouble = self.config, self.seconds, NonFiniteReport.none(self.state.adam)
+        config, before_s, non_finite = self.config, self.seconds, NonFiniteReport.none(self.state.adam)
         losses, logged, steps = dr.zeros(mi.Float), 0, 0  # steps since the last line of the log, and in this sitting
         while not self._is_over and not (steps and stop()):
-            losses, trouble = self._next(losses, trouble)
+            losses, non_finite = self._next(losses, non_finite)
             logged, steps, last = logged + 1, steps + 1, self.state.step == config.steps
             self.seconds = time.perf_counter() - self._origin_s
             scored, choosing = self._due()
             if scored or self.state.step % config.log_every == 0:
-                self._require_finite(trouble)
+                self._require_finite(non_finite)
                 progress = self._progress(losses[0] / logged, steps, before_s, scored)
                 on_progress(progress)
                 losses, logged = dr.zeros(mi.Float), 0
                 if choosing and progress.validation_score is not None:
                     self.choose(progress.validation_score)
             if self.state.step % config.checkpoint_every == 0 and not last:
-                self._require_finite(trouble)
+                self._require_finite(non_finite)
                 save()
-        return trouble
+        return non_finite
 
-    def _next(self, losses: Any, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+    def _next(self, losses: Any, non_finite: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """Take a step, and a round of density control where one is due; returns the sum of losses and the report."""
-        loss, trouble = self.take_step(trouble)
+        loss, non_finite = self.take_step(non_finite)
         # Summed on the device: a loss that is read waits for its step, and the next one could not be queued.
         losses += loss
         dr.eval(losses)
         self.state.step += 1
-        if trouble.step[0]:  # one number, but reading it waits for the step
-            self._require_finite(trouble)
+        if non_finite.step[0]:  # one number, but reading it waits for the step
+            self._require_finite(non_finite)
         if self.state.step in self.schedule.density:
             self.adapt()
-        return losses, trouble
+        return losses, non_finite
 
     def _due(self) -> tuple[bool, bool]:
         """Whether the state is scored at this step, and whether its score may choose it."""
@@ -314,9 +314,9 @@ class TrainingLoop(ABC):
         self.schedule, self.state.step = self.schedule.after(self.state.chosen)
         self.record_functions()
 
-    def _require_finite(self, trouble: NonFiniteReport) -> None:
+    def _require_finite(self, non_finite: NonFiniteReport) -> None:
         """Raise `NumericsError` after a step without finite values, or with parameters that are not finite."""
-        step = int(trouble.step[0])
+        step = int(non_finite.step[0])
         # A gradient of 1e20 is finite and its square is not: Adam would never move that parameter again.
         groups = (self.state.params(), *self.state.moments()[:2])
         bad = {name for group in groups for name, values in group.items() if not np.isfinite(values).all()}
@@ -324,6 +324,6 @@ class TrainingLoop(ABC):
             where = f"step {step or self.state.step}: parameters or their moments not finite: {listed(sorted(bad))}"
             raise NumericsError(f"{where}; go on from the last checkpoint with lower learning rates")
         if step:
-            names = np.array(["loss", *watched_groups(self.state.adam)])[trouble.groups.numpy() > 0]
+            names = np.array(["loss", *watched_groups(self.state.adam)])[non_finite.groups.numpy() > 0]
             where = f"step {step}: not finite: {listed(names)}"
             raise NumericsError(f"{where}; the parameters are those before it; lower the learning rates")

@@ -20,7 +20,7 @@ from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..gaussians.parameters import Gaussians
 from ..graph.graph import Alone, Field, Graph
-from ..receivers.registry import PIXEL, Form
+from ..receivers.registry import PIXEL, ObservationSpec
 from ..receivers.spreads import PathStatistics, joined
 from ..tasks.conditions import known_headings, normalised_uplink
 from ..tracing.paths.traced_field import TracedField
@@ -80,7 +80,7 @@ class Predictor:
         operator: bool = False,
     ) -> Predictor:
         """Predictor of spectra of an image size by a field alone, with the papers' receiver."""
-        return cls(Graph(field, receivers, Form(PIXEL, (height, width))), params, operator)
+        return cls(Graph(field, receivers, ObservationSpec(PIXEL, (height, width))), params, operator)
 
     @property
     def receivers(self) -> tuple[Receiver, ...]:

@@ -114,21 +114,21 @@ class Steps:
         self._data, self.places = TrainingData.of(plan.targets), places_of(plan.graph)
         self.recorded: dict[Any, StepFunction] = {}
 
-    def take(self, state: FitState, schedule: Schedule, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+    def take(self, state: FitState, schedule: Schedule, non_finite: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """Take the step of a schedule that follows the steps of a state; returns its loss and report."""
         # Slots are rows of the traced side, of which each row has one, however many conditions it has.
         t, targets = state.step, self._plan.targets
         port, rows = int(schedule.receiver[t]), schedule.rows[t]
         slots = mi.UInt32(np.searchsorted(self._plan.known[port], rows // targets.per_row).tolist())
         function = self._function(port, state)
-        batch, step = self.places[port].batch(None, slots), ScheduledStep.of(schedule, t, trouble)
-        state.mean, trouble, loss, view_gradient_norm = function(
+        batch, step = self.places[port].batch(None, slots), ScheduledStep.of(schedule, t, non_finite)
+        state.mean, non_finite, loss, view_gradient_norm = function(
             state.adam, state.mean, self._data, mi.UInt32(rows.tolist()), batch, step
         )
         state.view_gradient_norm += view_gradient_norm
         state.view_gradient_steps += 1
         dr.schedule(state.view_gradient_norm)  # evaluated together with the loop's sum of losses
-        return loss, trouble
+        return loss, non_finite
 
     def _function(self, port: int, state: FitState) -> StepFunction:
         """Recorded step of a port; without paths one serves all, else each search for paths needs another."""
@@ -183,8 +183,8 @@ class Steps:
             # In the receiver's unit, so that learning rates suit observations of any scale.
             prediction = report(params, replace(batch, condition=condition))
             loss = loss_of(prediction * scale, truth, dr.width(rows), *shape)
-            mean, trouble, finite = guarded_step(adam, params, loss, mean, at)
-            result = mean, trouble, dr.detach(loss), _view_gradient_norm(params, batch.pose, finite)
+            mean, non_finite, finite = guarded_step(adam, params, loss, mean, at)
+            result = mean, non_finite, dr.detach(loss), _view_gradient_norm(params, batch.pose, finite)
             dr.eval(adam, result)
             return result
 

@@ -99,7 +99,7 @@ class Trainer(TrainingLoop):
                 state.reach_m = 0.0
         else:
             check_params(plan.graph.field, state.params(), "checkpoint.npz")
-            plan.graph.cover(self.sides, state.params())
+            plan.graph.add_surface_gaussians(self.sides, state.params())
         self.state = state
         # A resumed fit whose state was chosen has the shortened schedule that followed.
         if state.chosen:
@@ -122,7 +122,7 @@ class Trainer(TrainingLoop):
         self.state = FitState(start | same | discs, self.state.adam.beta_1)
         for name in ("chosen", "reach_m", "phase_error", *OF_FIT):
             setattr(self.state, name, getattr(chosen, name))
-        self.plan.graph.cover(self.sides, self.state.params())
+        self.plan.graph.add_surface_gaussians(self.sides, self.state.params())
         self.schedule, self.state.step = self.schedule.after(chosen.chosen)
 
     @property
@@ -202,9 +202,9 @@ class Trainer(TrainingLoop):
         if self.plan.chooses_beside_paths:
             self.state.held_out = self.validation.choose_phase_error(self.predictor(), self.state)
 
-    def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+    def take_step(self, non_finite: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """One optimiser step (`TrainingLoop`)."""
-        return self.steps.take(self.state, self.schedule, trouble)
+        return self.steps.take(self.state, self.schedule, non_finite)
 
     def adapt(self) -> None:
         """One round of density control."""

@@ -69,7 +69,7 @@ class LocatedPositions:
         return np.asarray(np.linalg.norm(self.tx_pos_m[:, :2] - true_m[:, :2], axis=1))
 
     def neighbours_error_m(self, true_m: FloatArray) -> FloatArray | None:
-        """Distances [m] of nearest neighbours from true positions, likewise; None without training rows."""
+        """Distances [m] of nearest neighbours from true positions; None without training rows."""
         near_m = self.neighbours_m
         return None if near_m is None else np.asarray(np.linalg.norm(near_m[:, :2] - true_m[:, :2], axis=1))
 

@@ -20,7 +20,7 @@ from ...core.array_files import keyed, under
 from ...core.settings import names_of
 from ...graph.graph import Graph
 from ...graph.settings import TRACED_NAMES
-from ...receivers.registry import GAPS, Form
+from ...receivers.registry import GAPS, ObservationSpec
 from ...tasks import TASKS
 from ...tasks.conditions import placed_receivers, scene_carrier
 from ...tracing.options import without_effect
@@ -64,7 +64,7 @@ class FittedField(Fitted):
 
     def __init__(self, arrays: Arrays, config: TrainConfig, problem: Problem, store: Path) -> None:
         self._arrays, self._problem, self._store = arrays, problem, store
-        self.config, self.form, self.receivers = config, Form.of(arrays), stored_receivers(arrays)
+        self.config, self.form, self.receivers = config, ObservationSpec.of(arrays), stored_receivers(arrays)
         self.params: Params = under(PARAM, arrays)
         # Of Gaussians that no held-out row gained by, nothing is stored and nothing evaluated.
         used = problem.scene is None or "position" in self.params
@@ -80,7 +80,7 @@ class FittedField(Fitted):
         assert self.receivers is not None
         scene = None if self._problem.scene is None else self._problem.open_scene(form.carrier_hz)
         graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna, config.evaluation)
-        graph.cover((), self.params)
+        graph.add_surface_gaussians((), self.params)
         reach, phase_error = None, float(self._arrays.get(PHASE_ERROR, 0.0))
         if REACH in self._arrays:
             if np.isnan(length_m := float(self._arrays[REACH])):

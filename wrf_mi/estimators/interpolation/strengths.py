@@ -68,8 +68,11 @@ SKEW_DB = 0.4  # shift of predictions a priori, as fades reach deeper than peaks
 OFFSET_SD_DB = 10.0  # standard deviation of the common offset of all receivers about the transmit power a priori
 EXPONENT_SD = (1.0, 0.3)
 """Standard deviations of the exponent of distance about free space's: common, and of each receiver."""
-TRACED_SD = (0.5, 0.2)  # likewise of the factor of the traced decibels about 1
-BODY_PATTERN_DB = (1.0, 0.2)  # likewise of the first harmonic of the transmitter's pattern
+TRACED_SD = (0.5, 0.2)  # standard deviations, common and of each receiver, of the factor of the traced decibels about 1
+BODY_PATTERN_DB = (
+    1.0,
+    0.2,
+)  # standard deviations, common and of each receiver, of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
 EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
 

@@ -103,15 +103,15 @@ class NetworkTrainer(TrainingLoop):
 
         self._step = Recorded(step)
 
-    def take_step(self, trouble: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
+    def take_step(self, non_finite: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """Take the next step of the schedule; returns the loss."""
         state, schedule, t = self.state, self.schedule, self.state.step
         # A new generator for each step: a resumed training draws the same numbers as an uninterrupted training.
         rng = np.random.default_rng([*self._seed, 2, t])
         drawn = self.network.draw(schedule.rows[t], int(schedule.receiver[t]), rng)
-        at = ScheduledStep.of(schedule, t, trouble)
-        state.mean, trouble, loss = self._step(state.adam, state.mean, self.network.data, drawn, at)
-        return loss, trouble
+        at = ScheduledStep.of(schedule, t, non_finite)
+        state.mean, non_finite, loss = self._step(state.adam, state.mean, self.network.data, drawn, at)
+        return loss, non_finite
 
     def validate(self) -> float:
         """Score of the running mean of the weights on the validation rows; NaN without such rows."""

@@ -20,7 +20,7 @@ from ...core.paths import ARRAYS, read_paths_file, save_paths
 from ...core.settings import settings_from
 from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
-from ..search.chains import SPECULAR, Legs
+from ..search.chains import SPECULAR, PathInteractions
 from ..search.surfaces import Surfaces, scene_surfaces
 from ..sionna.materials import absorbs, at_frequency
 from ..sionna.path_solver import Devices, Ends, path_gains
@@ -38,8 +38,9 @@ class TraceResult:
         tx_pos_m: transmitters [n_tx, 3], metres.
         receivers: the ``n_rx`` receivers.
         primitives: triangle of the object at each interaction, int32, shape [p, depth], -1 beyond the last.
-        probability: probability of each random interaction [p, depth], see `wrf_mi.tracing.search.chains.Legs`.
-        wedge: edges of diffraction, see `wrf_mi.tracing.search.chains.Legs`; empty without diffraction.
+        probability: probability of each random interaction [p, depth], see
+            `wrf_mi.tracing.search.chains.PathInteractions`.
+        wedge: edges of diffraction, see `wrf_mi.tracing.search.chains.PathInteractions`; empty without diffraction.
         options: the options of the trace.
         rays: number of rays from each source; differs from ``options.rays`` where that is ``"auto"``.
         from_receivers: whether the search went from receivers to transmitters.
@@ -116,7 +117,7 @@ class TraceResult:
         paths = replace(selected.paths, rx=np.searchsorted(which, selected.paths.rx), n_rx=len(which))
         return replace(selected, paths=paths, receivers=tuple(self.receivers[number] for number in which))
 
-    def legs(self, surfaces: Surfaces) -> Legs:
+    def legs(self, surfaces: Surfaces) -> PathInteractions:
         """The paths in the direction of the search, for Sionna RT; `InputError` of a scene that lacks an object."""
         paths, first = self.paths, np.zeros(len(self.paths.object_names) + 1, np.int64)
         for index, name in enumerate(paths.object_names):
@@ -131,7 +132,9 @@ class TraceResult:
             if self.primitives[met].max() >= surfaces.first_face[number + 1] - first[index]:
                 raise InputError(f"scene: object {name!r} is not the one that the saved paths meet; trace them anew")
         face = np.where(paths.objects >= 0, first[paths.objects] + self.primitives, -1)
-        legs = Legs(paths.tx, paths.rx, paths.interactions, face, paths.vertices_m, self.probability, self.wedge)
+        legs = PathInteractions(
+            paths.tx, paths.rx, paths.interactions, face, paths.vertices_m, self.probability, self.wedge
+        )
         return legs.reverse() if self.from_receivers else legs
 
     def ends(self) -> Ends:
@@ -163,7 +166,7 @@ def paths_with_gain(gain: NDArray[np.inexact[Any]]) -> IntArray:
 def gains_of_receivers(
     scene: Any,
     surfaces: Surfaces,
-    legs: Legs,
+    legs: PathInteractions,
     ends: Ends,
     rays: int,
     receivers: Sequence[Receiver],

@@ -17,7 +17,7 @@ from ...core.antenna import ANTENNA
 from ...core.files import listed
 from ...core.types import FloatArray, IntArray
 from ..options import DEFAULTS, MAX_RAYS, TraceOptions
-from ..search.chains import Legs, ReflectionChains, check_search, join, shoot
+from ..search.chains import PathInteractions, ReflectionChains, check_search, join, shoot
 from ..search.devices import before_surfaces, check_devices, from_behind
 from ..search.images import image_sources, specular_paths
 from ..search.surfaces import Surfaces, scene_surfaces
@@ -179,6 +179,7 @@ def trace_paths(
         ValueError: positions of another shape or not finite.
         InputError: no transmitter or no receiver, or an antenna inside a solid object.
     """
+    # Positions and devices, checked.
     positions, devices = _stated_devices(tx_pos_m, receivers)
     shared = prepared or Prepared(scene)
     if check:
@@ -186,21 +187,26 @@ def trace_paths(
         shared.report_scattering(options)
     # Devices are placed before the surfaces that they are on.
     positions, devices = shared.placed(positions, devices)
-    # Rays leave the receivers, as each takes a second, but for fields that are not reciprocal.
+
+    # The side that rays leave from: the receivers, as each takes a second, but for fields that are not reciprocal.
     side = search_from or ("transmitters" if options.sampled else "receivers")
     swap = side == "receivers" and not options.diffraction
     transmitters, rx_devices = device_ends(positions, devices, tx_antenna)
     ends = (rx_devices, transmitters) if swap else (transmitters, rx_devices)
     sources, targets = ends[0].position_m, ends[1].position_m
     rays = shared.rays(sources, targets, options)
-    # Paths, then their gains by Sionna RT's field calculator, which knows diffraction and scattering.
+
     with scattering_materials(scene, options):
+        # Search: interactions of all paths, chunk by chunk.
         legs = _search(shared, sources, targets, options, rays, progress)
+
+        # Gains by Sionna RT's field calculator, which knows diffraction and scattering.
         gain = np.full(len(legs), np.nan, np.complex128)
         if gains:
             receiver = legs.source if swap else legs.target
             gain = gains_of_receivers(scene, shared.surfaces, legs, ends, rays, devices, receiver)
-        # Sorted from transmitters to receivers, with each triangle's number in its object, as in a file.
+
+        # Result: sorted from transmitters to receivers, with each triangle's number in its object, as in a file.
         paths, legs = _paths(legs.reverse() if swap else legs, gain, shared.surfaces, positions, rx_devices.position_m)
         primitives = np.where(legs.face >= 0, legs.face - shared.surfaces.first_face[paths.objects], -1)
         hz, arrays = float(scene.frequency[0]), (primitives.astype(np.int32), legs.probability, legs.wedge)
@@ -234,7 +240,7 @@ def _warn_of_silence(paths: Paths, tx_pos_m: FloatArray, receivers: Sequence[Rec
 
 def _search(
     shared: Prepared, sources: FloatArray, targets: FloatArray, options: TraceOptions, rays: int, progress: bool
-) -> Legs:
+) -> PathInteractions:
     parts = []
     with Progress(console=Console(stderr=True), transient=True, disable=not progress) as bar:
         task = bar.add_task("tracing paths", total=len(sources) * len(targets))
@@ -288,7 +294,7 @@ def spread(count: int, most: int) -> IntArray:
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
-def _lengths(legs: Legs, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
+def _lengths(legs: PathInteractions, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
     """Unfolded lengths [p] in float64."""
     # From point to point: beyond the last interaction the point stays, which adds nothing.
     point, length = sources_m[legs.source], np.zeros(len(legs))
@@ -300,8 +306,8 @@ def _lengths(legs: Legs, sources_m: FloatArray, targets_m: FloatArray) -> FloatA
 
 
 def _paths(
-    legs: Legs, gain: NDArray[np.complex128], surfaces: Surfaces, tx_pos_m: FloatArray, rx_pos_m: FloatArray
-) -> tuple[Paths, Legs]:
+    legs: PathInteractions, gain: NDArray[np.complex128], surfaces: Surfaces, tx_pos_m: FloatArray, rx_pos_m: FloatArray
+) -> tuple[Paths, PathInteractions]:
     """Paths sorted by receiver, transmitter and length, and the legs (from transmitters to receivers) in that order."""
     length = _lengths(legs, tx_pos_m, rx_pos_m)
     # Faces in order decide between equal lengths, as in mirrored rooms: the order is that of every run.

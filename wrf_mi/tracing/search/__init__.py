@@ -5,7 +5,7 @@ Module by module, in the order of a search:
 - `surfaces`: triangles of the scene in float64, their planes, and the same closed at seams, for rays;
 - `devices`: antennas on, behind and inside surfaces;
 - `chains`: rays from a source find sequences of planes that may reflect; bounds of planes rule most of them out; and
-  `Legs`, the result, interactions of each path;
+  `PathInteractions`, the result, interactions of each path;
 - `images`: the image method, points of reflection in float64;
 - `visibility`: rays along the legs of candidates find what obstructs them, or is passed; at edges, float64 does.
 

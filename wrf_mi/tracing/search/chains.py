@@ -22,7 +22,14 @@ from .surfaces import Surfaces
 logger = logging.getLogger(__name__)
 
 SPECULAR, TRANSMISSION = 1, 4  # values of Sionna RT's ``InteractionType``
-ARRAYS = ("source", "target", "interactions", "face", "vertices_m", "probability")  # fields of `Legs` by path
+ARRAYS = (
+    "source",
+    "target",
+    "interactions",
+    "face",
+    "vertices_m",
+    "probability",
+)  # fields by path
 PAIRS_PER_CHUNK = 1 << 24  # pairs of chain and position in a chunk: 64 MiB for each single-precision array
 RAYS_PER_CHUNK = 1 << 20  # rays in a chunk
 MARGIN_M = 1e-3  # slack of the bounds of planes
@@ -37,7 +44,7 @@ _kept: OrderedDict[tuple[Any, ...], IntArray] = OrderedDict()
 
 
 @dataclass(frozen=True)
-class Legs:
+class PathInteractions:
     """Interactions of p paths from source to target, the input of Sionna RT's stages."""
 
     source: IntArray  # index of the point from which each path comes, shape [p]
@@ -51,12 +58,12 @@ class Legs:
     def __len__(self) -> int:
         return len(self.source)
 
-    def select(self, which: NDArray[Any] | slice) -> Legs:
+    def select(self, which: NDArray[Any] | slice) -> PathInteractions:
         """The paths of a mask or of indices."""
         wedge = {name: array[which] for name, array in self.wedge.items()}
-        return Legs(**{name: getattr(self, name)[which] for name in ARRAYS}, wedge=wedge)
+        return PathInteractions(**{name: getattr(self, name)[which] for name in ARRAYS}, wedge=wedge)
 
-    def reverse(self) -> Legs:
+    def reverse(self) -> PathInteractions:
         """The same paths from target to source; edges of diffraction keep the faces of the original direction."""
         depth = self.interactions.shape[1]
         last = np.count_nonzero(self.interactions, axis=1)[:, None] - 1
@@ -66,13 +73,15 @@ class Legs:
         return replace(self, source=self.target, target=self.source, **arrays)
 
 
-def join(parts: list[Legs]) -> Legs:
+def join(parts: list[PathInteractions]) -> PathInteractions:
     """Concatenate legs of the same depth."""
     wedge: dict[str, NDArray[Any]] = {}
     for name, like in next((part.wedge for part in parts if part.wedge), {}).items():
         zeros = [np.zeros((len(part), *like.shape[1:]), like.dtype) for part in parts]
         wedge[name] = np.concatenate([part.wedge.get(name, zero) for part, zero in zip(parts, zeros, strict=True)])
-    return Legs(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}, wedge=wedge)
+    return PathInteractions(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}, wedge=wedge
+    )
 
 
 @dataclass(frozen=True)

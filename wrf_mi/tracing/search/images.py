@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
-from .chains import SPECULAR, Legs, ReflectionChains, join, possible
+from .chains import SPECULAR, PathInteractions, ReflectionChains, join, possible
 from .devices import before_surfaces, clear_m
 from .surfaces import Surfaces
 from .visibility import reflect_on_faces, unobstructed
@@ -68,7 +68,7 @@ def meeting_point(
 
 def specular_paths(
     surfaces: Surfaces, chains: ReflectionChains, sources_m: FloatArray, targets_m: FloatArray, options: TraceOptions
-) -> Legs:
+) -> PathInteractions:
     """Unobstructed paths, exact in float64, from sources [s, 3] to targets [n, 3], metres, by chains from sources."""
     depth = max(options.depth, 1)
     direct = np.arange(len(sources_m) * len(targets_m) if options.line_of_sight else 0)
@@ -93,7 +93,9 @@ def specular_paths(
         met = unobstructed(surfaces, vertices[row], plane[row], depth, options.transmission and options.depth > 0)
         is_path = row[met.candidate]
         exhaustive = np.ones(met.face.shape, np.float32)
-        single = Legs(source[is_path], target[is_path], met.interactions, met.face, met.points_m, exhaustive, {})
+        single = PathInteractions(
+            source[is_path], target[is_path], met.interactions, met.face, met.points_m, exhaustive, {}
+        )
         exact = _exact(surfaces, chains, chain[is_path], single, sources_m, targets_m)
         valid = reflect_on_faces(surfaces, exact)
         parts.append(exact if valid.all() else exact.select(valid))
@@ -154,10 +156,10 @@ def _exact(
     surfaces: Surfaces,
     chains: ReflectionChains,
     chain: IntArray,
-    single: Legs,
+    single: PathInteractions,
     sources_m: FloatArray,
     targets_m: FloatArray,
-) -> Legs:
+) -> PathInteractions:
     """Vertices in float64, from the target back to the images of the source: single precision loses the phase."""
     point, vertices = targets_m[single.target], single.vertices_m.copy()
     reflected = np.cumsum(single.interactions == SPECULAR, axis=1)

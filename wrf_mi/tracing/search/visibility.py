@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from trimesh.triangles import closest_point
 
 from ...core.types import FloatArray, IntArray
-from .chains import SPECULAR, TRANSMISSION, Legs
+from .chains import SPECULAR, TRANSMISSION, PathInteractions
 from .surfaces import ENLARGED, Surfaces
 
 STEP = 5e-7
@@ -40,7 +40,7 @@ PAIRS_TOGETHER = 1 << 20  # pairs of points and planes, or faces, in a chunk
 UNKNOWN_FACE = (1 << 31) - 1  # face of a reflection that rays cannot distinguish from another one at the same point
 
 
-class Met(NamedTuple):
+class ValidPaths(NamedTuple):
     """Paths and what they meet."""
 
     candidate: IntArray  # indices of the candidates that are paths [k]
@@ -48,9 +48,9 @@ class Met(NamedTuple):
     face: IntArray  # faces [k, depth], -1 beyond the last
     points_m: FloatArray  # points in single precision [k, depth, 3], metres, NaN beyond the last
 
-    def select(self, which: NDArray[Any]) -> Met:
+    def select(self, which: NDArray[Any]) -> ValidPaths:
         """The paths of a mask or of indices."""
-        return Met(*(array[which] for array in self))
+        return ValidPaths(*(array[which] for array in self))
 
     @property
     def leg(self) -> IntArray:
@@ -59,7 +59,9 @@ class Met(NamedTuple):
         return np.cumsum(reflects, axis=1) - reflects
 
 
-def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, depth: int, transmission: bool) -> Met:
+def unobstructed(
+    surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, depth: int, transmission: bool
+) -> ValidPaths:
     """Candidates that are paths: what obstructs none of their legs, and at each reflection the plane that reflects.
 
     No vertex but those of reflection of ``vertices_m`` [n, b + 2, 3], source, points of reflection and target in
@@ -75,7 +77,7 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
     size, legs = len(plane), plane.shape[1] + 1
     if not size or not len(surfaces.triangles):
         nothing = np.zeros((size, depth), np.uint8)
-        return Met(np.arange(size), nothing, nothing.astype(np.int64) - 1, np.full((*nothing.shape, 3), np.nan))
+        return ValidPaths(np.arange(size), nothing, nothing.astype(np.int64) - 1, np.full((*nothing.shape, 3), np.nan))
     scene, plane_of = surfaces.screens, surfaces.faces_on_device[1]
     lane = dr.arange(mi.UInt32, size)
     vertices = to_vectors(vertices_m.reshape(-1, 3) - surfaces.centre_m, mi.Point3f)
@@ -154,7 +156,7 @@ def unobstructed(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, de
     kinds = np.where(code >= REFLECTS, SPECULAR, TRANSMISSION)
     points_m = np.moveaxis(points.numpy().reshape(3, size, depth), 0, -1)[is_path].astype(float)
     inside = np.where(used[..., None], points_m + surfaces.centre_m, np.nan)
-    met = Met(is_path, np.where(used, kinds, 0).astype(np.uint8), np.where(used, code % REFLECTS, -1), inside)
+    met = ValidPaths(is_path, np.where(used, kinds, 0).astype(np.uint8), np.where(used, code % REFLECTS, -1), inside)
     return with_crossings(surfaces, vertices_m[is_path], plane[is_path], met, transmission)
 
 
@@ -187,7 +189,9 @@ class _Crossings(NamedTuple):
 _Near = tuple[IntArray, IntArray, FloatArray]  # indices of points on planes, a plane near each, and the points
 
 
-def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met, transmission: bool) -> Met:
+def with_crossings(
+    surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: ValidPaths, transmission: bool
+) -> ValidPaths:
     """Paths with the surfaces that they cross at points of reflection; without those that are obstructed there."""
     # Of k paths as of `unobstructed`, and what rays met away from the points of reflection, with `UNKNOWN_FACE`, in
     # whose place the nearest face is put, if there is one at the point.
@@ -224,7 +228,7 @@ def with_crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, 
     return met if valid.all() else met.select(is_clear)
 
 
-def _inserted(met: Met, further: _Crossings, vertices_m: FloatArray) -> tuple[Met, NDArray[np.bool_]]:
+def _inserted(met: ValidPaths, further: _Crossings, vertices_m: FloatArray) -> tuple[ValidPaths, NDArray[np.bool_]]:
     """Paths [k] with further transmissions, and the mask of those that are not too deep."""
     path, slot = np.nonzero(met.interactions)
     mirrors, leg = met.interactions[path, slot] == SPECULAR, met.leg[path, slot]
@@ -240,13 +244,15 @@ def _inserted(met: Met, further: _Crossings, vertices_m: FloatArray) -> tuple[Me
     paths = paths[order]
     slots = np.arange(len(paths)) - np.searchsorted(paths, paths)
     within = slots < met.face.shape[1]
-    longer = Met(met.candidate, np.zeros_like(met.interactions), np.full_like(met.face, -1), met.points_m * np.nan)
+    longer = ValidPaths(
+        met.candidate, np.zeros_like(met.interactions), np.full_like(met.face, -1), met.points_m * np.nan
+    )
     for array, values in ((longer.interactions, kinds), (longer.face, faces), (longer.points_m, points)):
         array[paths[within], slots[within]] = values[within]
     return longer, np.bincount(paths, minlength=len(met.face)) <= met.face.shape[1]
 
 
-def reflect_on_faces(surfaces: Surfaces, legs: Legs) -> NDArray[np.bool_]:
+def reflect_on_faces(surfaces: Surfaces, legs: PathInteractions) -> NDArray[np.bool_]:
     """Mask of paths [p] whose points of reflection are on faces, and not beside them where rays meet enlarged ones."""
     path, slot = np.nonzero(legs.interactions == SPECULAR)
     points, face = legs.vertices_m[path, slot], legs.face[path, slot]
@@ -276,7 +282,7 @@ def nearest_faces(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> 
     return face, away_m
 
 
-def _crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: Met) -> _Crossings:
+def _crossings(surfaces: Surfaces, vertices_m: FloatArray, plane: IntArray, met: ValidPaths) -> _Crossings:
     """All crossings of faces within `NEAR` of a point where a path meets another surface, each leg and plane once."""
     path, level = np.nonzero(plane >= 0)
     row, slot = np.nonzero(met.interactions == TRANSMISSION)

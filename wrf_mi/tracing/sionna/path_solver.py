@@ -22,7 +22,7 @@ from ...core import Antenna
 from ...core.angles import FloatArray
 from ...core.antenna import MountedAntenna
 from ..options import TraceOptions
-from ..search.chains import SPECULAR, TRANSMISSION, Legs, join
+from ..search.chains import SPECULAR, TRANSMISSION, PathInteractions, join
 from ..search.images import image_sources
 from ..search.surfaces import Surfaces
 from .diffraction import diffraction_matrix
@@ -67,7 +67,7 @@ def sionna_orientation(to_world: ArrayLike) -> FloatArray:
         return np.asarray(Rotation.from_matrix(to_world).as_euler("ZYX"))
 
 
-def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
+def to_buffer(legs: PathInteractions, surfaces: Surfaces) -> Any:
     """A ``PathsBuffer`` of these paths."""
     import drjit as dr
     import mitsuba as mi
@@ -106,7 +106,7 @@ def to_buffer(legs: Legs, surfaces: Surfaces) -> Any:
     return buffer
 
 
-def from_buffer(buffer: Any, surfaces: Surfaces) -> Legs:
+def from_buffer(buffer: Any, surfaces: Surfaces) -> PathInteractions:
     """The valid paths in a buffer."""
     import drjit as dr
 
@@ -123,12 +123,12 @@ def from_buffer(buffer: Any, surfaces: Surfaces) -> Legs:
     wedges = buffer.diffracting_wedges
     wedge = {} if wedges is None else {name: getattr(wedges, name).numpy().T[valid] for name in WEDGE}
     source, target = (index.numpy()[valid].astype(np.int64) for index in (buffer.source_indices, buffer.target_indices))
-    return Legs(source, target, types, face, vertices, buffer.probs.numpy()[valid], wedge)
+    return PathInteractions(source, target, types, face, vertices, buffer.probs.numpy()[valid], wedge)
 
 
 def sampled_paths(
     scene: Any, surfaces: Surfaces, source_m: FloatArray, targets_m: FloatArray, options: TraceOptions, rays: int
-) -> Legs:
+) -> PathInteractions:
     """Paths from a source [3] to targets [n, 3], metres, that scatter or diffract; vertices in single precision."""
     import drjit as dr
     import mitsuba as mi
@@ -331,7 +331,7 @@ def sionna_pattern(antenna: Antenna, receives: bool = False) -> Any:
     return PolarizedAntennaPattern(v_pattern=vertical, **how).patterns[0]
 
 
-def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int) -> NDArray[np.complex128]:
+def path_gains(scene: Any, surfaces: Surfaces, legs: PathInteractions, ends: Ends, rays: int) -> NDArray[np.complex128]:
     """Complex gains [p] of paths, without the phase exp(-j k length); NaN where single precision has none."""
     import drjit as dr
 
@@ -345,8 +345,8 @@ def path_gains(scene: Any, surfaces: Surfaces, legs: Legs, ends: Ends, rays: int
     return gain
 
 
-def apart(legs: Legs, surfaces: Surfaces, ends: Ends) -> Legs:
-    """Legs whose points of specular paths lie `SHORT` apart at least, so that each leg has a direction."""
+def apart(legs: PathInteractions, surfaces: Surfaces, ends: Ends) -> PathInteractions:
+    """PathInteractions whose points of specular paths lie `SHORT` apart at least, so that each leg has a direction."""
     # Sionna RT takes directions from points, which coincide where a path is reflected in an edge.
     count = np.count_nonzero(legs.interactions, axis=1)
     points = np.concatenate([ends[0].position_m[legs.source, None], legs.vertices_m], axis=1)
