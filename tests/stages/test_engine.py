@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +106,26 @@ def test_best_option_is_taken_and_reported(levels: list[tuple[str, float, int]],
     assert {rows for _, rows in fits[:-1]} == {len(fold.all_train)}
     assert engine.unseen is not None
     assert len(engine.unseen.mean) == len(fold.test)
+
+
+@dataclass
+class Chained(Levels):
+    """Levels, each of which goes on from the one before."""
+
+    def options(self, problem: Problem, split: Split) -> Sequence[Option]:
+        options = super().options(problem, split)
+        return [options[0]] + [each._replace(after=before.name) for before, each in pairwise(options)]
+
+
+@pytest.mark.parametrize(("level", "tried"), [(-51.5, True), (-52.0, False)])
+def test_an_option_is_tried_where_the_one_it_goes_on_from_gained(level, tried, tmp_path: Path) -> None:
+    levels, fits = [("stated", -52.0, 0), ("second", level, 1), ("third", -50.0, 2)], list[tuple[str, int]]()
+    engine = engine_of(tmp_path, [Chained(levels, fits)])
+    engine.fit()
+    assert ("third" in {name for name, _ in fits}) is tried
+    reports = {report.option: report for report in engine.reports}
+    assert reports["third"].taken is tried
+    assert ("second, which it goes on from, is no better than stated" in reports["third"].why) is not tried
 
 
 @pytest.mark.parametrize(("level", "tried"), [(-50.5, True), (-52.0, False)])
