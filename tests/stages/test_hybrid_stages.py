@@ -229,11 +229,11 @@ def test_reports_of_held_out_rows_are_those_of_a_fit_without_them() -> None:
 @pytest.mark.parametrize("task", ["rssi", "csi"])
 def test_strengths_and_channels_are_fitted_in_stages(task: str, scenes: dict[str, Path], tmp_path: Path) -> None:
     record, split = measured(scenes, task)
-    settings = QUICK if task == "csi" else ()  # no field, whose steps these are, for powers of uncertain positions
+    settings = QUICK if task == "csi" else ()  # nothing is trained for powers of uncertain positions
     run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=settings)
     names = [report["stage"] for report in run.metrics["stages"]]
     assert (names[0], names[-1]) == ("mean", "residual")
-    assert ("field" in names) == (task == "csi")
+    assert ("surfaces" in names) == (task == "csi")
     assert_restored(run, record)
 
 
