@@ -64,6 +64,7 @@ class GaussianAttribute(ABC):
         return {self.name if self.size == 1 else f"{self.name}_{k}": each for k, each in enumerate(values)}
 
 
+NO_ATTRIBUTES: tuple[GaussianAttribute, ...] = ()  # those of the fields of this package
 ATTRIBUTES: Registry[GaussianAttribute] = Registry("attribute of Gaussians", "wrf_mi.gaussian_attributes", {})
 
 

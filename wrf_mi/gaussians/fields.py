@@ -8,13 +8,12 @@ whatever float type the tensors have.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import drjit as dr
 import numpy as np
 
 from ..core import InputError
-from .attributes import GaussianAttribute
+from .attributes import NO_ATTRIBUTES
 from .initial import InitialGaussians
 from .network import Params, Weights, dense, dense_of_pairs, encode, encoded_size, init_layer, linear
 from .parameters import Gaussians, common_geometry, logistic, rows, scheduled
@@ -89,7 +88,7 @@ class WrfGs:
     signal_widths: tuple[int, int] = (128, 64)
     components: int = 1
 
-    attributes: ClassVar[tuple[GaussianAttribute, ...]] = ()  # further ones, see `wrf_mi.gaussians.attributes`
+    attributes = NO_ATTRIBUTES  # further ones, see `wrf_mi.gaussians.attributes`
     blending = "product"
     per_gaussian = GEOMETRY
     static_geometry = True
@@ -158,7 +157,7 @@ class WrfGsPlus:
     static_geometry: bool = False
     components: int = 1
 
-    attributes: ClassVar[tuple[GaussianAttribute, ...]] = ()
+    attributes = NO_ATTRIBUTES
     blending = "alpha"
     per_gaussian = (*GEOMETRY, "opacity", "signal")
     signal_parameters = ("signal", "deform.")
@@ -248,7 +247,7 @@ class Factorised:
     width: int = 128
     components: int = 1
 
-    attributes: ClassVar[tuple[GaussianAttribute, ...]] = ()
+    attributes = NO_ATTRIBUTES
     blending = "alpha"
     static_geometry = True
     per_gaussian = (*GEOMETRY, "opacity", "signal")
