@@ -176,7 +176,7 @@ def test_channels_are_stored_and_reproducible(walked: Record, tmp_path: Path) ->
 
 def test_record_has_the_stated_shapes_and_splits(walked: Record) -> None:
     rows = len(PLACES["flat"]().routes) * WALK.places
-    assert (walked.name, walked.task, len(walked)) == ("traced-csi-flat", "csi", rows)
+    assert (walked.name, walked.task.name, len(walked)) == ("traced-csi-flat", "csi", rows)
     assert walked.observation.shape == walked.truth.shape == (1, *walked.uplink.shape) == (1, rows, 6, 26)
     assert walked.has_positions
     assert np.abs(walked.truth).max(axis=(0, 2, 3)).min() > 0
