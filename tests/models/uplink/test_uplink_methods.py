@@ -227,6 +227,9 @@ def test_captures_without_a_pose_are_fitted_and_predicted(name, known, walk):
     assert (predicted.shape, predicted.dtype) == ((5, 6, HALF), np.complex64)
     assert np.isfinite(predicted).all()
     assert np.abs(predicted).min() > 0
+    if name != "nerf2":  # which refuses rows of which nothing was received
+        silent = replace(inputs, uplink=np.zeros_like(inputs.uplink))
+        assert np.isfinite(fitted.predict(silent, 0).mean).all()
     if name in ("linear", "r2f2", "optml"):
         assert np.median(cea_db(predicted, record.observation[0][split.test])) > 15
     blank = Problem(replace(record, observation=np.zeros_like(record.observation)), None)

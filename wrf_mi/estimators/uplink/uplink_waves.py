@@ -296,7 +296,7 @@ class ArrayWaves(Waves):
         carrier *= _turn(length * offset.min())
         ones = _turn(length[..., None] * (spacing * np.arange(8)))
         eights = _turn(length[..., None] * (spacing * 8 * np.arange(order.max() // 8 + 1))) * carrier[..., None]
-        beat = (eights[..., None] * ones[..., None, :]).reshape(*length.shape, -1)
+        beat = (eights[..., None] * ones[..., None, :]).reshape(*length.shape, 8 * eights.shape[-1])
         return np.asarray(beat[..., : len(order)] if (np.diff(order) == 1).all() else beat[..., order])
 
     def _slopes(self, theta: FloatArray) -> tuple[Complex, FloatArray]:
