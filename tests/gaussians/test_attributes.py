@@ -72,7 +72,7 @@ def test_attribute_changes_signals_of_any_field(name: str, roughness: Any) -> No
 
 def test_density_control_follows_the_rule_of_the_attribute(roughness: Any) -> None:
     before = {"roughness": np.float32([[0.3, 0.4]])}
-    grown = grown_attributes((roughness,), before, np.array([0, 1, 1]))
+    grown = grown_attributes(WithAttributes(None, (roughness,)), before, np.array([0, 1, 1]))
     np.testing.assert_array_equal(grown["roughness"], np.float32([[0.3, 0.05, 0.05]]))
 
 

@@ -64,7 +64,6 @@ class GaussianAttribute(ABC):
         return {self.name if self.size == 1 else f"{self.name}_{k}": each for k, each in enumerate(values)}
 
 
-NO_ATTRIBUTES: tuple[GaussianAttribute, ...] = ()  # those of the fields of this package
 ATTRIBUTES: Registry[GaussianAttribute] = Registry("attribute of Gaussians", "wrf_mi.gaussian_attributes", {})
 
 
@@ -110,6 +109,11 @@ class WithAttributes:
         return gaussians
 
 
+def attributes_of(field: Any) -> tuple[GaussianAttribute, ...]:
+    """Further attributes of a field's Gaussians; most fields have none."""
+    return field.attributes if isinstance(field, WithAttributes) else ()
+
+
 def with_attributes(field: Any, names: str) -> Any:
     """A field with registered attributes of some names, separated by commas; "": the field itself.
 
@@ -125,8 +129,8 @@ def with_attributes(field: Any, names: str) -> Any:
 
 
 def grown_attributes(
-    attributes: tuple[GaussianAttribute, ...], before: Mapping[str, NDArray[np.float32]], source: IntArray
+    field: Any, before: Mapping[str, NDArray[np.float32]], source: IntArray
 ) -> dict[str, NDArray[np.float32]]:
-    """Attributes after a round of density control, by their names; arguments as `GaussianAttribute.grown`."""
+    """Attributes of a field after a round of density control, by their names; as `GaussianAttribute.grown`."""
     divided = np.bincount(source)[source] > 1
-    return {each.name: each.grown(before[each.name], source, divided) for each in attributes}
+    return {each.name: each.grown(before[each.name], source, divided) for each in attributes_of(field)}

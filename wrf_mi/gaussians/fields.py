@@ -13,7 +13,6 @@ import drjit as dr
 import numpy as np
 
 from ..core import InputError
-from .attributes import NO_ATTRIBUTES
 from .initial import InitialGaussians
 from .network import Params, Weights, dense, dense_of_pairs, encode, encoded_size, init_layer, linear
 from .parameters import Gaussians, common_geometry, logistic, rows, scheduled
@@ -88,7 +87,6 @@ class WrfGs:
     signal_widths: tuple[int, int] = (128, 64)
     components: int = 1
 
-    attributes = NO_ATTRIBUTES  # further ones, see `wrf_mi.gaussians.attributes`
     blending = "product"
     per_gaussian = GEOMETRY
     static_geometry = True
@@ -157,7 +155,6 @@ class WrfGsPlus:
     static_geometry: bool = False
     components: int = 1
 
-    attributes = NO_ATTRIBUTES
     blending = "alpha"
     per_gaussian = (*GEOMETRY, "opacity", "signal")
     signal_parameters = ("signal", "deform.")
@@ -247,7 +244,6 @@ class Factorised:
     width: int = 128
     components: int = 1
 
-    attributes = NO_ATTRIBUTES
     blending = "alpha"
     static_geometry = True
     per_gaussian = (*GEOMETRY, "opacity", "signal")

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ..backend.device import Recorded, on_device, to_float, to_tensor
 from ..backend.vectors import Complex, Pose
 from ..core import InputError, Receiver
+from ..gaussians.attributes import attributes_of
 from ..gaussians.tiles import TiledPlane, perception_plane
 from ..graph.graph import LEVEL, Batch, Graph, Report
 from ..graph.settings import TRACED_NAMES
@@ -156,8 +157,7 @@ class Steps:
         o, traced = self._plan.config.optimiser, self._plan.graph.traced
         rates = {name: getattr(o, name) for name in ("position", "rotation", "opacity", "signal")}
         rates |= {"log_scale": o.scale, LEVEL: o.level}
-        if (field := self._plan.graph.field) is not None:
-            rates |= {attribute.name: attribute.rate for attribute in field.attributes}
+        rates |= {attribute.name: attribute.rate for attribute in attributes_of(self._plan.graph.field)}
         # Parameters of networks have a dot in their names (`wrf_mi.gaussians.network.init_layer`).
         unknown = [name for name in names if "." not in name and name not in rates]
         if unknown:

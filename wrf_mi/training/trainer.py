@@ -219,7 +219,7 @@ class Trainer(TrainingLoop):
         # A field that starts with more Gaussians than the limit keeps them, and does not grow.
         most = max(density.max_gaussians, self.config.initial.gaussians)
         change = adapt(params, gradient, distance, rng, density.growth_fraction, most)
-        change.parameters.update(grown_attributes(self.field.attributes, params, change.source))
+        change.parameters.update(grown_attributes(self.field, params, change.source))
         state.change_density(change)
         self.record_functions()
         rounds, every = sorted(self.schedule.density), density.reset_every

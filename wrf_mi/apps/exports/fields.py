@@ -15,6 +15,7 @@ from ...core.array_files import keyed, stored_arrays, under, write_arrays
 from ...core.carriers import carriers_text
 from ...core.files import atomic_folder, one_line, readable, write_atomically
 from ...estimators.gaussian.model import PARAM, FittedField
+from ...gaussians.attributes import attributes_of
 from ...gaussians.parameters import Gaussians
 from ...runs.folder import CONFIG, FITTED, METRICS, SPLIT, check_format, check_new
 from ...runs.run import Run, open_run
@@ -97,8 +98,7 @@ def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, A
     with dr.suspend_grad():
         gaussians = field.predictor.gaussians(tx_pos_m, log_carrier)
     columns = splat_columns(gaussians)
-    assert field.field is not None
-    for attribute in field.field.attributes:
+    for attribute in attributes_of(field.field):
         of_attribute = attribute.columns(field.params[attribute.name])
         columns |= {name: values.astype(np.float32) for name, values in of_attribute.items()}
     where = " ".join(f"{x:.9g}" for x in tx_pos_m[0])
