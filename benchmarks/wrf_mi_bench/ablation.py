@@ -34,7 +34,7 @@ from wrf_mi.tasks.scores import bootstrap
 from wrf_mi.training.selection import hold_out
 
 from .bench import FLAT
-from .comparison import measured_on, say, stored_part
+from .comparison import line, measured_on, say, stored_part
 from .declared import pivoted
 
 CAMPUS, FLOOR = "duke-cbrs", "wifi-office"  # folders of measured data beside the known data sets
@@ -88,7 +88,7 @@ def records(folder: Path) -> Iterator[tuple[Record, int | None]]:
         if name != FLAT and not place.exists():
             raise InputError(f"{name}: not in {data_home()}; give a folder of measured data by WRF_MI_DATA")
         if name == FLOOR and not (folder / name).exists():
-            train, test = (str(place / f"database_office_{part}.csv") for part in ("train", "test"))
+            train, test = ([str(place / f"database_office_{part}.csv")] for part in ("train", "test"))
             wrf_mi.import_measurements(train, folder / name, test=test, pitch_m=0.6)
         yield load(name if name == FLAT else folder / name if name == FLOOR else place), count
 
@@ -148,6 +148,7 @@ def main() -> dict[str, Any]:
         row["gain"] = f"{row['held_out']:+.2f} ({interval}); {row['test']:+.2f}"
         if row["mechanism"] == ALL:
             row["gain"] = f"{row['held_out_db']:.2f}; {row['test_db']:.2f}"
+        row |= line(f"{row['cell']}: {row['mechanism']}", row["gain"])
     return {"rows": rows, "measured": measured_on(parts)}
 
 
