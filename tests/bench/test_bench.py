@@ -26,7 +26,7 @@ NEEDS_NO_DATA = {
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
     **dict.fromkeys(("operator", "waits"), "speed.md"),
-    "stages": "hybrid.md",
+    **dict.fromkeys(("stages", "ablation"), "hybrid.md"),
     **{"rooms": "correction.md", "locate": "locate.md", "moved": "scenes.md"},
     **dict.fromkeys(("fdtd", "far-scans"), "correction.md"),
     **{"reception": "maps.md", "plan": "maps.md", "closed-forms": "numerics.md"},
