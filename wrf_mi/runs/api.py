@@ -162,7 +162,7 @@ def train(
         session = Session(folder, folder, on_progress, stop, scheduler, progress)
         with _noting_resumption(folder):
             _complete(folder, config, problem, session)
-    run = Run(folder, problem.record, kept=scene)
+    run = Run(folder, problem.record, owner=scene)
     if out is None:
         weakref.finalize(run, shutil.rmtree, folder, ignore_errors=True)
     return run

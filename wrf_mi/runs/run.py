@@ -48,7 +48,7 @@ class Run:
         record: data that the model was fitted to; None: the data set that the folder names.
         operator: learned fields predict by operator where they can.
         scene: edited copy of the scene that the model was fitted in, to predict in; None: that scene.
-        kept: what lives as long as the run, such as a scene in a temporary folder.
+        owner: object that is kept alive with the run, such as a scene in a temporary folder.
 
     >>> import wrf_mi
     >>> run = wrf_mi.train("laboratory", "idw", n_train=20)
@@ -60,7 +60,7 @@ class Run:
     record: Record | None = field(default=None, repr=False, compare=False)
     operator: bool = True
     scene: str | Path | None = None
-    kept: Any = field(default=None, repr=False, compare=False)
+    owner: Any = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Accept the folder's name as text."""
@@ -107,7 +107,7 @@ class Run:
 
     def in_scene(self, scene: str | Path | Any) -> Run:
         """The run in an edited copy of its scene, a `wrf_mi.Scene` or folder; of hybrids, of the corrected scene."""
-        return replace(self, scene=getattr(scene, "folder", scene), kept=(self.kept, scene))
+        return replace(self, scene=getattr(scene, "folder", scene), owner=(self.owner, scene))
 
     @property
     def receivers(self) -> tuple[Receiver, ...]:

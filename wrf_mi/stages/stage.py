@@ -35,7 +35,9 @@ class Option(NamedTuple):
     #: Options of equal freedom compete by their mean score of held-out rows; one of more freedom is taken where its
     #: gain is clear (`wrf_mi.training.selection.last_gain`).
     freedom: int = 0
-    after: str = ""  # option that it goes on from: it is tried where that one is not clearly behind another
+    #: option that it goes on from: it is tried where that one is not clearly behind another, and where that one has
+    #: itself gained, if it goes on from a third
+    after: str = ""
 
 
 class Stage(ABC):
