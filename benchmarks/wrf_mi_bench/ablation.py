@@ -53,7 +53,7 @@ class Mechanism:
 
     @property
     def lines(self) -> int:
-        """Lines of that code."""
+        """Lines of that source, comments and docstrings among them."""
         return sum(len(inspect.getsource(part).splitlines()) for part in self.code)
 
 

@@ -29,10 +29,8 @@ Slopes = Callable[[ComplexArray, IntArray], FloatArray]
 """Changes of reports by changes [k, values] of signals of the rows ``which`` [k]."""
 Sums = Literal["fields", "elements", "powers"]
 """Sums over paths: of fields at one antenna on each subcarrier, of fields at the elements of an array, or of powers."""
-GAPS = (
-    "frequencies_hz",
-    "floor_db",
-)  # attributes of a specification that may be NaN: unknown, or none
+GAPS = ("frequencies_hz", "floor_db")
+"""Attributes of a specification that may be NaN: unknown, or none."""
 
 
 @dataclass(frozen=True)

@@ -139,9 +139,7 @@ class Engine:
                 continue
             scores, left = self._judged[stage.name], dict[str, str]()
             for done, option in enumerate(options):
-                before = next((other.after for other in options if other.name == option.after), "")
-                why = self._why_omitted(option.after, before, scores) if option.after else ""
-                if why:
+                if option.after and (why := self._why_omitted(self._option(number, option.after), scores)):
                     left[option.name] = f"{option.after}, which it goes on from, {why}"
                     continue
                 self._session.report(f"{stage.name}: {option.name}", done / len(options))
@@ -162,14 +160,15 @@ class Engine:
             plan = (*plan, best)
         return plan
 
-    def _why_omitted(self, name: str, before: str, scores: Mapping[str, FloatArray]) -> str:
-        """Why an option that goes on from ``name``, itself from ``before``, is not tried; "": it is."""
-        own = scores.get(name)
+    def _why_omitted(self, before: Option, scores: Mapping[str, FloatArray]) -> str:
+        """Why an option that goes on from the one ``before`` is not tried; "": it is."""
+        own = scores.get(before.name)
         if own is None or any(improves(other, own, True) for other in scores.values()):
             return "is clearly behind"
         # Each has more freedom than the one before, and several times its cost. In six fits to two rooms the third
         # gained twice, where the second had gained; where that had not, it took two thirds of the time.
-        return f"is no better than {before}" if before in scores and own.mean() <= scores[before].mean() else ""
+        first = scores.get(before.after)
+        return f"is no better than {before.after}" if first is not None and own.mean() <= first.mean() else ""
 
     def _best(self, options: Sequence[Option], scores: dict[str, FloatArray], confidence: float | None) -> str:
         """Name of the best option: the best mean of equal freedom, then the last clear gain of more freedom."""

@@ -34,11 +34,14 @@ def wound_both_ways(body: Body) -> bool:
 
 
 def wound_one_way(corners_m: FloatArray) -> FloatArray:
-    """Triangles [f, 3, 3] of which neighbours are wound the same way."""
+    """Triangles [f, 3, 3] of which neighbours are wound the same way, as the first of each body is."""
     mesh = welded(corners_m)
     before = mesh.faces.copy()
     trimesh.repair.fix_winding(mesh)
     turned = (mesh.faces != before).any(axis=1)
+    # trimesh makes faces of a body agree, and leaves open with which of them.
+    for body in bodies(corners_m):
+        turned[body.faces] ^= turned[body.faces.min()]
     return np.where(turned[:, None, None], corners_m[:, ::-1], corners_m)
 
 
