@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ class Inputs:
     uplink: NDArray[Any] | None = None  # uplink channel coefficients [m, antennas, subcarriers], complex64, or None
     first_row: int = 0  # number of the first row, for messages
     carriers_hz: FloatArray | None = None  # carrier of each row [m], Hz, or None where the data have a single carrier
+    #: run of the measurement of each row [m], see `Record.runs`; None: another one than those of the data
+    runs: NDArray[np.str_] | None = None
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -33,9 +35,10 @@ class Inputs:
     def rows(self, chosen: slice | IntArray) -> Inputs:
         """Inputs of some rows; ``first_row`` of an array is that of all rows."""
         start = (chosen.start or 0) if isinstance(chosen, slice) else 0
-        columns = (self.tx_pos_m, self.tx_heading_rad, self.uplink, self.carriers_hz)
-        position, heading, uplink, carriers = (None if values is None else values[chosen] for values in columns)
-        return Inputs(cast(FloatArray, position), heading, uplink, self.first_row + start, carriers)
+        names = ("tx_pos_m", "tx_heading_rad", "uplink", "carriers_hz", "runs")
+        columns: dict[str, Any] = {name: getattr(self, name) for name in names}
+        of_rows: dict[str, Any] = {name: None if values is None else values[chosen] for name, values in columns.items()}
+        return replace(self, **of_rows, first_row=self.first_row + start)
 
 
 @dataclass(frozen=True)
@@ -123,8 +126,8 @@ class Record:
             for a mean of readings the standard deviation of the mean. None where unknown.
         carriers_hz: carrier of each row in Hz, [n], of spectra and signal strengths that were measured at several
             carriers; None where all rows have the same.
-        runs: run of the measurement, such as a day or a session, in which each row was taken, texts [n]; None where
-            unknown.
+        runs: run of the measurement, such as a walk, a day or a device, in which each row was taken, texts [n]; None
+            where unknown. Signal strengths of a run may have an offset of their own.
         source: file or folder of the data.
 
     Signal strengths of two transmitter positions at one receiver:
@@ -161,7 +164,7 @@ class Record:
 
     def inputs(self, rows: slice | IntArray = slice(None)) -> Inputs:
         """Inputs of some rows."""
-        return Inputs(self.tx_pos_m, self.tx_heading_rad, self.uplink, 0, self.carriers_hz).rows(rows)
+        return Inputs(self.tx_pos_m, self.tx_heading_rad, self.uplink, 0, self.carriers_hz, self.runs).rows(rows)
 
     @property
     def scored(self) -> NDArray[np.float32] | NDArray[np.complex64]:

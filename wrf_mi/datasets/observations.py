@@ -20,6 +20,8 @@ LARGEST = 1e15
 LEAST_ROWS = 2
 """Training rows of a receiver that a fit needs: a level and its slope need two, as do a row that trains and another
 that chooses settings."""
+LEAST_RUNS = 3
+"""Runs of training rows from which runs are held out: one of two leaves a single offset, of which none can be told."""
 FEW_ROWS = 5
 """Training rows below which strengths of a receiver are predicted by the law of distance that all receivers share."""
 
@@ -34,6 +36,21 @@ def rows_received(record: Record, rows: IntArray) -> IntArray:
         return np.asarray(received.sum(axis=1), np.int64)
     carriers = np.unique(record.carriers_hz[rows])
     return np.asarray(received.astype(np.int64) @ (record.carriers_hz[rows][:, None] == carriers)).max(axis=1)
+
+
+def trained_runs(record: Record, rows: IntArray) -> NDArray[np.str_]:
+    """Names of the runs of the measurement that some rows are of, sorted; none where they are unknown."""
+    runs = np.zeros(0, str) if record.runs is None else np.unique(record.runs[rows])
+    return runs[runs != ""]
+
+
+def predicts_new_runs(record: Record, split: Split) -> bool:
+    """Whether the rows that a split predicts are of other runs of the measurement than those that train.
+
+    Without test rows any may be wanted, and so those of another run. Fewer than `LEAST_RUNS` tell nothing of others.
+    """
+    runs = trained_runs(record, split.all_train)
+    return len(runs) >= LEAST_RUNS and not np.isin(trained_runs(record, split.test), runs).any()
 
 
 def fitted_receivers(

@@ -183,7 +183,7 @@ def _fitted(problem: Problem, split: Split, session: Session) -> FittedMixture:
     fitted.stated["weights"] = [{"distance_m": at_m, **dict(zip(used, row, strict=True))} for at_m, row in weights]
     options = [{"part": name, **report} for name, part in fit.fitted.items() for report in part.options]
     if options:
-        fitted.stated |= {"options": options, "hold_out": away_as(split)}
+        fitted.stated |= {"options": options, "hold_out": away_as(problem.record, split)}
     return fitted
 
 

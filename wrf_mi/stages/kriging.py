@@ -14,6 +14,7 @@ from ..estimators.interpolation.strengths import EXACT, Strengths
 from ..estimators.model import Arrays, Fitted, Model, Problem, Session, known_positions
 from .engine import Engine
 from .residual import StrengthResidual
+from .runs import Runs
 
 STOPS = "stop.value_dbm"
 """Array of pooled strengths, which generic kriging has not: readings, NaN where a receiver did not report at a stop."""
@@ -37,7 +38,8 @@ class StrengthKriging(GenericKriging):
         if not self.pools_receivers(problem):
             return super().fit(problem, split, session)
         known_positions(problem.record, problem.rows(split), self.name)
-        engine = Engine(self, [StrengthResidual(problem.settings, problem.stated_settings)], problem, split, session)
+        stages = Runs(), StrengthResidual(problem.settings, problem.stated_settings)
+        engine = Engine(self, stages, problem, split, session)
         fitted = engine.fit().fitted
         assert isinstance(fitted, Strengths)
         fitted.options, fitted.unseen = engine.stated_reports(), engine.unseen

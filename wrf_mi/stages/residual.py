@@ -8,7 +8,7 @@ from functools import partial
 
 from ..core import Split
 from ..core.types import FloatArray
-from ..datasets.observations import rows_received
+from ..datasets.observations import predicts_new_runs, rows_received
 from ..estimators.interpolation.strength_settings import (
     BY_SEARCH,
     DEFAULT,
@@ -24,6 +24,7 @@ from ..estimators.interpolation.strength_trees import LEAST_STOPS
 from ..estimators.interpolation.strengths import Strengths, calibrated, fit_strengths
 from ..estimators.model import Problem, Session
 from .engine import CONFIDENCE
+from .runs import Runs
 from .stage import Option, Stage, State
 
 FEW_ROWS = 16
@@ -65,7 +66,8 @@ class StrengthResidual(Stage):
 
     def _fit(self, settings: StrengthSettings, state: State, split: Split, session: Session) -> State:
         record, rows = state.problem.record, split.all_train
-        fitted = fit_strengths(record, rows, state.mean, settings, session.report, self.stated, calibrate=False)
+        runs = bool(state.kept.get(Runs.name))
+        fitted = fit_strengths(record, rows, state.mean, settings, session.report, self.stated, False, runs)
         return replace(state, fitted=fitted)
 
     def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
@@ -83,7 +85,9 @@ class StrengthResidual(Stage):
         return option._replace(fit=fit)
 
     def finish(self, state: State, split: Split, session: Session) -> State:
-        """Deviations by stretches that are held out."""
+        """Deviations by stretches or runs that are held out."""
         assert isinstance(state.fitted, Strengths)
-        fitted = calibrated(state.fitted, state.problem.record, split.all_train, session.report, self.stated)
+        record = state.problem.record
+        new_runs = predicts_new_runs(record, split)
+        fitted = calibrated(state.fitted, record, split.all_train, session.report, self.stated, new_runs)
         return replace(state, fitted=fitted)

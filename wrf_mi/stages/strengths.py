@@ -29,6 +29,7 @@ from ..tracing.tracer import check_polarization
 from .engine import Engine, OptionReport
 from .kriging import StrengthKriging
 from .residual import StrengthResidual
+from .runs import Runs
 from .scene import MEAN, SceneStage, StageReport, in_scene, scene_reports
 from .side import FittedInScene
 from .stage import Option, Stage, State
@@ -112,7 +113,7 @@ class TracedStrengths(Model):
 
     def fit(self, problem: Problem, split: Split, session: Session) -> FittedStrengths:
         """Calibrate the scene, trace its mean, and fit kriging about it."""
-        stages = SceneStage(), Mean(), StrengthResidual(StrengthSettings())
+        stages = SceneStage(), Mean(), Runs(), StrengthResidual(StrengthSettings())
         engine = Engine(self, stages, problem, split, session)
         state = engine.fit()
         strengths = state.fitted

@@ -23,7 +23,7 @@ from scipy.special import stdtrit
 from ..core import Record, Split
 from ..core.angles import FloatArray
 from ..core.types import IntArray
-from ..datasets.observations import LEAST_ROWS, fitted_receivers, rows_received
+from ..datasets.observations import LEAST_ROWS, fitted_receivers, predicts_new_runs, rows_received, trained_runs
 from ..datasets.splits import rows_left
 
 Option = TypeVar("Option")
@@ -174,7 +174,8 @@ def hold_out(record: Record, split: Split) -> Split | None:
 
     Where the split holds out receivers, half of the trained receivers are held out instead, but for as many rows as the
     split leaves; where it holds out a carrier, one of the trained carriers is, at held-out positions if the split's
-    test positions are not among the training rows'.
+    test positions are not among the training rows'; where it predicts other runs of the measurement than those that
+    train, some of these runs.
 
     Args:
         record: data with known positions.
@@ -191,9 +192,24 @@ def hold_out(record: Record, split: Split) -> Split | None:
     carriers = record.carriers_hz
     if carriers is not None and len(split.test) and not np.isin(carriers[split.test], carriers[rows]).any():
         return _without_carrier(record.tx_pos_m, carriers, split)
+    if predicts_new_runs(record, split):
+        out = _of_runs(record, split)
+        return _fold(split, out, out)
     out = _clusters_or_farthest(split, record.tx_pos_m)
     fold = _fold(split, out, out)
     return fold if rows_received(record, fold.all_train).max() >= LEAST_ROWS else None
+
+
+def _of_runs(record: Record, split: Split) -> IntArray:
+    """Training rows of some runs, drawn with the split's seed: about a share `HELD_OUT` of all."""
+    assert record.runs is not None
+    rows, runs = split.all_train, record.runs[split.all_train]
+    out = np.zeros(len(rows), bool)
+    for run in np.random.default_rng([split.seed, 13]).permutation(trained_runs(record, rows)):
+        more = out | (runs == run)
+        if more.mean() <= (HELD_OUT if out.any() else MOST_HELD_OUT):
+            out = more
+    return rows[out]
 
 
 def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray) -> IntArray:
@@ -205,8 +221,10 @@ def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray) -> IntArray:
     return np.sort(rows[np.argsort(-distance[:, 1], kind="stable")[: 2 if len(rows) > 3 else 1]])
 
 
-def away_as(split: Split) -> str:
+def away_as(record: Record, split: Split) -> str:
     """How far from the others the rows of `hold_out` are, in words for a report."""
+    if predicts_new_runs(record, split):
+        return "of other runs"
     if len(split.wanted_m):
         return "as far from the others as the wanted positions (transductive)"
     return "as far from the others as the test positions (transductive)" if len(split.test) else "in large clusters"
@@ -355,7 +373,9 @@ class HeldOut:
             drawn = np.sort(np.random.default_rng([seed, 5]).permutation(len(row))[:most])
             receiver, row, away = receiver[drawn], row[drawn], away[drawn]
         group = np.zeros(len(row), np.int64)
-        if fold.held_receivers:
+        if record.runs is not None and predicts_new_runs(record, fold):
+            group = np.unique(record.runs[row], return_inverse=True)[1].reshape(-1) % FOLDS
+        elif fold.held_receivers:
             group = np.unique(receiver, return_inverse=True)[1].reshape(-1) % FOLDS
         elif (count := min(FOLDS, len(np.unique(record.tx_pos_m[row], axis=0)))) > 1:
             group = clusters(record.tx_pos_m[row], count, np.random.default_rng([seed, 6]))

@@ -97,10 +97,14 @@ class KrigingSystem:
     @property
     def information(self) -> FloatArray:
         """B^T K^-1 B [p, p]: inverse covariance of the trend's coefficients without a prior."""
-        used = self._trend[:, self._used]
-        total = np.zeros((self.trend.shape[1],) * 2, used.dtype)
-        total[np.ix_(self._used, self._used)] = used.conj().T @ used
+        total = np.zeros((self.trend.shape[1],) * 2, self._trend.dtype)
+        self.add_information(total)
         return total
+
+    def add_information(self, total: FloatArray) -> None:
+        """Add `information` to a matrix."""
+        used = self._trend[:, self._used]
+        total[np.ix_(self._used, self._used)] += used.conj().T @ used
 
     def projected(self, values: Values) -> Values:
         """B^T K^-1 y [p, q] of observations [n, q]."""
@@ -130,7 +134,7 @@ class KrigingSystem:
         return beta, weights
 
     def variance(
-        self, prior: float, cross: FloatArray, trend: FloatArray | None = None, information: FloatArray | None = None
+        self, prior: float, cross: FloatArray, trend: FloatArray | None = None, covariance: FloatArray | None = None
     ) -> FloatArray:
         """Variance of trend and field, without noise, about their prediction at m positions, [m].
 
@@ -138,7 +142,7 @@ class KrigingSystem:
             prior: variance of the field without observations.
             cross: covariances with the rows [m, n], real.
             trend: columns at the positions [m, p]; None: zero mean.
-            information: inverse covariance of the trend's coefficients [p, p] from more than these rows.
+            covariance: covariance of the trend's coefficients [p, p] by more than these rows.
         """
         # k(x, x) - k^T K^-1 k (Rasmussen and Williams, equation 2.26); rounding may take it below zero.
         half = self.whiten(cross.T)
@@ -147,8 +151,12 @@ class KrigingSystem:
             return np.asarray(left)
         # And that of the trend's coefficients, R^T (B^T K^-1 B)^-1 R with R = b - B^T K^-1 k (equation 2.42).
         gap = trend - half.T @ self._trend
-        known = self.information if information is None else information
-        return np.asarray(left + (gap * np.linalg.solve(known, gap.T).T).sum(axis=1))
+        if covariance is None:
+            return np.asarray(left + (gap * np.linalg.solve(self.information, gap.T).T).sum(axis=1))
+        used = np.flatnonzero(gap.any(axis=0))  # of other receivers' terms none
+        return np.asarray(
+            left + np.einsum("mp,pq,mq->m", gap[:, used], covariance[np.ix_(used, used)], gap[:, used], optimize=True)
+        )
 
     @property
     def precision(self) -> Values:

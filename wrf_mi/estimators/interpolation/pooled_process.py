@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -92,9 +93,17 @@ class PooledProcess:
         self._systems = of_each(system, parts, sum(len(p.value) for p in parts))
         pairs = list(zip(self._systems, parts, strict=True))
         # Receivers are independent given beta: their information adds up to the prior's (equation 2.41).
-        self._information = np.diag(1 / np.square(self._prior_sd)) + sum(system.information for system in self._systems)
+        self._information = np.diag(1 / np.square(self._prior_sd))
+        for each in self._systems:
+            each.add_information(self._information)
+        vars(self).pop("_covariance", None)
         self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
         self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
+
+    @cached_property
+    def _covariance(self) -> FloatArray:
+        """Posterior covariance of the shared coefficients [k, k], which serves all predictions."""
+        return np.asarray(np.linalg.inv(self._information))
 
     @property
     def cost(self) -> float:
@@ -110,7 +119,7 @@ class PooledProcess:
         """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis`` [m, k]."""
         cross = self._kernel(inputs, self._inputs.take(self._parts[receiver].rows))
         mean = basis @ self.beta + cross @ self._weights[receiver]
-        return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self._information)
+        return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self._covariance)
 
     def weights(self, receiver: int) -> tuple[Any, FloatArray]:
         """Inputs of a receiver's observations, and weights [n] of the field's covariances with them in a mean."""

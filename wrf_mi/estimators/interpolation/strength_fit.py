@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from scipy.constants import speed_of_light
@@ -182,9 +182,8 @@ def by_likelihood(
     density. The length is a priori the geometric mean of the stops' spacing and half of their extent, uncertain by a
     factor e. Hyperparameters that are ``stated`` hold. Of more than ``limit`` stops that many count.
     """
-    stops = stops.thinned(limit)
     few, most = _most_heard(prior, stops.value_dbm)
-    stops = replace(stops, value_dbm=stops.value_dbm[most], count=stops.count[most])
+    stops = stops.at_receivers(most).thinned(limit)
     spacing_m, extent_m = scales(stops.poses.position_m)
     length_m = max(np.sqrt(spacing_m * extent_m / 2), NEAREST_M)  # rows may all be at one place
     middle = np.log([AREA_SHADOW_DB, length_m, AREA_NOISE_DB, prior.rx_sd_db])
@@ -242,11 +241,11 @@ def by_search(
     `LEAST_GAIN_DB`; those that are ``stated`` hold. ``join`` makes stops of rows. Rows that are all at one place choose
     nothing. Of more than `SEARCH_ROWS` rows and `LIKELIHOOD_RECEIVERS` receivers that many count.
     """
-    spaced = np.unique(np.linspace(0, len(measured.rows) - 1, SEARCH_ROWS).round().astype(np.int64))
-    measured = measured.take(spaced)
     prior, most = _most_heard(prior, measured.value_dbm)
     precision = None if measured.precision is None else measured.precision[most]
     measured = replace(measured, value_dbm=measured.value_dbm[most], precision=precision)
+    heard = np.flatnonzero(np.isfinite(measured.value_dbm).any(axis=0))
+    measured = measured.take(heard[np.unique(np.linspace(0, len(heard) - 1, SEARCH_ROWS).round().astype(np.int64))])
     # Every second fold: all of them choose much the same.
     parts = [
         (join(measured.take(train)), measured.take(out)) for train, out in [*folds(measured.poses.position_m)][::2]
@@ -317,14 +316,27 @@ def folds(position_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
             yield np.sort(order[~near]), np.sort(order[out])
 
 
-class Fit:
-    """Predictions of held-out stretches of the training rows; ``join`` makes stops of rows."""
+def run_folds(run: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Training rows and held-out rows of each fold, as indices, that hold out whole runs by their numbers [n]."""
+    number = np.unique(run, return_inverse=True)[1].reshape(-1) % FOLDS
+    for fold in range(int(number.max()) + 1):
+        yield np.flatnonzero(number != fold), np.flatnonzero(number == fold)
 
-    def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops]) -> None:
+
+class Fit:
+    """Predictions of rows that are held out of the training rows; ``join`` makes stops of rows.
+
+    Held out are stretches (`folds`), or with ``new_runs`` runs.
+    """
+
+    def __init__(
+        self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops], new_runs: bool = False
+    ) -> None:
         self._prior, self._measured = prior, measured
         self.spread: Hyperparameters | None = None
         self.trees = 0  # number of trees of each fold
-        used = folds(measured.poses.position_m)
+        by_run = new_runs and measured.poses.run is not None
+        used = run_folds(cast(IntArray, measured.poses.run)) if by_run else folds(measured.poses.position_m)
         self._folds = [(join(measured.take(train)), held_out) for train, held_out in used]
 
     def held_out(

@@ -14,7 +14,10 @@ Source: Gudmundson, "Correlation model for shadow fading in mobile radio systems
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,16 +34,21 @@ RX_HARMONICS = 2
 GAP = 5  # a stop ends where so many rows of the record are not among the given rows
 PARTS_OF_NOISE = ("drift_db", "noise_db")
 OF_HEADINGS = ("body_db", "body_m", "concentration", "lever_m")  # hyperparameters that count with headings alone
+NO_RUN = -1  # number of the run of a row that states none
 MOST_PAIRS = 2
 """Pairs of a distinct position and a distinct heading, relative to the poses, up to which all pairs are evaluated."""
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Positions [n, 3] and headings [n] of the transmitter; None where the data have no headings."""
+    """Positions [n, 3] and headings [n] of the transmitter; None where the data have no headings.
+
+    ``run`` [n] is the number of the run of the measurement, see `run_numbers`; None where runs do not matter.
+    """
 
     position_m: FloatArray
     heading_rad: FloatArray | None = None
+    run: IntArray | None = None
 
     def __len__(self) -> int:
         """Number of poses."""
@@ -49,7 +57,7 @@ class Poses:
     def take(self, which: NDArray[np.bool_] | IntArray) -> Poses:
         """The poses of a mask or of indices."""
         heading = None if self.heading_rad is None else self.heading_rad[which]
-        return Poses(self.position_m[which], heading)
+        return Poses(self.position_m[which], heading, None if self.run is None else self.run[which])
 
     def moved(self, lever_m: float) -> Poses:
         """The poses displaced by ``lever_m`` along their headings, to the antenna."""
@@ -126,8 +134,20 @@ def _directions(heading_rad: FloatArray) -> FloatArray:
     return np.stack([np.cos(heading_rad), np.sin(heading_rad)], axis=1)
 
 
+def run_numbers(runs: NDArray[np.str_], names: Sequence[str]) -> IntArray:
+    """Number of each of some runs [n] among names: the number of names for another one, `NO_RUN` for none."""
+    number = {name: place for place, name in enumerate(names)} | {"": NO_RUN}
+    distinct, place = np.unique(runs, return_inverse=True)
+    return np.array([number.get(str(name), len(names)) for name in distinct], np.int64)[place.reshape(-1)]
+
+
 def basis(
-    poses: Poses, receiver: int, receivers_m: FloatArray, traced_dbm: FloatArray | None, sd: FloatArray, rx_sd_db: float
+    poses: Poses,
+    receiver: int,
+    receivers_m: FloatArray,
+    traced_dbm: FloatArray | None,
+    sd: FloatArray,
+    rx_sd_db: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Columns of the mean [n, k] for n poses, and the prior standard deviations of their coefficients [k], above 0.
 
@@ -150,15 +170,18 @@ def basis(
                 terms.append((wave(k * (bearing - poses.heading_rad)) * level, *(sd[3] / k)))
     for k in range(1, RX_HARMONICS + 1):
         terms += [(wave(k * bearing), 0, rx_sd_db / k) for wave in (np.cos, np.sin)]
-    columns, deviations, count = list[FloatArray](), list[FloatArray](), len(receivers_m)
-    for column, common, each in terms:
-        # The part common to all receivers, and that of each.
-        parts, deviation = np.zeros((1 + count, len(column))), np.array([common, *[each] * count])
-        parts[[0, 1 + receiver]] = column
-        columns.append(parts[deviation > 0])  # a deviation of 0 says that there is no such term
-        deviations.append(deviation[deviation > 0])
-    # Row by row in memory, by which products of matrices round.
-    return np.ascontiguousarray(np.concatenate(columns).T), np.concatenate(deviations)
+    # The part of each term that is common to all receivers, and that of each; a deviation of 0: there is no such part.
+    count, begin = len(receivers_m), 0
+    sizes = [1 * (common > 0) + count * (each > 0) for _, common, each in terms]
+    columns, deviations = np.zeros((len(poses), sum(sizes))), np.empty(sum(sizes))
+    for (column, common, each), size in zip(terms, sizes, strict=True):
+        if common > 0:
+            columns[:, begin], deviations[begin] = column, common
+        if each > 0:
+            columns[:, begin + size - count + receiver] = column
+            deviations[begin + size - count : begin + size] = each
+        begin += size
+    return columns, deviations
 
 
 @dataclass(frozen=True)
@@ -192,6 +215,12 @@ class Stops:
     count: FloatArray
     row: FloatArray
 
+    def at_receivers(self, receivers: IntArray) -> Stops:
+        """The stops at which one of some receivers received something, with these receivers alone."""
+        which = np.flatnonzero(np.isfinite(self.value_dbm[receivers]).any(axis=0))
+        chosen = np.ix_(receivers, which)
+        return Stops(self.poses.take(which), self.value_dbm[chosen], self.count[chosen], self.row[which])
+
     def thinned(self, most: int) -> Stops:
         """At most ``most`` stops, evenly spaced."""
         if len(self.poses) <= most:
@@ -219,30 +248,31 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
     # Headings are averaged as unit vectors: they wrap around.
     direction = None if heading is None else np.arctan2(mean(np.sin(heading)), mean(np.cos(heading)))
     begins = np.searchsorted(number, np.arange(count + 1))
-    value = np.full((len(value_dbm), count), np.nan)
-    total = np.zeros((len(value_dbm), count))
-    single = np.flatnonzero(size == 1)
-    value[:, single], total[:, single] = value_dbm[:, begins[single]], weight[:, begins[single]]
-    total[np.isnan(value)] = 0
-    for stop in np.flatnonzero(size > 1):
+    received = np.isfinite(value_dbm)
+
+    def sums(values: NDArray[Any]) -> NDArray[Any]:
+        return np.add.reduceat(np.where(received, values, 0), begins[:-1], axis=1) if count else values
+
+    reports, total = sums(received.astype(int)), sums(weight)
+    value = np.where(reports == 1, sums(value_dbm), np.nan)
+    for receiver, stop in np.argwhere(reports > 1):
         chunk = slice(begins[stop], begins[stop + 1])
-        for receiver, reports in enumerate(value_dbm[:, chunk]):
-            known = np.isfinite(reports)
-            if known.any():
-                # A median, as fades skew the reports of a stop.
-                share = weight[receiver, chunk][known]
-                value[receiver, stop], total[receiver, stop] = _median(reports[known], share), share.sum()
-    return Stops(Poses(centre, direction), value, total, mean(measured.rows.astype(float)))
+        known = received[receiver, chunk]
+        # A median, as fades skew the reports of a stop.
+        value[receiver, stop] = _median(value_dbm[receiver, chunk][known], weight[receiver, chunk][known])
+    run = None if measured.poses.run is None else measured.poses.run[begins[:-1]]
+    return Stops(Poses(centre, direction, run), value, total, mean(measured.rows.astype(float)))
 
 
 def _stop_numbers(measured: Measured, reach_m: float, turn_rad: float, most: int) -> IntArray:
-    position, heading, rows = measured.poses.position_m, measured.poses.heading_rad, measured.rows
-    number, first = np.zeros(len(rows), np.int64), 0
+    position, heading, rows = measured.poses.position_m.tolist(), measured.poses.heading_rad, measured.rows
+    number, first, run = np.zeros(len(rows), np.int64), 0, measured.poses.run
     for k in range(1, len(rows)):
         # From the first row of the stop, not the previous one: a slow walk is many stops.
-        far = np.linalg.norm(position[k] - position[first]) > reach_m
+        far = math.dist(position[k], position[first]) > reach_m
         turned = heading is not None and abs(np.angle(np.exp(1j * (heading[k] - heading[first])))) > turn_rad
-        if far or turned or k - first >= most or rows[k] - rows[k - 1] > GAP:
+        other = run is not None and run[k] != run[first]
+        if far or turned or other or k - first >= most or rows[k] - rows[k - 1] > GAP:
             first = k
         number[k] = number[k - 1] + (first == k)
     return number

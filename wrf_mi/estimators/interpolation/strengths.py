@@ -21,12 +21,13 @@ from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray
 from ...core.settings import changed
 from ...core.types import IntArray
-from ...datasets.observations import FEW_ROWS
+from ...datasets.observations import FEW_ROWS, trained_runs
 from ...parallel.threads import one_blas_thread
 from ...tasks import require
 from ...training.session import OnProgress, quiet
 from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
 from .by_receiver import finite_positions
+from .run_offsets import RunOffsets
 from .strength_fit import (
     Fit,
     PriorMean,
@@ -49,7 +50,7 @@ from .strength_settings import (
     TREES,
     StrengthSettings,
 )
-from .strength_terms import Hyperparameters, Measured, Poses, Stops, stops_of
+from .strength_terms import Hyperparameters, Measured, Poses, Stops, run_numbers, stops_of
 from .strength_trees import TREES as TREES_OF_ALL
 from .strength_trees import TREES_OF_FOLD, Forest
 
@@ -84,6 +85,7 @@ class Strengths(Fitted):
     fit_facts: dict[str, float]  # numbers of the fit for `facts`
     shadowing: str = DEFAULT  # where hyperparameters come from, see `StrengthSettings`
     options: Sequence[Mapping[str, Any]] = ()  # reports of what held-out rows chose from
+    offsets: RunOffsets | None = None  # of the runs of the measurement; None: they have none
 
     def __post_init__(self) -> None:
         """Headings count where the training rows had them."""
@@ -98,22 +100,27 @@ class Strengths(Fitted):
         position_m = finite_positions(inputs, "kriging")
         mean, std, std_mean = np.empty((3, len(position_m)))
         noise = self.field.noise * self.widen[receiver] ** 2
-        for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
+        for rows, poses in self._chunks(position_m, inputs):
             with one_blas_thread():
                 means, variances = zip(*self.field.predict(poses, receiver), strict=True)
             # Of unknown headings: variance within each, and between their means.
             variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
             mean[rows] = np.mean(means, axis=0)
             std[rows], std_mean[rows] = np.sqrt(variance + noise), np.sqrt(variance)
+        if self.offsets is not None:
+            offset_db, variance = self.offsets.of(inputs.runs, len(mean))
+            mean += offset_db
+            variance = variance * self.widen[receiver] ** 2
+            std, std_mean = np.sqrt(std**2 + variance), np.sqrt(std_mean**2 + variance)
         return Prediction(mean, std, std_mean=std_mean)
 
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict` in a fraction of its time: variances take the most of that."""
         position_m = finite_positions(inputs, "kriging")
         mean = np.empty(len(position_m))
-        for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
+        for rows, poses in self._chunks(position_m, inputs):
             mean[rows] = np.mean([self.field.mean(each, receiver) for each in poses], axis=0)
-        return mean
+        return mean if self.offsets is None else mean + self.offsets.of(inputs.runs, len(mean))[0]
 
     def tracing_once(self) -> Strengths:
         """The model about a traced mean that keeps powers, see `Fitted`; itself about any other mean."""
@@ -127,26 +134,25 @@ class Strengths(Fitted):
     def refit(self, record: Record, rows: IntArray) -> Strengths:
         """The posterior given some rows, see `Fitted`; factors of deviations are those of held-out stretches of all."""
         field = self.tracing_once().field
-        stops = _stops(_measured(record, rows, field.headings))
+        stops = _stops(_without_offsets(_measured(record, rows, field.headings), record, self.offsets))
         with one_blas_thread():
             posterior = StrengthPosterior(
                 field.prior, field.hyperparameters, stops, field.rounds, field.spread, field.trees
             )
         return replace(self, field=posterior)
 
-    def _chunks(self, position_m: FloatArray, heading_rad: FloatArray | None) -> list[tuple[slice, list[Poses]]]:
-        """Slices of the rows, and poses that predictions are averaged over.
+    def _chunks(self, position_m: FloatArray, inputs: Inputs) -> list[tuple[IntArray, list[Poses]]]:
+        """Numbers of the rows in chunks, and poses that predictions are averaged over.
 
         These are at the stated headings, or at `HEADINGS` where headings count and are unknown.
         """
-        turns: list[FloatArray | None] = [heading_rad if self.uses_heading else None]
+        heading_rad = inputs.tx_heading_rad
+        turns: list[FloatArray | None] = [np.asarray(heading_rad, float) if self.uses_heading else None]
         if self.uses_heading and heading_rad is None:
             turns = [np.full(len(position_m), turn) for turn in 2 * np.pi * np.arange(HEADINGS) / HEADINGS]
-        parts = [slice(begin, begin + CHUNK) for begin in range(0, len(position_m), CHUNK)]
-        return [
-            (rows, [Poses(position_m[rows], None if turn is None else np.asarray(turn, float)[rows]) for turn in turns])
-            for rows in parts
-        ]
+        every = [Poses(position_m, turn) for turn in turns]
+        chunks = np.split(np.arange(len(position_m)), np.arange(CHUNK, len(position_m), CHUNK))
+        return [(rows, [poses.take(rows) for poses in every]) for rows in chunks]
 
     def arrays(self) -> Arrays:
         """Arrays for `from_arrays`."""
@@ -168,6 +174,8 @@ class Strengths(Fitted):
             **field_arrays(field.hyperparameters, "knob."),
             **field_arrays(field.spread, "spread."),
         }
+        if self.offsets is not None:
+            arrays |= field_arrays(self.offsets, "run.")
         if field.forest is not None:
             arrays |= field.forest.arrays() | {"trees": field.trees}
         if prior.traced is not None:
@@ -205,7 +213,8 @@ class Strengths(Fitted):
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         shadowing = str(arrays.get("shadowing", DEFAULT))
         options = json.loads(str(arrays.get("options", "[]")))
-        return cls(field, arrays["widen"], facts, shadowing, options)
+        offsets = from_field_arrays(RunOffsets, arrays, "run.") if "run.names" in arrays else None
+        return cls(field, arrays["widen"], facts, shadowing, options, offsets)
 
     def facts(self) -> dict[str, Any]:
         """Hyperparameters, calibration, and error on held-out rows."""
@@ -216,6 +225,7 @@ class Strengths(Fitted):
             "transmit_dbm": self.field.prior.transmit_dbm,
             "shadowing": self.shadowing,
             **asdict(self.field.hyperparameters),
+            **({} if self.offsets is None else {"run_sd_db": self.offsets.sd_db}),
             "widen": [float(factor) for factor in self.widen],
             "noise_of_reading_db": [float(np.sqrt(self.field.noise) * factor) for factor in self.widen],
             **self.fit_facts,
@@ -231,6 +241,7 @@ def fit_strengths(
     on_progress: OnProgress = quiet,
     stated: Collection[str] | None = None,
     calibrate: bool = True,
+    runs: bool = False,
 ) -> Strengths:
     """Fit signal strengths to some rows of a record; nothing is drawn, so there is no seed.
 
@@ -243,6 +254,7 @@ def fit_strengths(
         stated: names of the hyperparameters that hold, whatever the likelihood of the others; None: those that differ
             from their defaults.
         calibrate: whether deviations come from held-out stretches, see `calibrated`.
+        runs: whether runs of the measurement have offsets.
 
     Raises:
         InputError: a record of another task or without its carrier, or neither rows nor a map.
@@ -250,7 +262,10 @@ def fit_strengths(
     require(record, "rssi", why="these strengths are in dBm")
     if record.frequencies_hz is None:
         raise InputError(f"{record.name}: carrier frequency unknown; state it in the data")
-    measured = _measured(record, rows, settings.heading)
+    measured, offsets = _measured(record, rows, settings.heading), None
+    if runs:
+        offsets = RunOffsets.fit(_stops(measured), trained_runs(record, rows).tolist())
+        measured = _without_offsets(measured, record, offsets)
     if not len(measured.rows) and power_map is None:
         raise InputError(f"{record.name}: neither a training row that was received nor a scene; give one of them")
     prior = _prior(record, measured, power_map, settings)
@@ -268,16 +283,24 @@ def fit_strengths(
         hyperparameters = replace(h, drift_db=drift_db, shadow_db=NO_SHADOW_DB, body_db=0.0)
     trees = TREES_OF_ALL * (shadowing == TREES)
     field = StrengthPosterior(prior, hyperparameters, _stops(measured), ROBUST_ROUNDS, trees=trees)
-    strengths = Strengths(field, np.ones(len(measured.value_dbm)), {"rows": float(len(measured.rows))}, shadowing)
+    strengths = Strengths(
+        field, np.ones(len(measured.value_dbm)), {"rows": float(len(measured.rows))}, shadowing, offsets=offsets
+    )
     return calibrated(strengths, record, rows, on_progress, stated) if calibrate else strengths
 
 
 def calibrated(
-    strengths: Strengths, record: Record, rows: IntArray, on_progress: OnProgress = quiet, stated: Collection[str] = ()
+    strengths: Strengths,
+    record: Record,
+    rows: IntArray,
+    on_progress: OnProgress = quiet,
+    stated: Collection[str] = (),
+    new_runs: bool = False,
 ) -> Strengths:
     """The fit to some rows with deviations by stretches that are held out.
 
-    Deviations of hyperparameters that are not ``stated`` are by likelihood.
+    Deviations of hyperparameters that are not ``stated`` are by likelihood. With ``new_runs``, rows of other runs than
+    the record's are predicted, and so runs are held out in place of stretches.
     """
     field, facts = strengths.field, dict(strengths.fit_facts)
     prior, hyperparameters = field.prior, field.hyperparameters
@@ -285,18 +308,21 @@ def calibrated(
     values, widen = measured.value_dbm, strengths.widen.copy()
     if len(measured.rows) < 2:
         return strengths
-    fit = Fit(prior, measured, _stops)
+    # Rows of a run that is held out have an offset that nobody knows.
+    known = measured if new_runs else _without_offsets(measured, record, strengths.offsets)
+    values, variance = known.value_dbm, strengths.offsets.sd_db**2 if new_runs and strengths.offsets else 0.0
+    fit = Fit(prior, _without_offsets(measured, record, strengths.offsets), _stops, new_runs)
     fit.trees = min(TREES_OF_FOLD, field.trees)
     fit.spread = _deviations(strengths, stated)
     on_progress("strengths: held-out rows", 0.8)
     mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
     residual = values - mean
-    widen = widening(residual, std)
+    widen = widening(residual, np.sqrt(std**2 + variance))
     few = np.isfinite(values).sum(axis=1) < FEW_ROWS
     if few.any() and len(few) - few.sum() >= LEAST_HEARD:
         # At receivers without rows nearby errors are those of the common terms, as at others that are left out.
         mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS, unheard=True)
-        widen[few] = np.maximum(widen, widening(values - mean, std))[few]
+        widen[few] = np.maximum(widen, widening(values - mean, np.sqrt(std**2 + variance)))[few]
     if np.isfinite(residual).any():
         facts["held_out_db"] = float(np.nanmedian(np.abs(residual)))
     on_progress("strengths: all rows", 0.9)
@@ -318,14 +344,24 @@ def _deviations(strengths: Strengths, stated: Collection[str]) -> Hyperparameter
     return likely(h, {*stated, "shadow_db"} if shadowing == NONE else stated)
 
 
+def _without_offsets(measured: Measured, record: Record, offsets: RunOffsets | None) -> Measured:
+    """Rows of a record without the offsets of their runs."""
+    if offsets is None or record.runs is None:
+        return measured
+    offset_db, _ = offsets.of(record.runs[measured.rows], len(measured.rows))
+    return replace(measured, value_dbm=measured.value_dbm - offset_db)
+
+
 def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:
-    """Those of some rows of a record that a receiver received, with or without headings."""
+    """Those of some rows of a record that a receiver received, with their runs, with or without headings."""
     rows = np.unique(np.asarray(rows, np.int64))
     values = np.asarray(record.observation[:, rows], float)
     received = np.isfinite(values).any(axis=0)
     rows, values = rows[received], values[:, received]
     heading = record.tx_heading_rad if headings else None
-    poses = Poses(record.tx_pos_m[rows].astype(float), None if heading is None else np.asarray(heading[rows], float))
+    heading = None if heading is None else np.asarray(heading[rows], float)
+    run = None if record.runs is None else run_numbers(record.runs[rows], trained_runs(record, rows).tolist())
+    poses = Poses(record.tx_pos_m[rows].astype(float), heading, run)
     return Measured(poses, values, rows, record.precision(rows))
 
 
