@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically, write_figure
 from wrf_mi.runs.figures import score_cdf
+from wrf_mi.runs.results import reference_words
 from wrf_mi.tasks import TASKS
 
 from .comparison import Row, line
@@ -167,7 +168,7 @@ def part_table(part: TablePart, groups: Groups) -> str:
         first = next(of_method[0] for (share, _), of_method in groups.items() if share == most)
         empty = dict.fromkeys(("spread", "training", "sample", "memory", "published"), "")
         for key, block in first["reference"].items():
-            label = {"n_train": first["n_train"], "label": task.references[key], "digits": 2}
+            label = {"n_train": first["n_train"], "label": _reference_words(part, first, key), "digits": 2}
             rows.append({**block, **label, **empty})
     head = (
         f"| rows | method | median {task.label} | mean | p10 | p90 | training | a sample | memory | paper, other data |"
@@ -177,6 +178,14 @@ def part_table(part: TablePart, groups: Groups) -> str:
         "| {p90:.{digits}f} | {training} | {sample} | {memory} | {published} |"
     )
     return lined(head, line)(rows)
+
+
+def _reference_words(part: TablePart, row: Mapping[str, Any], key: str) -> str:
+    """Description of a reference; keys of IDW end with its number of neighbours where rows did not choose it."""
+    name = key.rstrip("0123456789")
+    if name != key:
+        return f"{TASKS[part.task].references[name]} of {key.removeprefix(name)} nearest"
+    return reference_words(TASKS[part.task], row["reference"], key)
 
 
 STORED, PICTURE = Path("benchmarks/results/tables"), Path("docs/images/pareto.png")

@@ -107,7 +107,7 @@ def at_carrier(case: Held, fold: int, seed: int, folder: Path) -> dict[str, Any]
     for name, where in ((TRACED, scene), (CORRECTED, better)):
         scores[name] = _scores(fit("ray-tracing", scene=where, settings=TRANSMISSION))
     scores[KRIGING] = _scores(fit("kriging"))
-    scores[IDW] = _scores(hybrid, hybrid.references[TASKS[hybrid.task].reference])
+    scores[IDW] = _scores(hybrid, hybrid.references["idw"])
     return scores | {CARRIER: _scores(hybrid, hybrid.references["carrier"]), **_facts(hybrid)}
 
 

@@ -66,7 +66,7 @@ def test_scripts_of_the_readme_run(tmp_path, monkeypatch, capsys):
     metrics = json.loads((tmp_path / "runs" / "script" / "metrics.json").read_text())
     assert metrics["steps"] == 2
     printed = capsys.readouterr().out
-    for block in (metrics["ssim"], metrics["reference"]["idw4"]):
+    for block in (metrics["ssim"], metrics["reference"]["idw"]):
         assert str(block["median"]) in printed
     assert names["spectrum"].shape == (HEIGHT, WIDTH)
     assert names["spectra"].shape == (3, HEIGHT, WIDTH)

@@ -115,13 +115,16 @@ def test_train_prints_a_table_and_progress_elsewhere(folder: Path, tmp_path: Pat
     out_folder = tmp_path / "run"
     status, out, err = command(training(folder, out_folder, "--seed", 3, model="wrf-gs"))
     assert status == 0
-    head, own, blend, facts, worse, where = out.splitlines()
+    head, own, blend, facts, verdict, worse, where = out.splitlines()
     assert head.split() == ["SSIM", "on", "5", "test", "rows", "median", "mean", "p10", "p90"]
     metrics = json.loads((out_folder / "metrics.json").read_text())
-    for line, block in ((own, metrics["ssim"]), (blend, metrics["reference"]["idw4"])):
+    for line, block in ((own, metrics["ssim"]), (blend, metrics["reference"]["idw"])):
         assert line.split()[-4:] == [f"{block[k]:.3f}" for k in ("median", "mean", "p10", "p90")]
     assert own.startswith("wrf-gs ")
     assert facts.startswith("split official, 19 training rows,")
+    assert verdict.startswith(
+        f"median SSIM {metrics['ssim']['median']:.3f}: no better than the best constant, the mean"
+    )
     assert worse.startswith("wrf-gs is no better than predicting the mean")  # after four steps
     assert where == f"results: {out_folder}"
     assert (metrics["model"], metrics["seed"], metrics["steps"]) == ("wrf-gs", 3, 4)
@@ -375,7 +378,7 @@ def test_demo_compares_models_in_a_held_out_region_and_in_a_measured_flat(
         assert text in out + err
     assert "median absolute error" in out
     table = rows_of(tmp_path / "demo" / "compare" / "compare.csv")
-    models = ["ray-tracing", "kriging", "idw4", "constant", "ray-tracing", "kriging", "idw100", "constant"]
+    models = ["ray-tracing", "kriging", "idw", "constant", "ray-tracing", "kriging", "idw", "constant", "constant"]
     assert [row["model"] for row in table] == models
     assert {row["dataset"] for row in table} == {"laboratory", "flat"}
     assert (tmp_path / "demo" / "scene" / "preview.png").is_file()

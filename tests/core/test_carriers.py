@@ -20,10 +20,10 @@ from wrf_mi.core.carriers import by_carrier
 from wrf_mi.datasets import load, write_ble_folder, write_nerf2_csi
 from wrf_mi.models import MODELS
 from wrf_mi.runs.api import open_run, plan_run, train
-from wrf_mi.runs.evaluate import reference_predictions
 from wrf_mi.runs.folder import RunRequest
-from wrf_mi.runs.results import read_run
-from wrf_mi.tasks import CARRIER, TASKS, instrument_of
+from wrf_mi.runs.references import reference_arrays
+from wrf_mi.runs.results import read_run, reference_key
+from wrf_mi.tasks import CARRIER, instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace
 from wrf_mi.tracing.paths.result import join_traces, recompute
 from wrf_mi.tracing.tracer import RayTracer, cross_polarized
@@ -48,7 +48,12 @@ def flat(flat_folder: Path) -> Record:
     return record.at_carriers(np.where(np.arange(len(record)) % 3 > 0, HIGH, LOW))
 
 
-SETTINGS = {"kriging": ["length_m=1", "noise=0.1", "heading_length=1"], "trees": ["trees=5"], "idw": [], "mri": []}
+SETTINGS = {
+    "kriging": ["length_m=1", "noise=0.1", "heading_length=1"],
+    "trees": ["trees=5"],
+    "idw": ["neighbours=4"],
+    "mri": [],
+}
 
 
 def of(record: Record, carrier_hz: float) -> tuple[Record, Split]:
@@ -93,8 +98,6 @@ def test_carriers_are_interpolated_separately(name: str, flat: Record, tmp_path:
         record, split = of(flat, carrier)
         alone = read_run(train(record, name, out=tmp_path / f"{carrier}", split=split, settings=SETTINGS[name]).folder)
         np.testing.assert_array_equal(read.prediction[:, carriers == carrier], alone.prediction)
-        for key in alone.references:
-            np.testing.assert_array_equal(read.references[key][:, carriers == carrier], alone.references[key])
     again = open_run(run.folder, flat)
     heading = flat.tx_heading_rad[read.row] if name in ("kriging", "trees") else None
     found = again.predict(flat.tx_pos_m[read.row], 1, heading, carriers_hz=carriers).mean
@@ -134,7 +137,7 @@ def test_a_carrier_is_predicted_from_the_others(name: str, flat: Record, tmp_pat
         train(three, name, out=tmp_path / "run", split="frequency-known:1", settings=SETTINGS[name]).folder
     )
     assert (carriers[found.row] == middle).all()
-    step = found.references[TASKS["rssi"].reference] - found.references[CARRIER]
+    step = found.references["idw"] - found.references[CARRIER]
     np.testing.assert_allclose(step, -20 * np.log10(middle / LOW), atol=FLOAT32_DB)  # the lower of two as near
     lowest = Split("lowest", 0, np.arange(n), np.zeros(0, np.int64), np.arange(2 * n, 3 * n))
     low = train(three, name, out=tmp_path / "low", split=lowest, settings=SETTINGS[name])
@@ -236,11 +239,11 @@ def test_one_target_error_and_unknown_materials_are_refused(flat: Record, room: 
 
 def test_reference_interpolates_rows_of_the_same_carrier(flat: Record) -> None:
     known, rows = flat.official
-    key = TASKS["rssi"].reference
+    key = reference_key("idw")
     split = Split("two", 0, known, known[:0], rows)
-    found = reference_predictions(flat, split)[key]
+    found = reference_arrays(flat, split)[key]
     shifted = replace(flat, observation=flat.observation + np.where(flat.carriers_hz == LOW, 30, 0).astype(np.float32))
-    moved = reference_predictions(shifted, split)[key] - found
+    moved = reference_arrays(shifted, split)[key] - found
     np.testing.assert_allclose(moved, [np.where(flat.carriers_hz[rows] == LOW, 30, 0)] * 2, atol=FLOAT32_DB)
 
 

@@ -40,7 +40,7 @@ def test_stored_models_reproduce_the_scored_predictions(name: str, flat_folder: 
         assert found.dtype == np.float32
         np.testing.assert_array_equal(found, arrays["prediction"][r])
     if name == "idw":
-        np.testing.assert_array_equal(arrays["prediction"], arrays["reference_idw100"])
+        np.testing.assert_array_equal(arrays["prediction"], arrays["reference_idw"])
     elif name != "mri":
         with pytest.raises(InputError, match="give heading_rad, or train with heading=false"):
             opened.predict(arrays["tx_pos"], 0)
@@ -54,7 +54,8 @@ def test_command_trains_as_the_function_does(flat_folder: Path, run: Path, tmp_p
     out, few = tmp_path / "run", tmp_path / "few"
     status, table, err = command(["train", flat_folder, "--model", "mri", "--out", out])
     assert status == 0, err
-    assert [line.split()[0] for line in table.splitlines()] == ["absolute", "mri", "IDW", "split", "results:"]
+    first = ["absolute", "mri", "IDW", "split", "median", "RMSE", "results:"]
+    assert [line.split()[0] for line in table.splitlines()] == first
     assert err.splitlines() == ["mri: receivers"]
     np.testing.assert_array_equal(stored(out)["prediction"], stored(run)["prediction"])
     chosen = ["--set", "shared=true", "--n-train", "0.5", "--seed", 4, "--split", "random"]
@@ -126,7 +127,7 @@ def test_sweep_and_comparison_show_baselines_and_the_reference(
     assert (row["model"], row["status"], row["median"]) == ("idw", "done", row["reference_median"])
     compare([run, out / "model=idw"], tmp_path / "page")
     rows = rows_of(tmp_path / "page" / "compare.csv")
-    assert [row["model"] for row in rows] == ["mri", "idw", "idw100", "constant"]
+    assert [row["model"] for row in rows] == ["mri", "idw", "idw", "constant", "constant"]
     assert rows[1]["median"] == rows[2]["median"] != rows[0]["median"]
     words = ["sweep", flat_folder, "--vary", "model=idw,vae", "--out", tmp_path / "no"]
     command.refused(words, "vae serves spectrum")

@@ -39,13 +39,13 @@ def make_run(
     np.savez(
         path / "predictions.npz",
         **{"row": np.array(rows), "tx_pos": np.zeros((len(rows), 3)), "truth": truth},
-        **{"prediction": prediction.astype(np.float32), "reference_idw4": blend.astype(np.float32)},
+        **{"prediction": prediction.astype(np.float32), "reference_idw": blend.astype(np.float32)},
         receiver_name=[f"gateway{r}" for r in range(receivers or 1)],
     )
     score, reference = (summary(ssim(values, truth)) for values in (prediction, blend))
     metrics = {
         **{"task": "spectrum", "dataset": "made/room", "model": model, "split": split, "seed": seed},
-        **{"n_train": 20, "n_test": len(rows), "ssim": score, "reference": {"idw4": {"median": reference["median"]}}},
+        **{"n_train": 20, "n_test": len(rows), "ssim": score, "reference": {"idw": {"median": reference["median"]}}},
         **{"ms_per_sample": 3.25, "train_seconds": 61.5 if trained else 0.0, "peak_memory_mb": 512.0},
     }
     (path / "metrics.json").write_text(json.dumps(metrics))
@@ -71,11 +71,11 @@ def test_table_contains_the_metrics_of_the_runs(tmp_path):
     assert list(table[0]) == list(COLUMNS)
     metrics = json.loads((good / "metrics.json").read_text())
     assert [row["run"] for row in table][:2] == ["good", "bad"]
-    assert [row["model"] for row in table] == ["wrf-gs+", "idw", "idw4", "idw4"]
+    assert [row["model"] for row in table] == ["wrf-gs+", "idw", "idw", "idw"]
     assert [row["seed"] for row in table] == ["3", "7", "", ""]
     for key in ("median", "mean", "p10", "p90"):
         assert float(table[0][key]) == metrics["ssim"][key]
-    assert float(table[2]["median"]) == metrics["reference"]["idw4"]["median"]
+    assert float(table[2]["median"]) == metrics["reference"]["idw"]["median"]
     assert float(table[0]["ms_per_sample"]) == 3.25
     assert float(table[0]["median"]) > float(table[1]["median"])
     assert page == tmp_path / "out" / "index.html"
@@ -157,7 +157,7 @@ def test_reference_is_drawn_once_for_equal_rows(tmp_path, monkeypatch):
     scores, references, label = calls[-1]
     assert label == "SSIM"
     assert list(scores) == ["a", "b", "c"]
-    assert list(references) == ["IDW of 4 nearest, official", "IDW of 4 nearest, official of c"]
+    assert list(references) == ["IDW, official", "IDW, official of c"]
 
 
 def test_several_receivers_are_pooled_and_named(tmp_path, monkeypatch):
@@ -206,10 +206,10 @@ UNFINISHED_LOG = '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": t
         (write("predictions.npz", "not a zip"), "predictions.npz: not readable"),
         (write("log.jsonl", UNFINISHED_LOG), "line 2 is no log entry"),
         (write("config.yaml", "seed: 1"), "format not stated, this version reads 4; train it anew"),
-        (edit_metrics(task="rssi"), "no abs_error_db or no reference idw100"),
+        (edit_metrics(task="rssi"), "no abs_error_db or no reference idw"),
         (edit_metrics(n_test=...), "no n_test"),
-        (edit_metrics(reference={}), "no reference idw4"),
-        (edit_arrays(lambda arrays: arrays.pop("reference_idw4")), "reference_idw4"),
+        (edit_metrics(reference={}), "no reference idw"),
+        (edit_arrays(lambda arrays: arrays.pop("reference_idw")), "reference_idw"),
         (edit_metrics(task="colour"), "task 'colour'; known are spectrum, rssi, csi"),
         *(
             (edit_arrays(change), "shapes do not fit together .*; run evaluate to write it anew")

@@ -27,6 +27,7 @@ from wrf_mi.core import Record, Split
 from wrf_mi.models import Session
 from wrf_mi.runs import figures
 from wrf_mi.runs.api import plan_run, train
+from wrf_mi.runs.baselines import warnings_of
 from wrf_mi.runs.compare import compare
 from wrf_mi.runs.compare_page import changed_settings, command
 from wrf_mi.runs.compare_tables import (
@@ -40,7 +41,7 @@ from wrf_mi.runs.compare_tables import (
     method_rows,
 )
 from wrf_mi.runs.folder import AntennaOptions, RunRequest, read_config, start_run
-from wrf_mi.runs.results import Results, warnings_of
+from wrf_mi.runs.results import Results
 from wrf_mi.runs.run import open_run
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -67,7 +68,7 @@ def strengths(
     positions_m = np.zeros((len(rows), 3)) if positions_m is None else positions_m
     stated = (Path(path) / name, name, "rssi", "flat", metrics, seed, names)
     split = Split("official", seed, np.array(train, np.int64), np.zeros(0, np.int64), rows)
-    idw = {"idw100": truth + idw_db}
+    idw = {"idw": truth + idw_db}
     return Results(*stated, rows, positions_m, prediction, truth, idw, None, None, {}, splits=[split])
 
 
@@ -86,7 +87,7 @@ def test_differences_have_the_sign_of_the_score_and_the_rule_of_the_interval() -
     other = {"good": "close", "close": "good"}[best]
     assert found["bad", best] == "worse"
     assert found[other, best] == "tie"
-    reference = "IDW of 100 nearest"
+    reference = "IDW"
     assert {name: found[name, reference] for name in ("bad", "good")} == {"bad": "worse", "good": "better"}
     against = next(one for one in differences(runs) if (one.run, one.against) == ("bad", best))
     expected = np.mean(np.abs(best_run(runs).prediction - good.truth) - np.abs(bad.prediction - bad.truth))
@@ -115,14 +116,14 @@ def test_runs_of_other_training_rows_have_no_verdict() -> None:
     found = verdicts([good, bad, few])
     assert found["bad", "good"] == "worse"
     assert (found["few", "good"], found["bad", "few"]) == (OTHER_ROWS, OTHER_ROWS)
-    assert found["few", "IDW of 100 nearest"] == "tie"  # the reference of the same training rows
+    assert found["few", "IDW"] == "tie"  # the reference of the same training rows
     assert all(gain.low is None for gain in differences([good, bad, few]) if gain.verdict == OTHER_ROWS)
 
 
 def test_all_pairs_follow_those_of_the_best_run() -> None:
     runs = [strengths(name, error) for name, error in (("c", 3.0), ("a", 1.0), ("b", 2.0), ("d", 4.0))]
     gains = differences(runs)
-    reference = "IDW of 100 nearest"
+    reference = "IDW"
     first = [("c", "a"), ("c", reference), ("a", reference), ("b", "a"), ("b", reference), ("d", "a"), ("d", reference)]
     assert [(gain.run, gain.against) for gain in first_differences(runs, gains)] == first
     others = {(gain.run, gain.against): gain.verdict for gain in gains[len(first) :]}
@@ -173,7 +174,7 @@ def test_all_seeds_must_agree(seeds: list[Path]) -> None:
     ]
     runs.append(strengths("worst", 5.0))
     found = verdicts(runs)
-    reference = "IDW of 100 nearest"
+    reference = "IDW"
     assert {found[path.name, reference] for path in seeds} == {"tie"}  # one of three seeds is worse
     assert found["worst", reference] == "worse"
     assert found["worst", "seed0"] == "worse"
@@ -304,10 +305,10 @@ def test_page_is_one_well_formed_file_of_several_data_sets(tmp_path: Path) -> No
     assert "higher is better" in page
     rows = rows_of(tmp_path / "out" / "differences.csv")
     assert [(row["run"], row["against"], row["verdict"]) for row in rows] == [
-        ("a<b>&", "IDW of 4 nearest", "better"),
+        ("a<b>&", "IDW", "better"),
         ("second", "a<b>&", "worse"),
-        ("second", "IDW of 4 nearest", "worse"),
-        ("other", "IDW of 4 nearest", "better"),
+        ("second", "IDW", "worse"),
+        ("other", "IDW", "better"),
     ]
 
 

@@ -19,19 +19,20 @@ from made_spectra import spectra
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.datasets import make_splits, write_ble_folder, write_nerf2_csi
-from wrf_mi.runs.evaluate import evaluate, pool, write_results
-from wrf_mi.runs.results import (
+from wrf_mi.runs.baselines import (
     CONSTANT,
+    CONSTANT_RMSE,
     SCORES,
     VARIATION,
     WORDS,
-    Results,
-    against_constant,
+    against,
     constant_scores,
-    read_run,
     variation,
+    verdicts,
     warnings_of,
 )
+from wrf_mi.runs.evaluate import evaluate, pool, write_results
+from wrf_mi.runs.results import Results, read_run
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim
 
@@ -40,6 +41,8 @@ FLOAT32 = 1e-5
 """Rounding of tens of dBm, and of scores of some dB, in float32."""
 HEADER = {"dataset": "made-up", "model": "off", "split": "official", "train_seconds": 0.0, "peak_memory_mb": 1.0}
 FIELDS = {"median", "mean", "p10", "p90"}
+ERRORS = {"bias", "std", "rmse"}
+GAIN = {"gain", "gain_error", "beaten"}
 
 
 def record(task: str, receivers: int, subcarriers: int = 3) -> Record:
@@ -84,15 +87,16 @@ def stored(folder: Path, metrics: dict, arrays: dict) -> Results:
 def test_signal_strengths_of_one_receiver(tmp_path: Path):
     truth, [(metrics, arrays)] = scored("rssi", 1)
     assert metrics["task"] == "rssi"
-    assert metrics["abs_error_db"] == {key: pytest.approx(1, abs=FLOAT32) for key in FIELDS}
-    assert set(metrics["reference"]["idw100"]) == FIELDS
+    expected = {key: pytest.approx(1, abs=FLOAT32) for key in FIELDS | {"bias", "rmse"}}
+    assert metrics["abs_error_db"] == expected | {"std": pytest.approx(0, abs=FLOAT32)}
+    assert set(metrics["reference"]["idw"]) == FIELDS | ERRORS | GAIN | {f"rmse_{key}" for key in GAIN} | {"neighbours"}
     # Rows 38 and 39 of the one receiver were not received; row 39 was by none and is in no split.
     assert (metrics["n_train"], metrics["n_test"]) == (27, 8)
     assert "receivers" not in metrics
     run = stored(tmp_path / "run", metrics, arrays)
     with np.load(tmp_path / "run" / "predictions.npz") as file:
-        assert sorted(file) == ["prediction", "receiver_name", "reference_idw100", "row", "truth", "tx_pos"]
-        for key in ("prediction", "truth", "reference_idw100"):
+        assert sorted(file) == ["prediction", "receiver_name", "reference_idw", "row", "truth", "tx_pos"]
+        for key in ("prediction", "truth", "reference_idw"):
             assert file[key].dtype == np.float32
         assert file["prediction"].shape == (8,)
     assert (run.task, run.dataset, run.receivers) == ("rssi", "made-up", ("anchor0",))
@@ -108,7 +112,7 @@ def test_several_receivers_have_a_block_each_and_a_pooled_one(tmp_path: Path):
     for r, (name, count) in enumerate([("anchor0", 9), ("anchor1", 8)]):
         block = metrics["receivers"][name]
         assert block["abs_error_db"]["median"] == pytest.approx(1 + r, abs=FLOAT32)
-        assert set(block["reference"]["idw100"]) == FIELDS
+        assert set(block["reference"]["idw"]) == FIELDS | ERRORS
         assert block["n_test"] == count
     # Every sample that was received counts once: 9 of 1 dB and 8 of 2 dB.
     assert metrics["abs_error_db"]["mean"] == pytest.approx((9 * 1 + 8 * 2) / 17, abs=FLOAT32)
@@ -126,7 +130,8 @@ def test_scores_have_the_same_keys_for_all_tasks():
         for block in (metrics, *metrics["receivers"].values()):
             rule = {"metric": TASKS[task].block, "higher_is_better": TASKS[task].higher_is_better}
             assert block["score"] == rule | block[TASKS[task].block]
-    assert by_task["rssi"]["score"].keys() == by_task["csi"]["score"].keys() == {"metric", "higher_is_better"} | FIELDS
+    assert by_task["csi"]["score"].keys() == {"metric", "higher_is_better"} | FIELDS
+    assert by_task["rssi"]["score"].keys() == {"metric", "higher_is_better"} | FIELDS | ERRORS
 
 
 def test_a_receiver_that_received_no_test_row_has_no_scores():
@@ -147,7 +152,7 @@ def test_channel_coefficients(tmp_path: Path, receivers: int):
     assert run.prediction.shape == (receivers, 10, 3)
     assert run.prediction.dtype == np.complex64
     np.testing.assert_allclose(run.score, np.full((receivers, 10), 20), atol=FLOAT32)
-    blend = metrics["reference"]["idw4"]
+    blend = metrics["reference"]["idw"]
     assert blend["median"] == pytest.approx(np.median(cea_db(run.reference, run.truth)))
     assert blend["median"] < 3, "white noise cannot be interpolated"
 
@@ -280,7 +285,7 @@ def test_a_gain_counts_beyond_its_standard_error(task: str, gain: float, seed: i
     constant = rng.uniform(2, 6, (2, 30))
     sign = 1 if scorer.higher_is_better else -1
     scores = constant + sign * (gain + rng.normal(0, 1, (2, 30)))
-    block = against_constant(scorer, scores, constant)
+    block = against(scorer, scores, constant)
     assert block["gain"] == pytest.approx(gain, abs=1)  # seven standard errors
     better = sign * np.median(scores) > sign * np.median(constant)
     assert block["beaten"] == (block["gain"] > max(block["gain_error"], 0.01) and better)
@@ -291,7 +296,7 @@ def test_a_prediction_as_good_as_the_constant_does_not_beat_it(task: str) -> Non
     scores = np.random.default_rng(0).uniform(0, 1, (1, 20))
     sign = 1 if TASKS[task].higher_is_better else -1
     for gain in (0.0, 1e-4):
-        assert not against_constant(TASKS[task], scores + sign * gain, scores)["beaten"]
+        assert not against(TASKS[task], scores + sign * gain, scores)["beaten"]
 
 
 def test_folds_are_scored_together() -> None:
@@ -299,6 +304,47 @@ def test_folds_are_scored_together() -> None:
     for split in make_splits(record, "blocked"):
         metrics, _ = evaluate(record, split, lambda rows, receiver: record.observation[receiver, rows])
         assert metrics[CONSTANT]["beaten"]
+
+
+def test_constant_of_smallest_rmse_is_the_mean_of_each_receiver() -> None:
+    record = building()
+    (split,) = make_splits(record, "official")
+    metrics, _ = evaluate(record, split, lambda rows, receiver: record.observation[receiver, rows] + 1)
+    trained, tested = record.observation[:, :TRAINED].astype(float), record.observation[:, TRAINED:]
+    for key, constant_dbm in ((CONSTANT_RMSE, trained.mean(axis=1)), (CONSTANT, np.median(trained, axis=1))):
+        error_db = constant_dbm[:, None] - tested
+        block = metrics[key]
+        assert block["rmse"] == pytest.approx(np.sqrt(np.mean(error_db**2)), abs=FLOAT32)
+        assert block["bias"] == pytest.approx(error_db.mean(), abs=FLOAT32)
+        assert block["rmse_gain"] == pytest.approx(block["rmse"] - 1, abs=FLOAT32)
+        assert block["rmse_beaten"]
+    assert metrics[CONSTANT]["words"] == "the median of each receiver's training rows"
+    assert metrics[CONSTANT_RMSE]["words"] == "the mean of each receiver's training rows"
+
+
+def test_verdicts_are_against_the_constant_that_is_best_for_each_score() -> None:
+    record = building()
+    (split,) = make_splits(record, "official")
+    mean_dbm = record.observation[:, :TRAINED].mean(axis=1)
+    metrics, _ = evaluate(record, split, lambda rows, receiver: np.full(len(rows), mean_dbm[receiver]))
+    median, rmse = verdicts(metrics)
+    assert median.startswith(f"median absolute error (dB) {metrics['abs_error_db']['median']:.3f}: no better than the")
+    assert "best constant, the median of each receiver's training rows" in median
+    assert rmse.startswith(f"RMSE {metrics['abs_error_db']['rmse']:.3f} dB (bias ")
+    assert "equal to the best constant, the mean of each receiver's training rows" in rmse
+    assert re.search(r"; no better than the best simple model, IDW of \d+ nearest \(\d", rmse)
+    truth, _ = evaluate(record, split, lambda rows, receiver: record.observation[receiver, rows])
+    assert all(line.count("better than") == 2 and "no better" not in line for line in verdicts(truth))
+
+
+def test_the_best_reference_is_compared_with() -> None:
+    truth = np.zeros((1, 4), np.float32)
+    references = {"idw": truth + 3, "law": truth + 2}
+    stated = (Path(), "name", "rssi", "data", {}, 0, ("anchor0",), np.arange(4), np.zeros((4, 3)), truth, truth)
+    results = Results(*stated, references, None, None, {})
+    assert results.best_reference == "law"
+    np.testing.assert_array_equal(results.reference, references["law"])
+    assert results.reference_name == "one path-loss law of all receivers"
 
 
 @pytest.mark.parametrize("model", ["idw", "kriging", "mri", "trees"])

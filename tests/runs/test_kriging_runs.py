@@ -56,7 +56,7 @@ def test_run_folder_holds_model_and_standard_deviation(waves: Path, run: Path) -
     metrics = json.loads((run / "metrics.json").read_text())
     assert (metrics["model"], metrics["task"], metrics["n_train"], metrics["n_test"]) == ("kriging", "spectrum", 26, 10)
     assert metrics["ssim"]["median"] == pytest.approx(np.median(ssim(arrays["prediction"], arrays["truth"])))
-    assert metrics["ssim"]["median"] > metrics["reference"]["idw4"]["median"]
+    assert metrics["ssim"]["median"] > metrics["reference"]["idw"]["median"]
     inside = inside_interval(arrays["prediction"], arrays["std"], arrays["truth"])
     assert metrics["inside_90"] == pytest.approx(inside)
     assert 0.5 < inside < 1
@@ -121,7 +121,7 @@ def test_standard_deviations_of_folds_are_pooled(waves: Path, tmp_path: Path) ->
 def test_comparison_shows_kriging_and_reference(run: Path, tmp_path: Path) -> None:
     assert "inside 90 %" in compare([run], tmp_path / "page").read_text()
     rows = rows_of(tmp_path / "page" / "compare.csv")
-    assert [row["model"] for row in rows] == ["kriging", "idw4", "constant"]
+    assert [row["model"] for row in rows] == ["kriging", "idw", "constant"]
     assert float(rows[0]["inside_90"]) == json.loads((run / "metrics.json").read_text())["inside_90"]
     assert rows[1]["inside_90"] == ""
     assert (tmp_path / "page" / "waves-samples.png").is_file()

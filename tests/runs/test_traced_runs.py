@@ -187,7 +187,7 @@ def test_command_traces_predicts_and_compares(
     assert predicted["prediction"] == pytest.approx(read.prediction, abs=FLOAT32_DB)
     assert predicted["receiver_name"].tolist() == ["anchor1", "anchor2"]
     page = compare([run, out], tmp_path / "compare").read_text()
-    assert all(name in page for name in (run.name, out.name, "idw100"))
+    assert all(name in page for name in (run.name, out.name, "idw"))
 
 
 def test_train_and_trace_give_equal_scores(

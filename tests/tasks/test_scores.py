@@ -12,7 +12,7 @@ from wrf_mi.core.angles import pixel_directions, solid_angles
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.estimators.interpolation.idw import InverseDistance
 from wrf_mi.tasks import TASKS
-from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim, ssim_mixtures, summary
+from wrf_mi.tasks.scores import abs_error_db, cea_db, signed_errors_db, ssim, ssim_mixtures, summary
 
 EXACT = 1e-12
 SUMS = 1e-9  # differences of float64 sums of 49 values below one, and logarithms
@@ -191,6 +191,20 @@ def test_published_figures_of_the_authors_split_and_the_blocked_split():
     assert official["median"] == pytest.approx(0.978, abs=PUBLISHED)
     assert blocked["median"] == pytest.approx(0.630, abs=PUBLISHED)
     assert (blocked["p10"], blocked["p90"]) == pytest.approx((0.40, 0.86), abs=10 * PUBLISHED)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 200), st.floats(-20, 20), st.floats(0, 10), st.integers(0, 2**32 - 1))
+def test_rmse_is_that_of_bias_and_standard_deviation(count, bias, std, seed):
+    from sklearn.metrics import root_mean_squared_error
+
+    rng = np.random.default_rng(seed)
+    truth = rng.normal(-70, 10, count)
+    prediction = truth + rng.normal(bias, std, count)
+    errors = signed_errors_db(np.append(prediction, -50.0), np.append(truth, np.nan))
+    assert errors["rmse"] ** 2 == pytest.approx(errors["bias"] ** 2 + errors["std"] ** 2, rel=1e-9, abs=1e-12)
+    assert errors["rmse"] == pytest.approx(root_mean_squared_error(truth, prediction), rel=EXACT)
+    assert errors["bias"] == pytest.approx(np.mean(prediction) - np.mean(truth), abs=1e-9)
 
 
 PUBLISHED_DB = 0.1

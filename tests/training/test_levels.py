@@ -16,7 +16,7 @@ from scipy.constants import speed_of_light
 import wrf_mi
 from wrf_mi.core import Receiver, Record
 from wrf_mi.gaussians import FIELDS
-from wrf_mi.runs.results import LEAST_VARIATION, VARIATION
+from wrf_mi.runs.baselines import LEAST_VARIATION, VARIATION
 
 OF_FIELD = (
     *("steps=300", "batch=8", "initial.gaussians=60", "density.every=0", "network.width=64", "validate_every=1000"),

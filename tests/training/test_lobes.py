@@ -15,7 +15,8 @@ from wrf_mi.backend.device import to_tensor
 from wrf_mi.core import InputError
 from wrf_mi.core.settings import with_settings
 from wrf_mi.gaussians import FIELDS, WrfGsPlus, random_gaussians
-from wrf_mi.runs.results import CONSTANT, LEAST_VARIATION, VARIATION, read_run
+from wrf_mi.runs.baselines import CONSTANT, LEAST_VARIATION, VARIATION
+from wrf_mi.runs.results import read_run
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.trainer import Trainer
 

@@ -7,7 +7,7 @@ task by name (`wrf_mi.core.Record.task`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -22,8 +22,10 @@ MixtureScores = Callable[[FloatArray, IntArray], FloatArray]
 """From weights [n, k] of sum 1 and numbers [n] of observations to scores [n] of weighted means of k predictions."""
 UPLINK = "uplink"  # Key of the reference that copies the uplink
 LAW = "law"  # Key of the reference at receivers that were held out
+IDW = "idw"  # Key of the reference by inverse-distance weighting
+NEIGHBOURS = "neighbours"  # Key of the numbers of neighbours in its block of ``metrics.json``
 CARRIER = "carrier"
-"""Key of the reference at carriers without training rows: that of `Task.reference` at the nearest carrier with some."""
+"""Key of the reference at carriers without training rows: that of `IDW` at the nearest carrier with some."""
 MEAN, MEDIAN = "the mean of each receiver's training rows", "the median of each receiver's training rows"
 """Words for constant predictions (`Task.constants`); of arrays value by value."""
 Loss = Callable[..., Any]
@@ -101,7 +103,8 @@ class Task(ABC):
     #: settings of the training of paths alone that differ from the defaults of such a training
     settings_of_paths: ClassVar[tuple[str, ...]] = ()
     loss_unit: ClassVar[float] = 1.0  #: unit of an observation in which errors are about as large as those of spectra
-    neighbours: ClassVar[int] = 4  #: training rows of the reference, inverse-distance weighting
+    #: training rows of the reference, inverse-distance weighting, where no rows can be held out to choose their number
+    neighbours: ClassVar[int] = 4
     softening_m: ClassVar[float] = 0.0  #: addend of the distances in the reference, metres
     #: words for the second reference, of data with an uplink; "" where the task has none
     from_uplink: ClassVar[str] = ""
@@ -178,21 +181,12 @@ class Task(ABC):
         return {MEAN: np.asarray(observed.mean(axis=0)), MEDIAN: np.asarray(np.median(observed, axis=0))}
 
     @property
-    def reference(self) -> str:
-        """Key of inverse-distance weighting in ``metrics.json``."""
-        return f"idw{self.neighbours}"
-
-    @property
     def references(self) -> dict[str, str]:
-        """Words for each possible reference by its key; the first that a run has is its headline."""
-        known = {self.reference: f"IDW of {self.neighbours} nearest"}
+        """Words for each possible reference by its key."""
+        known = {IDW: "IDW"}
         known |= {LAW: "one path-loss law of all receivers"} if self.shares_law else {}
         known |= {CARRIER: "nearest carrier's rows"} if self.several_carriers else {}
         return {UPLINK: self.from_uplink} | known if self.from_uplink else known
-
-    def headline(self, stored: Container[str]) -> str | None:
-        """The first of `references` among the stored ones; None without any."""
-        return next((key for key in self.references if key in stored), None)
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
         """Loss of the training, a Dr.Jit float of one value: mean absolute difference over received observations.

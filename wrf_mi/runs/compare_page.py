@@ -23,6 +23,7 @@ from ..core.yaml_files import read_yaml
 from ..datasets.registry import KNOWN
 from ..estimators.model import default_settings
 from ..tasks import TASKS
+from .baselines import warnings_of
 from .compare_tables import (
     BETTER,
     COLUMNS,
@@ -38,7 +39,7 @@ from .compare_tables import (
     first_differences,
 )
 from .folder import CONFIG, RunConfig, known_config, stored_versions
-from .results import PREDICTED, Results, warnings_of
+from .results import PREDICTED, Results
 
 NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
 CONSTANT = ("dataset", "metric")  # columns that are equal in a section, whose heading states them
@@ -113,10 +114,10 @@ def _section(section: Section) -> str:
 The median comes first here, the verdicts below are of differences of means: they may rank runs differently.</p>
 {_table(shown, section.scores, NUMERIC)}
 {_unbeaten(section.runs)}{_methods(section.methods)}<h3>Paired differences</h3>
-<p class="note">Each run against its reference{_text(others)}, on the test rows that both have: mean difference per row,
-positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of blocks of rows: clusters of their
-positions, since near rows resemble each other, or else stretches of consecutive rows. {BETTER} and {WORSE}: the
-interval excludes zero, in all seeds; else a tie. {NO_GAIN}: the run would be {BETTER}, but is not better than the
+<p class="note">Each run against its best reference{_text(others)}, on the test rows that both have: mean difference
+per row, positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of blocks of rows: clusters
+of their positions, since near rows resemble each other, or else stretches of consecutive rows. {BETTER} and {WORSE}:
+the interval excludes zero, in all seeds; else a tie. {NO_GAIN}: the run would be {BETTER}, but is not better than the
 constant prediction. {OTHER_ROWS}: differences would be those of the training
 rows.{words}</p>
 {gains}

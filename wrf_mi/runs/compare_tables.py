@@ -16,15 +16,18 @@ from ..core.types import IntArray
 from ..tasks import TASKS
 from ..tasks.scores import block_bootstrap
 from ..training.selection import clusters
+from .baselines import CONSTANT, CONSTANT_RMSE, constant_of, warnings_of
 from .folder import known_config
-from .results import CONSTANT, PREDICTED, Results, constant_of, warnings_of
+from .results import PREDICTED, Results
 
 COLUMNS = {"run": "run", "model": "model", "dataset": "data set", "split": "split", "seed": "seed"}
 COLUMNS |= {"n_train": "training rows (mean of folds)", "n_test": "test rows", "metric": "score"}
 COLUMNS |= {key: key for key in ("median", "mean", "p10", "p90")} | {"common_mean": "mean, common rows"}
+COLUMNS |= {"bias": "bias (dB)", "std": "standard deviation of the error (dB)", "rmse": "RMSE (dB)"}
 COLUMNS |= {"inside_90": "inside 90 %", "crps": "CRPS", "ms_per_sample": "ms per sample"}
 COLUMNS |= {"train_seconds": "training (s)", "peak_memory_mb": "peak memory (MB)"}
 """Columns of ``compare.csv`` and their headings on the page."""
+SCORES = ("median", "mean", "p10", "p90", "bias", "std", "rmse")  # columns of a block of scores
 DIFFERENCES = {key: key for key in ("run", "against", "verdict", "difference")}
 DIFFERENCES |= {"low": "95 % from", "high": "to", "rows": "common rows", "blocks": "blocks"}
 """Columns of ``differences.csv`` and their headings on the page; positive differences are in favour of the run."""
@@ -79,11 +82,11 @@ def best_run(runs: Sequence[Results]) -> Results:
 
 
 def differences(runs: Sequence[Results]) -> list[Difference]:
-    """Each run against the best one, of several runs, and against its reference; then all other pairs of runs.
+    """Each run against the best one, of several runs, and against its best reference; then all other pairs of runs.
 
     "Better" and "worse": the 95 % interval of the difference, of resampled blocks of test rows, excludes zero in all
     seeds; all else is a tie. `NO_GAIN`: better, but some seed is no better than the constant prediction
-    (`wrf_mi.runs.results.warnings_of`). Runs that differ in their seed alone are seeds of one method; methods are
+    (`wrf_mi.runs.baselines.warnings_of`). Runs that differ in their seed alone are seeds of one method; methods are
     compared by runs of the same seed. Runs that predict the common rows from other training rows are not comparable.
     """
     best, of_name, by_name = best_run(runs), methods(runs), {run.name: run for run in runs}
@@ -270,11 +273,11 @@ def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
 def _constants(runs: Sequence[Results]) -> list[dict[str, Any]]:
     """Rows of the constant prediction (`wrf_mi.tasks.Task.constants`), once for runs with the same scores of it."""
     by_name: dict[str, dict[str, Any]] = {}
-    for run in (run for run in runs if CONSTANT in run.metrics):
+    for run, kind in ((run, kind) for run in runs for kind in (CONSTANT, CONSTANT_RMSE) if kind in run.metrics):
         shown = {column: run.metrics[column] for column in ("split", "n_train", "n_test")}
-        shown |= {key: run.metrics[CONSTANT][key] for key in ("median", "mean", "p10", "p90")} | {"model": CONSTANT}
+        shown |= {key: run.metrics[kind].get(key) for key in SCORES} | {"model": CONSTANT}
         if shown not in by_name.values():
-            name = f"{constant_of(run.metrics).removeprefix('the ')}, {run.metrics['split']}"
+            name = f"{constant_of(run.metrics, kind).removeprefix('the ')}, {run.metrics['split']}"
             by_name[f"{name} of {run.name}" if name in by_name else name] = shown
     return [{"run": name} | shown for name, shown in by_name.items()]
 
@@ -293,6 +296,6 @@ def references(runs: Sequence[Results]) -> dict[str, tuple[Results, str]]:
             known = (r.reference_scores[key] for r, k in by_name.values() if k == key)
             if any(np.array_equal(scores, other, equal_nan=True) for other in known):
                 continue
-            name = f"{TASKS[run.task].references[key]}, {run.metrics['split']}"
+            name = f"{run.words_of(key)}, {run.metrics['split']}"
             by_name[f"{name} of {run.name}" if name in by_name else name] = run, key
     return by_name

@@ -13,33 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import InputError, Prediction, Record, Split
+from ..core.angles import FloatArray
 from ..core.array_files import write_arrays
 from ..core.carriers import FREQUENCY
 from ..core.files import write_atomically
 from ..core.memory import peak_memory_mb
+from ..core.task import IDW, NEIGHBOURS
 from ..core.types import IntArray
 from ..datasets import make_splits
 from ..datasets.observations import FEW_ROWS, rows_received, scorable
-from ..estimators.few_rows import with_few_rows
-from ..estimators.interpolation.idw import MODEL as IDW
-from ..estimators.interpolation.mri import MODEL as MRI
-from ..estimators.model import PredictAll, default_settings, inputs_of
+from ..estimators.model import PredictAll, inputs_of
 from ..estimators.receiver_places import stored_places
-from ..models import Fitted, Inputs, Problem, Session
-from ..tasks import CARRIER, LAW, TASKS, UPLINK
-from ..tasks.scores import crps, inside_interval, summary
+from ..models import Fitted, Problem
+from ..tasks import TASKS
+from ..tasks.scores import crps, inside_interval, signed_errors_db, summary
+from .baselines import COUNT, NOT_STORED, against, against_rmse, against_simple, constant_scores, evenly_spaced
 from .folder import METRICS, PREDICTIONS, RunConfig
 from .reception import reception_arrays, reception_block
-from .results import (
-    NOT_STORED,
-    RECEPTION,
-    STD_MEAN,
-    Observations,
-    against_constants,
-    constant_scores,
-    evenly_spaced,
-    reference_key,
-)
+from .references import reference_arrays
+from .results import RECEPTION, STD_MEAN, reference_key
 
 Predict = Callable[[IntArray, int], "NDArray[Any] | Prediction"]
 """Predicts what the receiver of an index observes in rows [m] of the record: spectra [m, H, W], powers [m] in dBm or
@@ -95,13 +87,13 @@ def _milliseconds_per_sample(predict: Predict, rows: IntArray, receiver: int) ->
 def evaluate(record: Record, split: Split, predict: Predict, single: Predict | None = None) -> Scores:
     """Score predictions on the test rows of a split, together with the references that the data allow.
 
-    References (`reference_predictions`) use all training rows of the split, validation rows included. ``single`` is
-    timed at one row; None: ``predict``.
+    References (`wrf_mi.runs.references.reference_arrays`) use all training rows of the split, validation rows included.
+    ``single`` is timed at one row; None: ``predict``.
 
     Returns:
         The blocks of ``metrics.json`` that scoring gives (``task``, ``score`` and the same by the name of the metric,
-        ``reference``, ``constant`` (`wrf_mi.runs.results.against_constant`),
-        ``variation`` (`wrf_mi.runs.results.variation`), for several receivers ``receivers``, with
+        ``reference``, ``constant`` and ``constant_rmse`` (`wrf_mi.runs.baselines.against_simple`),
+        ``variation`` (`wrf_mi.runs.baselines.variation`), for several receivers ``receivers``, with
         standard deviations ``inside_90`` and ``crps``, with probabilities of reception ``reception``, ``n_train``,
         ``n_test``, ``n_not_scored``, ``ms_per_sample``), and the arrays of ``predictions.npz``. An observation that is
         not finite is not scored: its truth is NaN; so are those of trained receivers where a split holds out others.
@@ -122,7 +114,7 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         "truth": truth,
         "tx_pos": record.tx_pos_m[rows],
         **({} if record.carriers_hz is None else {FREQUENCY: record.carriers_hz[rows]}),
-        **{reference_key(key): values for key, values in reference_predictions(record, split).items()},
+        **reference_arrays(record, split),
         **constant_scores(record, split, truth),
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
@@ -179,19 +171,31 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
     keys = [key for key in scorer.references if reference_key(key) in arrays]
     references = {key: scorer.of_rows(arrays[reference_key(key)], arrays["truth"]) for key in keys}
 
+    def block(values: FloatArray, prediction: str, chosen: Any) -> dict[str, float]:
+        errors = signed_errors_db(arrays[prediction][chosen], arrays["truth"][chosen]) if scorer.in_decibel else {}
+        return summary(values[chosen]) | errors
+
     def blocks(chosen: Any) -> dict[str, Any]:
-        reference = {key: summary(values[chosen]) for key, values in references.items()}
-        stated, meaning = summary(scores[chosen]), {"metric": scorer.block, "higher_is_better": scorer.higher_is_better}
+        reference = {key: block(values, reference_key(key), chosen) for key, values in references.items()}
+        stated = block(scores, "prediction", chosen)
+        meaning = {"metric": scorer.block, "higher_is_better": scorer.higher_is_better}
         return {"score": meaning | stated, scorer.block: stated, "reference": reference}
 
     metrics: dict[str, Any] = {"task": task, **blocks(slice(None)), "n_test": len(arrays["row"])}
+    for key, simple in references.items():
+        metrics["reference"][key] |= against(scorer, scores, simple)
+        if scorer.in_decibel:
+            stated = arrays["prediction"], arrays[reference_key(key)], arrays["truth"]
+            metrics["reference"][key] |= against_rmse(*stated)
+    if COUNT in arrays:
+        metrics["reference"][IDW][NEIGHBOURS] = np.unique(arrays[COUNT]).tolist()
     if len(scores) > 1:
         counts = np.count_nonzero(~np.isnan(scores), axis=1)
         metrics["receivers"] = {
             str(name): {**(blocks(r) if counts[r] else {}), "n_test": int(counts[r])}
             for r, name in enumerate(arrays["receiver_name"])
         }
-    metrics |= against_constants(scorer, scores, arrays)
+    metrics |= against_simple(scorer, scores, arrays)
     if "std" in arrays:
         # Truth without noise lies in intervals of the mean, readings in their own.
         std = STD_MEAN if NOISE_FREE in arrays and STD_MEAN in arrays else "std"
@@ -356,63 +360,3 @@ def stored_metrics(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return stored if isinstance(stored, dict) else {}
-
-
-def reference_predictions(record: Record, split: Split) -> dict[str, Observations]:
-    """References that the data allow (`wrf_mi.tasks.Task.references`), as [n_rx, m, ...] of the test rows by key.
-
-    Inverse-distance weighting (IDW) needs positions of training and test rows; the copy of the uplink needs an uplink.
-    At receivers without training rows, the path-loss law of the others' training rows takes their place. Where test
-    rows have carriers without training rows, IDW interpolates between carriers, and a further reference is IDW at the
-    nearest carrier with training rows.
-
-    Raises:
-        InputError: data that allow none, uplink and downlink of different numbers of antennas, or a receiver that
-            received no training row.
-    """
-    task, kind, rows = record.task, record.observation.dtype, split.test
-    predictions: dict[str, Any] = {}
-    if record.uplink is not None and task.from_uplink:
-        predictions[UPLINK] = np.stack([_copied_uplink(record, record.uplink[rows])] * len(record.receivers))
-    if np.isfinite(record.tx_pos_m[np.concatenate([split.all_train, rows])]).all():
-        predictions |= _interpolated(record, split)
-    if not predictions:
-        lacking = "positions" + (" and uplink" if task.from_uplink else "")
-        raise InputError(f"{record.name}: {lacking} are not known, so no reference can be computed; add them")
-    return {key: values.astype(kind) for key, values in predictions.items()}
-
-
-def _interpolated(record: Record, split: Split) -> dict[str, NDArray[Any]]:
-    """References [n_rx, m, ...] that are computed from the positions of training rows."""
-    alone = split.held_receivers and not len(split.left)
-    key, entry = (LAW, MRI) if alone else (record.task.reference, IDW)
-    plain = replace(split, train=split.all_train, validation=split.validation[:0])
-    problem = Problem(record, default_settings(entry, (), {})).seen(split)
-    fitted = with_few_rows(entry, record.task.name).fit(problem, plain, Session(Path(), Path()))  # writes no file
-
-    def of_all(inputs: Inputs) -> NDArray[Any]:
-        return np.stack([fitted.predict(inputs, receiver).mean for receiver in range(len(record.receivers))])
-
-    inputs = inputs_of(record, split.test)
-    predictions = {key: of_all(inputs)}
-    if record.carriers_hz is not None and inputs.carriers_hz is not None:
-        known = np.unique(record.carriers_hz[split.all_train])
-        nearest = known[np.abs(np.log(inputs.carriers_hz[:, None] / known)).argmin(axis=1)]
-        if (nearest != inputs.carriers_hz).any():
-            predictions[CARRIER] = of_all(replace(inputs, carriers_hz=nearest))
-    return predictions
-
-
-def _copied_uplink(record: Record, uplink: NDArray[Any]) -> NDArray[Any]:
-    """Uplink [m, antennas, subcarriers] in the shape of a downlink, [m, subcarriers] or [m, antennas, subcarriers].
-
-    Where the numbers of subcarriers differ, each takes the uplink's at the nearest relative position in the band.
-    """
-    shape = record.observation.shape[2:]
-    antennas = shape[0] if len(shape) == 2 else 1
-    if uplink.shape[1] != antennas:
-        raise InputError(
-            f"{record.name}: uplink of {uplink.shape[1]} antennas, downlink of {antennas}; give both for the same ones"
-        )
-    nearest = np.round(np.linspace(0, uplink.shape[2] - 1, shape[-1])).astype(int)
-    return uplink[:, :, nearest].reshape(len(uplink), *shape)

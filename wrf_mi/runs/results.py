@@ -1,4 +1,4 @@
-"""Scores and predictions of a finished run, read from its folder, and what they are against a constant prediction."""
+"""Scores and predictions of a finished run, read from its folder."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import InputError, Record, Split
+from ..core import InputError, Split
 from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays
 from ..core.files import readable
+from ..core.task import IDW, NEIGHBOURS
 from ..core.types import IntArray
 from ..datasets import load_split
 from ..tasks import TASKS, Task
-from ..tasks.scores import summary
 from ..training.checkpoint import LOG
 from .folder import METRICS, PREDICTIONS, SPLIT, check_format, run_parts
 
@@ -27,25 +27,25 @@ Observations = NDArray[np.float32] | NDArray[np.complex64]
 """Grey values, powers in dBm or channel coefficients (`wrf_mi.core.Record`)."""
 
 REMEDY = "run evaluate to write it anew"
-CONSTANT = "constant"  # key of the block in ``metrics.json``
 PREDICTED = "predictions"  # key in ``metrics.json`` of the file of another program
 STD_MEAN = "std_mean"  # key in ``predictions.npz``: standard deviation of the mean
 RECEPTION = "probability_of_reception"  # key in ``predictions.npz`` and variable of a map
-SCORES, WORDS = "constant_score", "constant_words"
-NOT_STORED = SCORES, WORDS
-"""Keys of the constant prediction's scores and words, [n_rx, m] each, among the arrays of an evaluation."""
-CHOSEN_BY = 100  # largest number of a receiver's training rows by which the constant is chosen: SSIM takes milliseconds
-VARIATION = "variation"  # key of the block in ``metrics.json``
-LEAST_VARIATION = 0.1
-"""Ratio of the standard deviations of predictions and truth over the rows, below which predictions hardly vary.
-
-Predictions of ratio r reduce the squared error of their own mean by 1 - (1 - r)^2 at most, here by a fifth.
-"""
 
 
 def reference_key(name: str) -> str:
     """Key in ``predictions.npz`` of a reference."""
     return f"reference_{name}"
+
+
+def reference_words(task: Task, references: dict[str, Any], key: str) -> str:
+    """Description of a reference, with the numbers of neighbours that folds chose, of the ``reference`` of metrics.
+
+    >>> reference_words(TASKS["rssi"], {"idw": {"neighbours": [8, 32]}}, "idw")
+    'IDW of 8 to 32 nearest'
+    """
+    counts = references.get(key, {}).get(NEIGHBOURS)
+    numbers = f" of {' to '.join(map(str, np.unique([min(counts), max(counts)])))} nearest" if counts else ""
+    return task.references[key] + numbers
 
 
 @dataclass(frozen=True)
@@ -113,20 +113,31 @@ class Results:
         """Scores of each reference by name."""
         return {key: TASKS[self.task].of_rows(values, self.truth) for key, values in self.references.items()}
 
+    @cached_property
+    def best_reference(self) -> str:
+        """Key of the reference with the best mean score on the test rows, the simple model to compare with."""
+        task = TASKS[self.task]
+        means = {key: np.nanmean(np.clip(scores, *task.limits)) for key, scores in self.reference_scores.items()}
+        return (max if task.higher_is_better else min)(means, key=lambda key: float(means[key]))
+
     @property
     def reference(self) -> Observations:
-        """Predictions of the first reference."""
-        return next(iter(self.references.values()))
+        """Predictions of the best reference."""
+        return self.references[self.best_reference]
 
     @property
     def reference_name(self) -> str:
-        """Description of the first reference."""
-        return TASKS[self.task].references[next(iter(self.references))]
+        """Description of the best reference."""
+        return self.words_of(self.best_reference)
+
+    def words_of(self, key: str) -> str:
+        """Description of a reference."""
+        return reference_words(TASKS[self.task], self.metrics.get("reference", {}), key)
 
     @property
     def reference_score(self) -> FloatArray:
-        """Score of the first reference."""
-        return next(iter(self.reference_scores.values()))
+        """Score of the best reference."""
+        return self.reference_scores[self.best_reference]
 
 
 def read_run(path: str | Path, name: str | None = None) -> Results:
@@ -204,7 +215,7 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     references = stored if isinstance(stored, dict) else {}
     blocks = [metrics.get(task.block), *(references[key] for key in task.references if key in references)]
     if len(blocks) == 1 or any(not isinstance(block, dict) or "median" not in block for block in blocks):
-        names = [task.reference, *sorted(set(task.references) - {task.reference})]
+        names = [IDW, *sorted(set(task.references) - {IDW})]
         text = f"no {task.block} or no reference {' or '.join(names)} with a median"
         raise InputError(f"{path}: {text}; {REMEDY}")
     return dict(metrics)
@@ -259,108 +270,3 @@ def _read_log(path: Path) -> list[tuple[float, float]]:
         except (ValueError, KeyError, AttributeError, TypeError):
             raise InputError(f"{path}: line {number} is no log entry; remove the line") from None
     return points
-
-
-def constant_scores(record: Record, split: Split, truth: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Scores [n_rx, m] of a constant prediction of the test rows' truth [n_rx, m, ...], and its words: `NOT_STORED`.
-
-    It is the one of `wrf_mi.tasks.Task.constants` with the best mean score on the training rows, validation rows
-    included, that a receiver received; a receiver without any, which the split holds out, takes those of all receivers.
-    Truth is NaN where it is not scored.
-    """
-    task, rows = record.task, split.all_train
-    observed = record.seen(split).observation[:, rows]
-    received = np.asarray(np.isfinite(observed).reshape(*observed.shape[:2], -1).all(axis=2))
-    trained: dict[str, list[FloatArray]] = {}
-    tested: dict[str, list[FloatArray]] = {}
-    for values, known, expected in zip(observed, received, truth, strict=True):
-        seen = values[known] if known.any() else observed[received]
-        sample = seen[evenly_spaced(len(seen), CHOSEN_BY)]
-        for words, constant in task.constants(seen).items():
-            for scores, rows_of in ((trained, sample), (tested, expected)):
-                predicted = np.broadcast_to(constant, rows_of.shape)[None]
-                scores.setdefault(words, []).append(task.of_rows(predicted, rows_of[None])[0])
-    # Limited, as in `against_constant`.
-    means = {words: np.nanmean(np.clip(np.concatenate(scores), *task.limits)) for words, scores in trained.items()}
-    best = (max if task.higher_is_better else min)(means, key=lambda words: means[words])
-    return {SCORES: np.stack(tested[best]), WORDS: np.full(truth.shape[:2], best)}
-
-
-def evenly_spaced(count: int, most: int) -> IntArray:
-    """Numbers of at most ``most`` of ``count`` rows, evenly spaced."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-
-
-def variation(prediction: NDArray[Any], truth: NDArray[Any]) -> dict[str, float] | None:
-    """Block of ``metrics.json``: how much predictions [n_rx, m, ...] vary over the rows, and how much the truth does.
-
-    Returns:
-        Standard deviations over the scored rows, root mean square over receivers and an observation's values, of
-        ``prediction`` and ``truth``, and their ``ratio``; None: the truth has no two rows that differ.
-    """
-    squares = np.zeros(2)
-    for of_receiver in zip(prediction, truth, strict=True):
-        scored = np.isfinite(of_receiver[1]).reshape(len(of_receiver[1]), -1).all(axis=1)
-        for number, values in enumerate(of_receiver):
-            if scored.any():
-                # About the first row: what is the same in all rows is then exactly 0.
-                change = np.asarray(values[scored] - values[scored][0], np.result_type(values, np.float64))
-                squares[number] += np.sum(np.square(np.abs(change - change.mean(axis=0))))
-    if not squares[1]:
-        return None
-    deviations = np.sqrt(squares / np.count_nonzero(np.isfinite(truth)))
-    return {
-        "prediction": float(deviations[0]),
-        "truth": float(deviations[1]),
-        "ratio": float(deviations[0] / deviations[1]),
-    }
-
-
-def against_constants(task: Task, scores: FloatArray, arrays: dict[str, Any]) -> dict[str, Any]:
-    """Blocks ``constant`` and ``variation`` of ``metrics.json`` from scores and the arrays of an evaluation."""
-    # Folds may differ in the constant that scores best on their training rows.
-    words = " or ".join(np.unique(arrays[WORDS]).tolist())
-    changes = variation(arrays["prediction"], arrays["truth"])
-    blocks = {CONSTANT: against_constant(task, scores, arrays[SCORES]) | {"words": words}}
-    return blocks if changes is None else blocks | {VARIATION: changes}
-
-
-def against_constant(task: Task, scores: FloatArray, constant: FloatArray) -> dict[str, Any]:
-    """Block of ``metrics.json``: whether a model's scores [n_rx, m] are clearly better than the constant prediction's.
-
-    Returns:
-        `wrf_mi.tasks.scores.summary` of the constant prediction, ``gain``, by which the model's mean score is better,
-        its standard error ``gain_error``, and ``beaten``.
-    """
-    sign = 1 if task.higher_is_better else -1
-    # Limited, as a few exact or absurd predictions would decide a mean of decibels.
-    gains = sign * (np.clip(scores, *task.limits) - np.clip(constant, *task.limits))
-    gains = gains[np.isfinite(gains)]
-    gain, error = float(gains.mean()), float(gains.std() / np.sqrt(len(gains)))
-    # More than the standard error, so that chance seldom passes for a gain, and more than the last digit that is shown,
-    # so that predicting all but zero does not either.
-    clear = gain > max(error, 10.0**-task.digits)
-    # The median is the score that tables show first.
-    beaten = clear and sign * float(np.nanmedian(scores) - np.nanmedian(constant)) > 0
-    return {**summary(constant + 0.0), "gain": gain, "gain_error": error, "beaten": beaten}
-
-
-def warnings_of(metrics: dict[str, Any]) -> list[str]:
-    """Lines about a model whose scores are not better than the constant prediction's, or that predicts a constant."""
-    block, changes, lines = metrics.get(CONSTANT), metrics.get(VARIATION), list[str]()
-    if block is not None and not block["beaten"]:
-        task = TASKS[metrics["task"]]
-        both = [f"{key} {metrics[task.block][key] + 0.0:.3f} against {block[key]:.3f}" for key in ("median", "mean")]
-        gain = f"gain {block['gain']:.2g}, standard error {block['gain_error']:.2g}"
-        what = f"{metrics['model']} is no better than predicting {constant_of(metrics)}"
-        lines.append(f"{what}: {task.label}, {', '.join(both)} ({gain}); see docs/data.md, Scores")
-    if changes is not None and changes["ratio"] < LEAST_VARIATION:
-        what = f"{metrics['model']} predicts nearly the same at all positions: standard deviation over the test rows"
-        deviations = f"{changes['prediction']:.2g}, of the truth {changes['truth']:.2g}"
-        lines.append(f"{what} {deviations}; do not use it to tell positions apart")
-    return lines
-
-
-def constant_of(metrics: dict[str, Any]) -> str:
-    """Words for the constant prediction that a run is compared with."""
-    return str(metrics[CONSTANT].get("words", "a constant"))  # earlier versions state none

@@ -34,6 +34,7 @@ from ..parallel import Scheduler, run_module
 from ..synthetic import load_record
 from ..tasks import TASKS
 from .applications import APPLICATIONS, COMMAND
+from .baselines import best_reference
 from .evaluate import stored_metrics
 from .folder import CONFIG, METRICS, RunRequest, is_finished, package_versions
 from .plan import plan_run
@@ -289,7 +290,8 @@ def _row(run: SweepRun, status: str) -> dict[str, Any]:
         return row | {"metrics": {}}
     task, references = TASKS[metrics["task"]], metrics["reference"]
     row |= {key: metrics[key] for key in HEADINGS if key in metrics} | {"metrics": metrics}
-    row |= {"score": task.label, "reference_median": references[task.headline(references)]["median"]}
+    best = best_reference(references, "median", task.higher_is_better)
+    row |= {"score": task.label, "reference_median": references[best]["median"]}
     return row | {key: metrics[task.block][key] for key in SCORES}
 
 

@@ -30,8 +30,8 @@ class Csi(Task):
     level_kind, level_note = "gain", "mean of |h|^2 over antennas and subcarriers, in the unit of the data"
     note = (
         "CEA is the channel estimation accuracy, -10 log10 of the relative squared error over a sample's antennas "
-        "and subcarriers; IDW averages the four nearest training rows by inverse squared distance; the copy of the "
-        "uplink takes each antenna's uplink coefficients for the downlink's."
+        "and subcarriers; IDW averages the nearest training rows, whose number held-out ones choose, by inverse "
+        "squared distance; the copy of the uplink takes each antenna's uplink coefficients for the downlink's."
     )
 
     def constants(self, observed: NDArray[Any]) -> dict[str, NDArray[Any]]:

@@ -34,8 +34,9 @@ class Rssi(Task):
     heading, quantity = "received signal strength", "RSSI (dBm)"
     level_kind, level_note = "power", "received power as the receiver reports it"
     note = (
-        "The absolute error in dB counts rows that were received; IDW averages the 100 nearest training rows "
-        "that the same receiver received by inverse squared distance, 0.4 m added."
+        "The absolute error in dB counts rows that were received; IDW averages the nearest training rows "
+        "that the same receiver received by inverse squared distance, 0.4 m added; held-out training rows choose their "
+        "number."
     )
 
     def floor_db(self, observed: NDArray[Any]) -> float:

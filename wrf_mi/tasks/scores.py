@@ -58,6 +58,23 @@ def abs_error_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
     return result
 
 
+def signed_errors_db(prediction: ArrayLike, truth: ArrayLike) -> dict[str, float]:
+    """Bias, standard deviation and root mean square of the errors ``prediction - truth`` of powers in dBm, dB.
+
+    Values have any shape; those that are NaN in the truth are left out. The standard deviation is about the bias, with
+    the number of values as its divisor, so that rmse^2 = bias^2 + std^2.
+
+    Returns:
+        ``bias`` (mean signed error), ``std`` and ``rmse``.
+
+    >>> signed_errors_db([-60.0, -70.0, -80.0], [-64.0, -70.0, np.nan])
+    {'bias': 2.0, 'std': 2.0, 'rmse': 2.8284271247461903}
+    """
+    error = np.asarray(prediction, float) - np.asarray(truth, float)
+    error = error[np.isfinite(error)]
+    return {"bias": float(error.mean()), "std": float(error.std()), "rmse": float(np.sqrt(np.square(error).mean()))}
+
+
 def cea_db(prediction: ArrayLike, truth: ArrayLike) -> FloatArray:
     """Channel estimation accuracy in dB, -10 log10(sum |prediction - truth|^2 / sum |truth|^2) over subcarriers.
 

@@ -49,8 +49,8 @@ class Spectrum(Task):
         "strong it is"
     )
     note = (
-        "SSIM is scikit-image's structural similarity with a data range of one; IDW averages the four nearest "
-        "training spectra by inverse squared distance."
+        "SSIM is scikit-image's structural similarity with a data range of one; IDW averages the nearest "
+        "training spectra, whose number held-out ones choose, by inverse squared distance."
     )
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:

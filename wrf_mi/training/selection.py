@@ -120,15 +120,17 @@ def hold_out_groups(split: Split, tx_pos_m: FloatArray, groups: int = GROUPS) ->
     count = min(groups, len(places_m)) if groups > GROUPS else min(GROUPS, len(rows) // ROWS_OF_GROUP, len(places_m))
     if count < 2:
         return split
-    rng, out = np.random.default_rng([split.seed, 3]), np.zeros(len(rows), bool)
+    rng = np.random.default_rng([split.seed, 3])
     fine = groups > GROUPS
     labels = cells(places_m, count)[place.reshape(-1)] if fine else clusters(tx_pos_m[rows], count, rng)
-    for group in rng.permutation(max(count, int(labels.max()) + 1)):
-        more = out | (labels == group)
+    sizes = np.bincount(labels, minlength=count)
+    taken, total = np.zeros(len(sizes), bool), 0
+    for group in rng.permutation(len(sizes)):
         # The first cluster may be larger than the share: without any, nothing could be chosen.
-        if more.mean() <= (HELD_OUT if out.any() else MOST_HELD_OUT):
-            out = more
-    if not out.any():
+        if (total + sizes[group]) / len(rows) <= (HELD_OUT if total else MOST_HELD_OUT):
+            taken[group], total = True, total + sizes[group]
+    out = taken[labels]
+    if not total:
         return split
     return replace(split, train=rows[~out], validation=np.sort(np.concatenate([split.validation, rows[out]])))
 

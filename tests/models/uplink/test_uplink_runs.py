@@ -71,14 +71,14 @@ def test_channels_of_an_array_are_scored_over_antennas_and_subcarriers(csi_folde
     error = np.square(np.abs(arrays["prediction"] - arrays["truth"])).sum(axis=(1, 2))
     expected = -10 * np.log10(error / np.square(np.abs(arrays["truth"])).sum(axis=(1, 2)))
     assert metrics["cea_db"]["median"] == pytest.approx(np.median(expected), abs=ROUNDING)
-    assert list(metrics["reference"]) == ["uplink", "idw4"]
+    assert list(metrics["reference"]) == ["uplink", "idw"]
     assert metrics["reference"]["uplink"]["median"] == pytest.approx(TURNED_DB, abs=1e-3)
-    assert metrics["reference"]["idw4"] == metrics["cea_db"]
+    assert metrics["reference"]["idw"].items() >= metrics["cea_db"].items()
     np.testing.assert_allclose(arrays["reference_uplink"], record.uplink[arrays["row"]], rtol=1e-6)
     assert read_run(out).reference_name == "copy of the uplink"
     assert (tmp_path / "page" / "index.html") == compare([out], tmp_path / "page")
     with (tmp_path / "page" / "compare.csv").open(newline="") as file:
-        assert [row["model"] for row in csv.DictReader(file)] == ["idw", "uplink", "idw4", "constant"]
+        assert [row["model"] for row in csv.DictReader(file)] == ["idw", "uplink", "idw", "constant"]
 
 
 def test_methods_are_fitted_to_measurements_and_scored_by_the_truth(turned: None, tmp_path: Path) -> None:

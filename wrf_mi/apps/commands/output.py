@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -43,15 +43,18 @@ def summary_table(title: str, blocks: Mapping[str, Mapping[str, float] | None], 
     return "\n".join(lines)
 
 
-def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) -> int:
-    """Print the content of ``metrics.json`` as a table or as JSON, and the run folder; the exit status."""
+def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool, more: Sequence[str] = ()) -> int:
+    """Print the content of ``metrics.json`` as a table, or as JSON, ``more`` lines and the run folder; exit status."""
     if as_json:
         return show(as_json, metrics, "")
-    from ...runs.results import rows_of_folds, warnings_of
+    from ...runs.baselines import verdicts, warnings_of
+    from ...runs.results import reference_words, rows_of_folds
     from ...tasks import TASKS
 
     task = TASKS[metrics["task"]]
-    references = {f"{words} ({key})": metrics["reference"].get(key) for key, words in task.references.items()}
+    stored = metrics["reference"]
+    in_order = [key for key in task.references if key in stored]
+    references = {f"{reference_words(task, stored, key)} ({key})": stored[key] for key in in_order}
     blocks = {metrics["model"]: metrics[task.block], **references}
     print(summary_table(f"{task.label} on {metrics['n_test']} test rows", blocks, 3))
     if metrics.get("stages"):
@@ -79,7 +82,7 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool) ->
             f"scores are cross-validated: each row is predicted by a fit to the other {folds['folds'] - 1} of "
             f"{of_folds or str(folds['folds']) + ' folds'}; the model is fitted to all rows"
         )
-    for line in warnings_of(metrics):
+    for line in (*verdicts(metrics), *more, *warnings_of(metrics)):
         print(line)
     if folder is not None:
         print(f"results: {folder}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,9 @@ def _add_evaluate(commands: Any) -> None:
     other.add_argument("--seed", type=int, metavar="N", help="seed of the split, and of the other fit (default: 0)")
     text = "draw how reliable probabilities of coverage are on test rows, P(level > threshold) against observed share"
     parser.add_argument("--reliability", metavar="FILE.png", help=text)
+    text = "also score local mean powers: signal strengths of test rows, measured and predicted, averaged in mW over "
+    text += "windows of so many wavelengths, such as 10 or 5,10,20 (docs/data.md, Scores)"
+    parser.add_argument("--local-mean", metavar="WAVELENGTHS", help=text)
     add_operator(parser)
 
 
@@ -59,24 +63,39 @@ def evaluate_command(a: Arguments) -> int:
     from ...runs.api import evaluate_run
 
     if a.split is not None:
-        refuse(a, ("reliability",), "is of the run's own test rows, not of --split")
+        refuse(a, ("reliability", "local_mean"), "is of the run's own test rows, not of --split")
+    windows = _windows(a.local_mean)
     if a.reliability is not None and Path(a.reliability).suffix.lower() != ".png":
         raise InputError(f"{a.reliability}: the picture is written as .png; give such a name")
     check_operator(a)
     metrics = evaluate_run(a.run, a.split, not a.no_operator)
+    lines = []
+    if windows:
+        from ...runs.local_mean import local_mean_scores
+
+        means = [local_mean_scores(a.run, wavelengths) for wavelengths in windows]
+        metrics, lines = metrics | {"local_mean": [asdict(mean) for mean in means]}, [str(mean) for mean in means]
     if a.reliability is None:
-        return show_metrics(metrics, None if a.split else Path(a.run), a.json)
+        return show_metrics(metrics, None if a.split else Path(a.run), a.json, lines)
     from ...core.files import write_figure
     from ..maps.coverage import reliability_figure, run_reliability
 
     result = run_reliability(a.run)
     write_figure(Path(a.reliability), reliability_figure({Path(a.run).resolve().name: result}))
     coverage = {"error": result.error, "brier": result.brier, "threshold_db": result.threshold_db.tolist()}
-    show_metrics(metrics | {"coverage": coverage}, Path(a.run), a.json)
+    show_metrics(metrics | {"coverage": coverage}, Path(a.run), a.json, lines)
     if not a.json:
         text = f"off by {result.error:.3f} on average, Brier score {result.brier:.3f}"
         print(f"coverage: observed share {text}: {a.reliability}")
     return 0
+
+
+def _windows(text: str | None) -> list[float]:
+    """Numbers of wavelengths of ``--local-mean``."""
+    try:
+        return [] if text is None else [float(number) for number in text.split(",")]
+    except ValueError:
+        raise InputError(f"--local-mean {text}: give numbers of wavelengths, such as 10 or 5,10,20") from None
 
 
 def _score_predictions(a: Arguments) -> int:
@@ -85,7 +104,7 @@ def _score_predictions(a: Arguments) -> int:
 
     if a.run is not None:
         raise InputError("evaluate: --predictions makes a run folder; omit RUN")
-    refuse(a, ("reliability", "no_operator"), "belongs to RUN, not to --predictions")
+    refuse(a, ("reliability", "local_mean", "no_operator"), "belongs to RUN, not to --predictions")
     if lacking := [name for name in ("dataset", "name", "out") if not stated(a, (name,))]:
         raise InputError(f"evaluate: --predictions needs --{lacking[0]}")
     options = {"n_train": a.n_train, "seed": a.seed or 0, "split": a.split or "official", "overwrite": a.replace}

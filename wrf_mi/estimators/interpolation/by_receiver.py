@@ -185,6 +185,7 @@ class ByReceiverModel(Model):
 
     uplink = "optional"
     several_carriers, headings = True, True
+    fitted: type[ByReceiver] = ByReceiver  #: class of its fitted models
 
     @abstractmethod
     def fit_single(self, rows: ReceiverRows) -> Single:
@@ -243,7 +244,7 @@ class ByReceiverModel(Model):
                 except InputError as error:
                     raise InputError(f"{record.name}, receiver {name}: {error}") from None
                 session.report(f"{self.name}: receivers", len(models) / enough.size)
-        return ByReceiver(self.name, models, headings is not None, carriers)
+        return self.fitted(self.name, models, headings is not None, carriers)
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
         """The models that `ByReceiver.arrays` described."""
@@ -254,4 +255,4 @@ class ByReceiverModel(Model):
             None if number in without else self.load_single(receiver, under(f"{number}/", arrays))
             for number, receiver in enumerate(receivers)
         ]
-        return ByReceiver(self.name, models, bool(arrays[HEADING]), carriers)
+        return self.fitted(self.name, models, bool(arrays[HEADING]), carriers)
