@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.array_files import keyed, under
+from ..core.stored import from_arrays, to_arrays
 from ..core.types import IntArray
 from ..estimators.held_out import HoldOut, predicted_rows
 from ..estimators.interpolation.kriging import Kriged, Kriging
@@ -75,19 +76,6 @@ class Residuals:
         """Expected residuals of a receiver at positions [m, 3], [m, *shape]; 0 without any rows."""
         kriged = self.by_receiver.get(receiver)
         return 0.0 if kriged is None else kriged.predict(tx_pos_m).reshape(len(tx_pos_m), *shape)
-
-    def arrays(self) -> Arrays:
-        """Arrays of a run file."""
-        arrays: Arrays = {}
-        for receiver, kriged in self.by_receiver.items():
-            arrays |= keyed(f"{receiver}/", kriged.arrays())
-        return arrays
-
-    @classmethod
-    def from_arrays(cls, arrays: Arrays, record: Record) -> Residuals:
-        """The residuals that `arrays` described."""
-        numbers = sorted({int(name.partition("/")[0]) for name in arrays})
-        return cls({k: Kriged.from_arrays(under(f"{k}/", arrays), record.receivers[k]) for k in numbers})
 
 
 PATHS = "paths"
@@ -319,7 +307,7 @@ class FittedMixture(Fitted):
         if self.reception is not None:
             arrays |= self.reception.arrays()
         if self.residuals is not None:
-            arrays |= keyed("residuals/", self.residuals.arrays())
+            arrays |= to_arrays(self.residuals, "residuals/")
         for name, fitted in self.parts.items():
             arrays |= keyed(f"{name}/", fitted.arrays())
         return arrays
@@ -330,7 +318,7 @@ class FittedMixture(Fitted):
         parts = {part: load(part, under(f"{part}/", arrays)) for part in map(str, arrays["names"])}
         mixture, stated = from_field_arrays(Mixture, under("mixture/", arrays)), json.loads(str(arrays["facts"]))
         stored, left = under("intervals/", arrays), under("residuals/", arrays)
-        residuals = Residuals.from_arrays(left, problem.record) if left else None
+        residuals = from_arrays(Residuals, left) if left else None
         intervals = from_field_arrays(Intervals, stored) if stored else None
         # Before deviations of some parts could count, those of all or of none did.
         deviations = arrays.get(DEVIATIONS, arrays["names"] if stated["sizes"] == STATED else np.zeros(0, str))

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...core.angles import FloatArray
 from ...core.array_files import keyed, under
+from ...core.stored import to_arrays
 from ..model import Arrays
 from .pooled_process import PooledProcess
 from .strength_terms import Poses
@@ -50,7 +51,7 @@ class Forest:
 
     def arrays(self) -> Arrays:
         """Arrays for `from_arrays`."""
-        parts = [keyed(f"{STORED}.{receiver}.", trees.arrays()) for receiver, trees in self._of_receiver.items()]
+        parts = [keyed(f"{STORED}.{receiver}.", to_arrays(trees)) for receiver, trees in self._of_receiver.items()]
         return {name: array for part in parts for name, array in part.items()}
 
     @classmethod
