@@ -72,11 +72,6 @@ MECHANISMS: Mapping[str, Mechanism] = {
     "receivers' patterns": Mechanism(((strengths, "RECEIVER_PATTERN_DB", strengths.NO_SHADOW_DB),)),
     "headings": Mechanism(settings=("heading=false",)),
     "Student-t noise": Mechanism(((strengths, "ROBUST_ROUNDS", 0),), code=(pooled_process.PooledProcess._reweighted,)),
-    "shift of skewed errors": Mechanism(
-        ((strengths, "SKEW_DB", 0.0), (strengths, "shift_of", lambda residual_db, prior_db=0.0: 0.0)),
-        code=(strength_fit.shift_of,),
-    ),
-    "noise of each receiver": Mechanism(((strength_fit, "RATIO", (1.0, 1.0)),), code=(strength_fit.Fit.set_ratio,)),
     "joined stops": Mechanism(((strengths, "STOP_ROWS", 1),), code=(strength_terms.stops_of,)),
 }
 

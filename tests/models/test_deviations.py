@@ -143,7 +143,7 @@ def test_files_of_earlier_fits_state_their_deviations_as_they_were() -> None:
         np.arange(5),
     )
     h = model.field.hyperparameters
-    noise_db = np.hypot(h.drift_db, h.noise_db) * (model.field.ratio * model.widen)[:, None]
+    noise_db = np.hypot(h.drift_db, h.noise_db) * model.widen[:, None]
     np.testing.assert_allclose(np.sqrt(unscaled.std**2 - unscaled.std_mean**2), noise_db + 0 * unscaled.std)
     stored = predicted(Strengths.from_arrays(arrays), record, np.arange(5))
     np.testing.assert_array_equal(stored.std_mean, predicted(model, record, np.arange(5)).std_mean)

@@ -83,7 +83,7 @@ class StrengthResidual(Stage):
         return option._replace(fit=fit)
 
     def finish(self, state: State, split: Split, session: Session) -> State:
-        """Deviations, shift and noise of each receiver, by stretches that are held out."""
+        """Deviations by stretches that are held out."""
         assert isinstance(state.fitted, Strengths)
         fitted = calibrated(state.fitted, state.problem.record, split.all_train, session.report, self.stated)
         return replace(state, fitted=fitted)

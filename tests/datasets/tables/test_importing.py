@@ -134,13 +134,13 @@ def test_times_of_another_unit_are_refused(tmp_path: Path) -> None:
 
 
 def test_further_columns_are_kept(tmp_path: Path) -> None:
-    frame = wide().assign(**{"hall RTT(mm)": np.arange(30.0), "device": "a", "count_x": 3})
-    imported(tmp_path, pandas.concat([frame, frame.assign(device="b")]))
+    frame = wide().assign(**{"hall RTT(mm)": np.arange(30.0), "operator": "a", "count_x": 3})
+    imported(tmp_path, pandas.concat([frame, frame.assign(operator="b")]))
     tables = [pandas.read_csv(path) for path in (tmp_path / "data").glob("*.csv")]
     kept = pandas.concat([table for table in tables if "rssi_hall" in table])
     order = [int(np.argmin(np.linalg.norm(kept[["x", "y"]] - place, axis=1))) for place in PLACES_M]
     np.testing.assert_allclose(kept["hall RTT(mm)"].iloc[order], np.arange(30.0))
-    assert set(kept.device) == {"a|b"}
+    assert set(kept.operator) == {"a|b"}
     assert set(kept.source_count_x) == {3}
 
 
@@ -154,6 +154,14 @@ def of_two_devices(frame: Any) -> Any:
 def test_rows_are_selected_by_a_column(tmp_path: Path) -> None:
     record = imported(tmp_path, of_two_devices(wide()), where={"device": "1"})
     np.testing.assert_allclose(in_order(record)[1], STRENGTHS, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("columns", [{"device": "a"}, {"walk": "a", "device": "c"}])
+def test_rows_of_a_device_or_walk_are_a_run(tmp_path: Path, columns: dict[str, str]) -> None:
+    first, other = columns, columns | {next(iter(columns)): "b"}
+    record = imported(tmp_path, pandas.concat([wide().assign(**first), (wide() - 8).assign(**other)]))
+    assert record.runs is not None
+    assert sorted(record.runs) == ["a"] * 30 + ["b"] * 30
 
 
 def test_headings_that_are_incomplete_are_kept_and_not_used(tmp_path: Path) -> None:
@@ -171,6 +179,22 @@ def test_receivers_of_a_scan_have_their_carriers(tmp_path: Path) -> None:
     stated = {receiver.name.removeprefix("anchor"): hz for receiver, hz in carriers}
     assert stated == {ap: 1e6 * carrier for ap, carrier in mhz.items()}
     assert len(record) == len(PLACES_M)
+
+
+def test_receivers_that_change_their_channel_keep_one_carrier(tmp_path: Path) -> None:
+    mhz = long().bssid.map({"kitchen": 2412, "hall": 5180, "7": 2412}).to_numpy(float)
+    hall = np.flatnonzero(long().bssid == "hall")
+    mhz[hall[:5]] = 5260  # another channel of the band
+    record = imported(tmp_path, long().assign(frequency=mhz))
+    names = [receiver.name.removeprefix("anchor") for receiver in record.receivers]
+    assert record.receiver_carriers_hz is not None
+    assert record.receiver_carriers_hz[names.index("hall")] == 5180e6
+    assert len(record) == len(PLACES_M)
+    assert "1 of 3 receivers changed their channel" in (tmp_path / "data" / "import.yml").read_text()
+    mhz[hall[:5]] = 2412  # another band: rows have carriers
+    (tmp_path / "bands").mkdir()
+    record = imported(tmp_path / "bands", long().assign(frequency=mhz))
+    assert record.carriers_hz is not None
 
 
 def test_hardware_addresses_match_in_any_case_and_notation(tmp_path: Path) -> None:

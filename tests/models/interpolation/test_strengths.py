@@ -13,7 +13,7 @@ from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.estimators.interpolation import strengths
 from wrf_mi.estimators.interpolation.pooled_process import PooledProcess, ReceiverObservations
-from wrf_mi.estimators.interpolation.strength_fit import folds, shift_of, widening
+from wrf_mi.estimators.interpolation.strength_fit import folds, widening
 from wrf_mi.estimators.interpolation.strength_settings import StrengthSettings
 from wrf_mi.estimators.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
 from wrf_mi.estimators.interpolation.strengths import Strengths, fit_strengths
@@ -267,16 +267,11 @@ def test_rows_of_one_place_hold_nothing_out() -> None:
     record = replace(made(30, 1.0), tx_pos_m=np.ones((30, 3)))
     searched = fit_strengths(record, np.arange(30), settings=replace(DEFAULTS, shadowing="searched"))
     assert searched.field.hyperparameters == DEFAULTS.hyperparameters
-    fitted = fit_strengths(record, np.arange(30))
-    assert fitted.shift_db == strengths.SKEW_DB
+    assert (fit_strengths(record, np.arange(30)).widen == 1).all()
 
 
-def test_skewed_residuals_shift_and_widen() -> None:
+def test_deviations_are_widened_by_residuals() -> None:
     rng = np.random.default_rng(0)
-    fades = 10 * np.log10(rng.exponential(size=40000))  # Rayleigh fading: mode 0 dB, mean -2.5 dB, median -1.6 dB
-    shift = shift_of(fades - fades.mean())
-    assert 1.2 < shift < 2.6
-    assert shift_of(np.zeros(1), 0.4) == 0.4
     wide = widening(rng.normal(0, 6, (1, 4000)), np.full((1, 4000), 3.0))
     assert wide[0] == pytest.approx(2, rel=0.06)
 

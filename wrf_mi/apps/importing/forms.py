@@ -32,7 +32,7 @@ MEANINGS = {
     "floor": "floor|floorid|floornumber|storey|level",
     "heading": "heading|yaw|orientation|bearing|azimuth|course|compass",
     "time": "time|timestamp|ts|datetime|date|rxtime|unixtime|epoch|t|firstseen",
-    "run": "run|session|visit|campaign|trajectory|track|walk",
+    "run": "run|session|visit|campaign|trajectory|track|walk|device|phone|handset|user",
     "split": "split|subset",
     "frequency": "frequency|freq|carrier|carrierfrequency|primaryfrequency|centerfreq|centrefrequency|centerfrequency",
 }

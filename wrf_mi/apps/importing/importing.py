@@ -52,6 +52,7 @@ from .receivers_table import read_receivers
 FACTS, PICTURE = "import.yml", "plan.png"  # files beside the tables: what the import assumed, and a plan of the rows
 MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
 MOST_CELLS = 50_000_000  # largest number of receivers times places: 2 GB while means are computed
+BAND = 0.25  # largest relative spread of the channels of one band: 0.14 of Wi-Fi at 5 GHz, while 2.4 and 5 GHz are two
 TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
 RADIOS = frozenset({"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "umts", "tdscdma", "lte", "nr", "5g"})
 """Values of a column of kinds of radio, in small letters."""
@@ -302,11 +303,21 @@ class _Import:
 
     def _carriers(self, carriers_hz: FloatArray, readings: Readings) -> dict[str, Any]:
         """Carriers of rows, none where each receiver has its own, as in a scan of Wi-Fi networks."""
-        pairs = np.unique(np.column_stack([readings.receiver, carriers_hz[readings.row]]), axis=0)
-        if len(np.unique(pairs[:, 1])) > 1 and len(pairs) == len(np.unique(pairs[:, 0])):
-            self.carrier_of = {readings.ids[int(number)]: float(carrier) for number, carrier in pairs}
-            return {}
-        return {"frequency_hz": carriers_hz}
+        heard = np.column_stack([readings.receiver, carriers_hz[readings.row]])
+        pairs, count = np.unique(heard, axis=0, return_counts=True)
+        # Access points change their channels now and then; where carriers are compared, every receiver has several.
+        parts = [np.flatnonzero(pairs[:, 0] == number) for number in np.unique(pairs[:, 0])]
+        several = [part for part in parts if len(part) > 1]
+        one_band = all(np.ptp(pairs[part, 1]) <= BAND * pairs[part, 1].min() for part in several)
+        if len(np.unique(pairs[:, 1])) == 1 or 2 * len(several) >= len(parts) or not one_band:
+            return {"frequency_hz": carriers_hz}
+        most = [pairs[part[np.argmax(count[part])]] for part in parts]
+        self.carrier_of = {readings.ids[int(number)]: float(carrier) for number, carrier in most}
+        if several:
+            named = listed([readings.ids[int(pairs[part[0], 0])] for part in several])
+            text = f"{len(several)} of {len(parts)} receivers changed their channel, and have that of most readings"
+            self.notes.append(f"{text}: {named}")
+        return {}
 
     def _means(self, readings: Readings, place: IntArray, places: int) -> tuple[list[str], Means]:
         """Ids of the receivers that remain, and the means of their readings at each place."""

@@ -31,9 +31,7 @@ STRETCH = (4, 150)
 """Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
 PLACE_M = 0.1  # grid whose cells are places: readings at a stop differ by what positions are known to
 BUFFER = 0.25  # share of a stretch that is left out on either side of it, as consecutive rows share noise
-TRUST = 500.0  # number of held-out values that weigh as much as the prior in estimates from their distribution
-SKEW_TRUST = 2000.0  # the same number for the middle of their narrowest half, which is less certain than a mean
-RATIO = (0.5, 2.0)  # bounds of the ratio of a receiver's noise to that of all
+TRUST = 100.0  # number of held-out values that weigh as much as the prior in a quantile of errors
 AREA_SHADOW_DB, AREA_NOISE_DB = 6.0, 2.0  # shadowing of areas a priori, and both parts of the noise
 LIKELIHOOD_STOPS, LIKELIHOOD_RECEIVERS, LIKELIHOOD_STEPS = 400, 12, 50
 """Largest numbers of stops and receivers in the likelihood, those with most rows, and of its evaluations."""
@@ -79,7 +77,7 @@ class PriorMean:
 class StrengthPosterior:
     """Posterior of the signal strengths, given stops (possibly none) and hyperparameters.
 
-    ``ratio`` [n_rx] is that of each receiver's noise to the noise of all; ``rounds`` reweight for Student-t noise.
+    ``rounds`` reweight for Student-t noise.
     Means are those of ``hyperparameters``, deviations those of ``spread`` (`likely_deviations`); None: the same.
     ``trees`` is the number of trees of what the mean terms leave; ``forest``: trees that were grown already.
     """
@@ -88,20 +86,19 @@ class StrengthPosterior:
         self,
         prior: PriorMean,
         hyperparameters: Hyperparameters,
-        ratio: FloatArray,
         stops: Stops,
         rounds: int = 0,
         spread: Hyperparameters | None = None,
         trees: int = 0,
         forest: Forest | None = None,
     ) -> None:
-        self.prior, self.hyperparameters, self.ratio, self.stops = prior, hyperparameters, ratio, stops
+        self.prior, self.hyperparameters, self.stops = prior, hyperparameters, stops
         self.spread, self.rounds = spread or hyperparameters, rounds
         self.headings = stops.poses.heading_rad is not None
         self._process = self._process_of(hyperparameters)
         self.trees, self.forest = trees, forest
         if trees and forest is None:
-            self.forest = Forest.grown(self._process, stops.poses, len(ratio), trees)
+            self.forest = Forest.grown(self._process, stops.poses, len(prior.receivers_m), trees)
 
     @cached_property
     def _moved(self) -> Poses:
@@ -120,9 +117,9 @@ class StrengthPosterior:
     def _process_of(self, h: Hyperparameters, prior: PriorMean | None = None) -> PooledProcess:
         """The process of hyperparameters with this lever, and of deviations of a prior with this mean."""
         parts = []
-        for (received, columns, value), count, ratio in zip(self._terms, self.stops.count, self.ratio, strict=True):
+        for (received, columns, value), count in zip(self._terms, self.stops.count, strict=True):
             # Reports of a stop average their own noise out, but not the fading that persists during the stop.
-            variance = (h.drift_db**2 + h.noise_db**2 / count[received]) * ratio**2
+            variance = h.drift_db**2 + h.noise_db**2 / count[received]
             parts.append(ReceiverObservations(received, columns, value, variance))
         sd = (prior or self.prior).deviations(self.headings)
         return PooledProcess(self._moved, parts, h.covariance, sd, h.variance(self.headings), self.rounds)
@@ -157,9 +154,10 @@ class StrengthPosterior:
         spread = self._spread_process  # computed here, not on threads
         return of_each(posterior, range(len(poses)), sum(map(len, poses)))
 
-    def noise(self, receiver: int) -> float:
+    @property
+    def noise(self) -> float:
         """Variance of a single report about the local mean power, dB^2."""
-        return float((self.spread.drift_db**2 + self.spread.noise_db**2) * self.ratio[receiver] ** 2)
+        return self.spread.drift_db**2 + self.spread.noise_db**2
 
     def mean(self, poses: Poses, receiver: int) -> FloatArray:
         """The mean of `predict`, dBm."""
@@ -206,7 +204,7 @@ def by_likelihood(
         logarithms[free] = chosen
         return logarithms
 
-    posterior = StrengthPosterior(few, start, np.ones(len(few.receivers_m)), stops)
+    posterior = StrengthPosterior(few, start, stops)
 
     def cost(chosen: FloatArray) -> float:
         penalty = float(np.square((chosen - middle[free]) / deviation[free]).sum())
@@ -253,12 +251,11 @@ def by_search(
     parts = [
         (join(measured.take(train)), measured.take(out)) for train, out in [*folds(measured.poses.position_m)][::2]
     ]
-    ones = np.ones(len(most))
 
     def error_db(hyperparameters: Hyperparameters) -> float:
         errors = list[FloatArray]()
         for stops, out in parts:
-            field = StrengthPosterior(prior, hyperparameters, ones, stops)
+            field = StrengthPosterior(prior, hyperparameters, stops)
             errors += [
                 np.abs(field.mean(out.poses, receiver) - out.value_dbm[receiver]) for receiver in range(len(most))
             ]
@@ -325,7 +322,6 @@ class Fit:
 
     def __init__(self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops]) -> None:
         self._prior, self._measured = prior, measured
-        self.ratio = np.ones(len(prior.receivers_m))
         self.spread: Hyperparameters | None = None
         self.trees = 0  # number of trees of each fold
         used = folds(measured.poses.position_m)
@@ -346,7 +342,6 @@ class Fit:
             field = StrengthPosterior(
                 self._prior,
                 hyperparameters,
-                self.ratio,
                 replace(stops, value_dbm=value_dbm),
                 rounds,
                 self.spread,
@@ -365,36 +360,9 @@ class Fit:
 
             predictions = of_each(predicted, range(len(mean)), sum(map(len, received)))
             for receiver, (value, variance) in enumerate(predictions):
-                total = variance + field.noise(receiver)
+                total = variance + field.noise
                 mean[receiver, received[receiver]], std[receiver, received[receiver]] = value, np.sqrt(total)
         return mean, std
-
-    def set_ratio(self, hyperparameters: Hyperparameters) -> None:
-        """Set ``ratio`` by the spread of each receiver's held-out residuals."""
-        residual_db = self.held_out(hyperparameters)[0] - self._measured.value_dbm
-        received = [row[np.isfinite(row)] for row in np.abs(residual_db)]
-        spread = np.array([np.median(row) if len(row) else 1 for row in received])
-        count = np.array([len(row) for row in received])
-        # Shrunk towards 1 in the logarithm: the spread of few residuals is chance.
-        self.ratio = np.clip(spread / np.median(spread), *RATIO) ** (count / (count + TRUST))
-
-
-def shift_of(residual_db: FloatArray, prior_db: float = 0.0) -> float:
-    """Shift of predictions that minimises the median absolute residual (measured minus predicted), dB.
-
-    Fades reach deeper than peaks, so the narrowest half of the residuals lies above their mean (the shorth, Andrews et
-    al., "Robust Estimates of Location" (1972)). With few residuals the prior dominates.
-    """
-    values = np.sort(residual_db[np.isfinite(residual_db)])
-    half = len(values) // 2
-    if half < 2:
-        return prior_db
-    # The middle of the narrowest half is erratic; the mean over halves of nearly that width is not.
-    low, high = values[: len(values) - half], values[half:]
-    near = high - low <= (high - low).min() * 1.01
-    middle = (high + low)[near] / 2
-    weight = len(values) / (len(values) + SKEW_TRUST)
-    return float(weight * middle.mean() + (1 - weight) * prior_db)
 
 
 def widening(residual_db: FloatArray, std_db: FloatArray) -> FloatArray:
@@ -406,7 +374,7 @@ def widening(residual_db: FloatArray, std_db: FloatArray) -> FloatArray:
     known = np.isfinite(score)
 
     def quantile(values: FloatArray, prior: float) -> float:
-        weight = len(values) / (len(values) + TRUST / 5)
+        weight = len(values) / (len(values) + TRUST)
         return float(np.quantile(values, LEVEL) ** weight * prior ** (1 - weight)) if len(values) else prior
 
     pooled = quantile(score[known], 1.0)

@@ -1,8 +1,8 @@
 """Kriging of received signal strengths: path loss or traced power, patterns and shadowing, pooled over receivers.
 
 Expected is free space, or the local mean of traced power (`wrf_mi.tracing.power_map`); measurements correct it. Common
-terms are in `strength_terms`; hyperparameters, the noise of each receiver, and the calibration of predictions come from
-held-out stretches of the training rows (`strength_fit`). Terms that all receivers share serve receivers without rows.
+terms are in `strength_terms`; hyperparameters and the calibration of predictions come from held-out stretches of the
+training rows (`strength_fit`). Terms that all receivers share serve receivers without rows.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from .strength_fit import (
     by_likelihood,
     by_search,
     likely_deviations,
-    shift_of,
     widening,
 )
 from .strength_settings import (
@@ -64,7 +63,6 @@ MOST_COVARIANCES = 2e8
 ROBUST_ROUNDS = 2
 LEAST_HEARD = 4  # receivers with more than a few rows that tell how well the others are predicted from them
 NO_SHADOW_DB = 1e-3  # standard deviation of shadowing where there is none: it has to be above zero
-SKEW_DB = 0.4  # shift of predictions a priori, as fades reach deeper than peaks
 OFFSET_SD_DB = 10.0  # standard deviation of the common offset of all receivers about the transmit power a priori
 EXPONENT_SD = (1.0, 0.3)
 """Standard deviations of the exponent of distance about free space's: common, and of each receiver."""
@@ -82,7 +80,6 @@ class Strengths(Fitted):
     """Fitted signal strengths; made by `fit_strengths`."""
 
     field: StrengthPosterior
-    shift_db: float
     widen: FloatArray  # factor of each receiver's standard deviations [n_rx]
     fit_facts: dict[str, float]  # numbers of the fit for `facts`
     shadowing: str = DEFAULT  # where hyperparameters come from, see `StrengthSettings`
@@ -100,13 +97,13 @@ class Strengths(Fitted):
         """
         position_m = finite_positions(inputs, "kriging")
         mean, std, std_mean = np.empty((3, len(position_m)))
-        noise = self.field.noise(receiver) * self.widen[receiver] ** 2
+        noise = self.field.noise * self.widen[receiver] ** 2
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
             with one_blas_thread():
                 means, variances = zip(*self.field.predict(poses, receiver), strict=True)
             # Of unknown headings: variance within each, and between their means.
             variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
-            mean[rows] = np.mean(means, axis=0) + self.shift_db
+            mean[rows] = np.mean(means, axis=0)
             std[rows], std_mean[rows] = np.sqrt(variance + noise), np.sqrt(variance)
         return Prediction(mean, std, std_mean=std_mean)
 
@@ -115,7 +112,7 @@ class Strengths(Fitted):
         position_m = finite_positions(inputs, "kriging")
         mean = np.empty(len(position_m))
         for rows, poses in self._chunks(position_m, inputs.tx_heading_rad):
-            mean[rows] = np.mean([self.field.mean(each, receiver) for each in poses], axis=0) + self.shift_db
+            mean[rows] = np.mean([self.field.mean(each, receiver) for each in poses], axis=0)
         return mean
 
     def tracing_once(self) -> Strengths:
@@ -133,7 +130,7 @@ class Strengths(Fitted):
         stops = _stops(_measured(record, rows, field.headings))
         with one_blas_thread():
             posterior = StrengthPosterior(
-                field.prior, field.hyperparameters, field.ratio, stops, field.rounds, field.spread, field.trees
+                field.prior, field.hyperparameters, stops, field.rounds, field.spread, field.trees
             )
         return replace(self, field=posterior)
 
@@ -162,9 +159,7 @@ class Strengths(Fitted):
             "base": np.append(prior.transmit_dbm, prior.frequency_hz),
             "prior.shared": prior.sd,
             "prior.rx": prior.rx_sd_db,
-            "ratio": field.ratio,
             "rounds": field.rounds,
-            "shift_db": self.shift_db,
             "widen": self.widen,
             "shadowing": self.shadowing,
             "options": json.dumps(list(self.options)),
@@ -206,11 +201,11 @@ class Strengths(Fitted):
             spread = from_field_arrays(Hyperparameters, arrays, "spread.")
         rounds, trees = int(arrays["rounds"]), int(arrays.get("trees", 0))
         forest = Forest.from_arrays(arrays)
-        field = StrengthPosterior(prior, hyperparameters, arrays["ratio"], stops, rounds, spread, trees, forest)
+        field = StrengthPosterior(prior, hyperparameters, stops, rounds, spread, trees, forest)
         facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
         shadowing = str(arrays.get("shadowing", DEFAULT))
         options = json.loads(str(arrays.get("options", "[]")))
-        return cls(field, float(arrays["shift_db"]), arrays["widen"], facts, shadowing, options)
+        return cls(field, arrays["widen"], facts, shadowing, options)
 
     def facts(self) -> dict[str, Any]:
         """Hyperparameters, calibration, and error on held-out rows."""
@@ -221,12 +216,8 @@ class Strengths(Fitted):
             "transmit_dbm": self.field.prior.transmit_dbm,
             "shadowing": self.shadowing,
             **asdict(self.field.hyperparameters),
-            "noise_ratio": [float(ratio) for ratio in self.field.ratio],
-            "shift_db": self.shift_db,
             "widen": [float(factor) for factor in self.widen],
-            "noise_of_reading_db": [
-                float(np.sqrt(self.field.noise(k)) * factor) for k, factor in enumerate(self.widen)
-            ],
+            "noise_of_reading_db": [float(np.sqrt(self.field.noise) * factor) for factor in self.widen],
             **self.fit_facts,
         }
         return {"fitted": fitted} | ({"options": list(self.options)} if self.options else {})
@@ -251,7 +242,7 @@ def fit_strengths(
         on_progress: progress callback.
         stated: names of the hyperparameters that hold, whatever the likelihood of the others; None: those that differ
             from their defaults.
-        calibrate: whether deviations, shift and the receivers' noise come from held-out stretches, see `calibrated`.
+        calibrate: whether deviations come from held-out stretches, see `calibrated`.
 
     Raises:
         InputError: a record of another task or without its carrier, or neither rows nor a map.
@@ -275,18 +266,16 @@ def fit_strengths(
         h = hyperparameters
         drift_db = float(np.linalg.norm([h.drift_db, h.shadow_db, h.body_db]))
         hyperparameters = replace(h, drift_db=drift_db, shadow_db=NO_SHADOW_DB, body_db=0.0)
-    ones, trees = np.ones(len(measured.value_dbm)), TREES_OF_ALL * (shadowing == TREES)
-    field = StrengthPosterior(prior, hyperparameters, ones, _stops(measured), ROBUST_ROUNDS, trees=trees)
-    # Traces at exact positions have no fades left in what they do not predict.
-    shift = 0.0 if power_map is not None and power_map.exact else SKEW_DB
-    strengths = Strengths(field, shift, ones, {"rows": float(len(measured.rows))}, shadowing)
+    trees = TREES_OF_ALL * (shadowing == TREES)
+    field = StrengthPosterior(prior, hyperparameters, _stops(measured), ROBUST_ROUNDS, trees=trees)
+    strengths = Strengths(field, np.ones(len(measured.value_dbm)), {"rows": float(len(measured.rows))}, shadowing)
     return calibrated(strengths, record, rows, on_progress, stated) if calibrate else strengths
 
 
 def calibrated(
     strengths: Strengths, record: Record, rows: IntArray, on_progress: OnProgress = quiet, stated: Collection[str] = ()
 ) -> Strengths:
-    """The fit to some rows with their shift, deviations and noise of each receiver by stretches that are held out.
+    """The fit to some rows with deviations by stretches that are held out.
 
     Deviations of hyperparameters that are not ``stated`` are by likelihood.
     """
@@ -298,27 +287,22 @@ def calibrated(
         return strengths
     fit = Fit(prior, measured, _stops)
     fit.trees = min(TREES_OF_FOLD, field.trees)
-    fit.set_ratio(hyperparameters)
     fit.spread = _deviations(strengths, stated)
     on_progress("strengths: held-out rows", 0.8)
     mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
     residual = values - mean
-    shift = shift_of(residual, strengths.shift_db)
-    widen = widening(residual - shift, std)
+    widen = widening(residual, std)
     few = np.isfinite(values).sum(axis=1) < FEW_ROWS
     if few.any() and len(few) - few.sum() >= LEAST_HEARD:
         # At receivers without rows nearby errors are those of the common terms, as at others that are left out.
         mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS, unheard=True)
-        widen[few] = np.maximum(widen, widening(values - mean - shift, std))[few]
+        widen[few] = np.maximum(widen, widening(values - mean, std))[few]
     if np.isfinite(residual).any():
-        facts["held_out_db"] = float(np.nanmedian(np.abs(residual - shift)))
+        facts["held_out_db"] = float(np.nanmedian(np.abs(residual)))
     on_progress("strengths: all rows", 0.9)
-    # Trees are grown anew, of what the mean with these ratios leaves.
-    field = StrengthPosterior(
-        prior, hyperparameters, fit.ratio, field.stops, ROBUST_ROUNDS, fit.spread, trees=field.trees
-    )
+    field = StrengthPosterior(prior, hyperparameters, field.stops, ROBUST_ROUNDS, fit.spread, field.trees, field.forest)
     on_progress("strengths: all rows", 1.0)
-    return replace(strengths, field=field, shift_db=shift, widen=widen, fit_facts=facts)
+    return replace(strengths, field=field, widen=widen, fit_facts=facts)
 
 
 def _deviations(strengths: Strengths, stated: Collection[str]) -> Hyperparameters | None:
