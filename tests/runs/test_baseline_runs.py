@@ -61,7 +61,7 @@ def test_command_trains_as_the_function_does(flat_folder: Path, run: Path, tmp_p
     metrics = command.json(["train", flat_folder, "--model", "mri", "--out", few, *chosen])
     assert (metrics["seed"], metrics["split"], metrics["n_train"]) == (4, "random", 12)
     with np.load(few / "model.npz") as arrays:
-        np.testing.assert_array_equal(arrays["0/law"], arrays["1/law"])  # one law for all
+        np.testing.assert_array_equal(arrays["models/0/law"], arrays["models/1/law"])  # one law for all
 
 
 def test_progress_names_the_fold_and_a_stop_in_a_part_the_run_to_resume() -> None:

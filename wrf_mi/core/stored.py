@@ -19,6 +19,7 @@ from __future__ import annotations
 import collections.abc
 import dataclasses
 import json
+import sys
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -71,16 +72,18 @@ def from_arrays(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], prefix: st
     return kind(**values)
 
 
-@cache
-def _hints(kind: type) -> dict[str, Any]:
-    return typing.get_type_hints(kind, include_extras=True)
+def _hint(kind: Any, name: str) -> Any:
+    """Annotation of a field; names in those of fields that are not stored may be known to type checkers alone."""
+    base = next(each for each in kind.__mro__ if name in vars(each).get("__annotations__", ()))
+    alone = types.SimpleNamespace(__annotations__={name: base.__annotations__[name]})
+    return typing.get_type_hints(alone, vars(sys.modules[base.__module__]), include_extras=True)[name]
 
 
 @cache
 def _fields(kind: Any) -> list[tuple[dataclasses.Field[Any], Any]]:
     """Fields of a dataclass that are stored, and their annotations."""
     stored = (field for field in dataclasses.fields(kind) if field.init and field.name not in _not_stored(kind))
-    return [(field, _hints(kind)[field.name]) for field in stored]
+    return [(field, _hint(kind, field.name)) for field in stored]
 
 
 @cache

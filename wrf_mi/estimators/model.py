@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from ..core import AntennaOptions, InputError, Prediction, Receiver, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
-from ..core.settings import changed, settings_from, with_settings
+from ..core.settings import changed, with_settings
 from ..core.stored import Arrays as Arrays
 from ..core.stored import from_arrays, to_arrays
 from ..core.types import Inputs as Inputs
@@ -360,26 +359,3 @@ def known_positions(record: Record, rows: IntArray, name: str) -> FloatArray:
 def slices(count: int, size: int) -> list[slice]:
     """Slices of ``size`` rows each, the last possibly of fewer, that cover so many rows."""
     return [slice(start, min(start + size, count)) for start in range(0, count, size)]
-
-
-def field_arrays(value: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """Fields of a dataclass instance that are not None, as arrays by ``prefix`` and name."""
-    named = ((field.name, getattr(value, field.name)) for field in fields(value))
-    return {f"{prefix}{name}": np.asarray(content) for name, content in named if content is not None}
-
-
-def from_field_arrays(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Kind:
-    """Instance of the dataclass ``kind`` from `field_arrays`; arrays without axes become numbers."""
-    names = (field.name for field in fields(cast(Any, kind)) if f"{prefix}{field.name}" in arrays)
-    stored = {name: arrays[f"{prefix}{name}"] for name in names}
-    return kind(**{name: value if value.ndim else value.item() for name, value in stored.items()})
-
-
-def settings_array(settings: Any) -> NDArray[Any]:
-    """Settings as an array of a run file."""
-    return np.asarray(json.dumps(asdict(settings)))
-
-
-def stored_settings(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], name: str) -> Kind:
-    """Settings of a run file, from `settings_array`."""
-    return settings_from(kind, json.loads(str(arrays["settings"])), name)
