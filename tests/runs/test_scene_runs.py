@@ -169,8 +169,8 @@ def test_run_that_validated_no_step_opens_with_an_infinite_reach(fit: Fit, tmp_p
     position = np.array([[1.9, 2.9, 1.5]])
     assert np.isfinite(run.predict(position).mean).all()
     arrays, seconds = read_fitted(run.folder, MODELS["wrf-gs+"].serving("spectrum", True))
-    write_fitted(run.folder, arrays | {"reach_m": np.array(np.nan)}, seconds)
-    with pytest.raises(InputError, match="reach_m: not a number"):
+    write_fitted(run.folder, arrays | {"reach/length_m": np.array(np.nan)}, seconds)
+    with pytest.raises(InputError, match="reach/length_m: not a number"):
         open_run(run.folder).predict(position)
 
 

@@ -75,6 +75,8 @@ class FittedField(Fitted):
 
     def __post_init__(self) -> None:
         self.held_out: HeldOutReports | None = None
+        if self.reach is not None and np.isnan(self.reach.length_m):
+            raise InputError("array reach/length_m: not a number; train the run anew")
         # Of Gaussians that no held-out row gained by, nothing is stored and nothing evaluated.
         used = self.problem.scene is None or "position" in self.params
         self.field = field_of(self.config, self.form) if used else None
