@@ -21,7 +21,7 @@ from .kriging import GenericKriging, UncertainKriged, asks_generic, kriged
 from .path_loss import NEAREST_M
 
 Complex = NDArray[np.complexfloating[Any, Any]]
-NEIGHBOURS = 32
+NEIGHBOURS = 32  # nearest rows that predict: farther ones are screened by them, and a solve costs their cube
 SHARES = (0.3, 0.6, 0.9, 0.99, 0.999)
 """Candidate shares of the field in the residual power, the rest being noise; held-out rows choose."""
 CERTAIN = 3.0  # standard errors by which predictions with the field must be better than without

@@ -58,7 +58,7 @@ STARTS = 60  # starts of the phase retrieval of one spectrum, at most
 LONGEST, SHORTEST = 4.6, 0.25  # lengths over which a wave stays coherent, in wavelengths
 LEAST_ROWS = 8  # least number of spectra for a covariance of signals
 
-DRAWS = 64
+DRAWS = 64  # draws of which the expected minimum and maximum of a spectrum are means
 COARSE = 0.1  # spacing of the directions of draws as a share of a lobe's width, wavelength over aperture
 CLEAR = 100.0
 """Ratio above which the Rician's moments are taken from their series, which has six digits where differences cancel."""

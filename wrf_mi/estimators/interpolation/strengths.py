@@ -61,7 +61,7 @@ HEADINGS = 8  # headings over which the prediction is averaged where the heading
 CHUNK = 1024  # transmitters predicted together, which bounds the memory of their covariances with the rows
 MOST_COVARIANCES = 2e8
 """Covariances between stops over all receivers, whose factors take 1.6 GB; with more, stops are thinned."""
-ROBUST_ROUNDS = 2
+ROBUST_ROUNDS = 2  # rounds of weights for Student-t noise, by the residuals of the one before
 LEAST_HEARD = 4  # receivers with more than a few rows that tell how well the others are predicted from them
 NO_SHADOW_DB = 1e-3  # standard deviation of shadowing where there is none: it has to be above zero
 OFFSET_SD_DB = 10.0  # standard deviation of the common offset of all receivers about the transmit power a priori
