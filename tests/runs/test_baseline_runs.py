@@ -137,7 +137,7 @@ def test_damaged_runs_are_refused(
     run: Path, tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str]
 ) -> None:
     damaged = copied(run, tmp_path / "run")
-    damaged_models_refused(damaged, "1/law", capsys)
+    damaged_models_refused(damaged, "models/1/law", capsys)
     (damaged / "model.npz").unlink()
     split = (damaged / "split.npz").read_bytes()
     (damaged / "split.npz").write_bytes(b"")

@@ -112,10 +112,6 @@ def _origin(hint: Any) -> Any:
     return typing.get_origin(kind) or kind
 
 
-def _is_dataclass(kind: Any) -> bool:
-    return dataclasses.is_dataclass(kind)
-
-
 def _is_plain(hint: Any) -> bool:
     """Whether JSON has the values of an annotation."""
     if hint is Ellipsis or typing.get_origin(hint) is Literal:
@@ -126,7 +122,7 @@ def _is_plain(hint: Any) -> bool:
     arguments = typing.get_args(alternatives[0])
     if kind in (*SEQUENCES, *MAPPINGS):
         return all(map(_is_plain, arguments))
-    if _is_dataclass(kind):
+    if hasattr(kind, "__dataclass_fields__"):
         return not _not_stored(kind) and all(_is_plain(each) for _, each in _fields(kind))
     return kind in (Any, Literal, bool, int, float, str)
 
@@ -147,7 +143,7 @@ def _classes(hint: Any) -> dict[str, type]:
             yield from below(each)
 
     classes = [each for kind in _alternatives(hint) if isinstance(kind, type) for each in below(kind)]
-    return {each.__name__: each for each in classes if _is_dataclass(each)}
+    return {each.__name__: each for each in classes if hasattr(each, "__dataclass_fields__")}
 
 
 def _is_named(hint: Any) -> bool:
