@@ -162,7 +162,7 @@ def huber(prediction, truth, batch, *shape):
     return dr.mean(dr.select(error < LIMIT, dr.square(error) / 2, LIMIT * (error - LIMIT / 2)))
 """
 STEPS = """
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -170,24 +170,19 @@ from wrf_mi.core import Prediction
 from wrf_mi.stages.further import Further, FurtherStage
 from wrf_mi.stages.stage import Option
 
+@dataclass
 class InSteps(Further):
     \"\"\"Strengths of an instrument that reports multiples of a step.\"\"\"
 
     stage = "steps"
-
-    def __init__(self, before, step_db):
-        super().__init__(before)
-        self.step_db = step_db
+    step_db: float
 
     def predict(self, inputs, receiver):
         prediction = self.before.predict(inputs, receiver)
         return Prediction(self.step_db * np.round(prediction.mean / self.step_db), prediction.std)
 
-    def own_arrays(self):
-        return {"step_db": np.asarray(self.step_db)}
-
 class Steps(FurtherStage):
-    name = "steps"
+    name, fitted = "steps", InSteps
 
     def options(self, problem, split):
         if problem.record.task.name != "rssi":
@@ -198,9 +193,6 @@ class Steps(FurtherStage):
         values = np.unique(state.problem.record.observation[:, split.all_train])
         step_db = float(np.diff(values[np.isfinite(values)]).min())
         return replace(state, fitted=InSteps(state.fitted, step_db))
-
-    def load(self, arrays, before):
-        return InSteps(before, float(arrays["step_db"]))
 
 STAGE = Steps()
 """

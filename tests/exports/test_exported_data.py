@@ -304,7 +304,7 @@ def test_imported_field_predicts_the_same_bits(runs: dict[str, Path], tmp_path: 
     for name, values in before.field.params.items():
         np.testing.assert_array_equal(run.field.params[name], values)
     with np.load(tmp_path / "field.npz", allow_pickle=False) as stored:
-        assert stored["param/position"].shape == (3, 8)
+        assert stored["params/position"].shape == (3, 8)
 
 
 def test_damaged_and_other_files_are_refused(runs: dict[str, Path], tmp_path: Path) -> None:
@@ -314,10 +314,13 @@ def test_damaged_and_other_files_are_refused(runs: dict[str, Path], tmp_path: Pa
     with np.load(file) as stored:
         arrays = dict(stored)
     for change, message in (
-        ({"export/format": np.array(9)}, "format 9, this version reads 1"),
+        ({"export/format": np.array(9)}, "format 9, this version reads 2"),
         ({"export/format": None}, "not written by export"),
         ({"export/config": None}, "incomplete"),
-        ({"param/position": np.full_like(arrays["param/position"], np.nan)}, "param/position has numbers that are not"),
+        (
+            {"params/position": np.full_like(arrays["params/position"], np.nan)},
+            "params/position has numbers that are not",
+        ),
     ):
         np.savez(file, **{key: values for key, values in (arrays | change).items() if values is not None})
         error_line(import_field, file, tmp_path / "run", message)

@@ -47,7 +47,7 @@ def test_commands_train_an_attribute_of_an_installed_package(flat_folder: Path, 
     errors = [json.loads(results[name][1])["abs_error_db"]["mean"] for name in ("trained", "resumed", "scored")]
     assert errors[0] == pytest.approx(errors[1]) == pytest.approx(errors[2])
     with np.load(run / "model.npz") as arrays:
-        stored = arrays["param/roughness"]
+        stored = arrays["params/roughness"]
     assert stored.shape[0] == 1
     assert not np.isin(stored, np.float32([0.1, 0.05])).any()  # all have been trained
     exported = trimesh.load(tmp_path / "splat.ply").metadata["_ply_raw"]["vertex"]["data"]["roughness"]

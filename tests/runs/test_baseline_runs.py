@@ -62,7 +62,7 @@ def test_command_trains_as_the_function_does(flat_folder: Path, run: Path, tmp_p
     metrics = command.json(["train", flat_folder, "--model", "mri", "--out", few, *chosen])
     assert (metrics["seed"], metrics["split"], metrics["n_train"]) == (4, "random", 12)
     with np.load(few / "model.npz") as arrays:
-        np.testing.assert_array_equal(arrays["0/law"], arrays["1/law"])  # one law for all
+        np.testing.assert_array_equal(arrays["models/0/law"], arrays["models/1/law"])  # one law for all
 
 
 def test_progress_names_the_fold_and_a_stop_in_a_part_the_run_to_resume() -> None:
@@ -138,7 +138,7 @@ def test_damaged_runs_are_refused(
     run: Path, tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str]
 ) -> None:
     damaged = copied(run, tmp_path / "run")
-    damaged_models_refused(damaged, "1/law", capsys)
+    damaged_models_refused(damaged, "models/1/law", capsys)
     (damaged / "model.npz").unlink()
     split = (damaged / "split.npz").read_bytes()
     (damaged / "split.npz").write_bytes(b"")

@@ -184,11 +184,11 @@ def test_traced_strengths_take_the_mean_gain_or_offset(law: Record, tmp_path: Pa
     hall = make_scene(tmp_path / "layout.csv", tmp_path / "scene", height_m=8.0).folder
     traced: dict[str, Any] = {"model": "ray-tracing", "scene": hall, "split": "receiver:2"}
     plain = train(law, out=tmp_path / "run", settings=["depth=1"], **traced).folder
-    offset_db = arrays_in(plain / "model.npz")["offset_db"]
+    offset_db = arrays_in(plain / "model.npz")["offsets/offset_db"]
     assert offset_db[2] == pytest.approx(offset_db[[0, 1, 3]].mean())
     settings = ["depth=1", "calibration=gain", "steps=40", "validate_every=20"]
     run = train(law, out=tmp_path / "calibrated", settings=settings, **traced).folder
-    gain = [arrays_in(run / "model.npz")[f"param/receiver.anchor{k}.gain"] for k in range(4)]
+    gain = [arrays_in(run / "model.npz")[f"params/receiver.anchor{k}.gain"] for k in range(4)]
     np.testing.assert_allclose(gain[2], np.mean([gain[0], gain[1], gain[3]], axis=0), rtol=1e-6)
     assert np.isfinite(read_run(run).prediction[2]).all()
     assert np.ptp([gain[k][0] for k in (0, 1, 3)]) > 0.3  # offsets of -3, 1 and 9 dB
@@ -202,14 +202,14 @@ def test_gaussians_are_seen_from_the_pose_of_a_new_receiver(name: str, law: Reco
     split = replace(make_splits(law, "official")[0], held_receivers=(4,))
     settings = ["steps=20", "validate_every=10", "initial.gaussians=40"]
     run = train(record, name, out=tmp_path / "run", split=split, settings=settings)
-    level = arrays_in(run.folder / "model.npz")["param/level"][0]
+    level = arrays_in(run.folder / "model.npz")["params/level"][0]
     assert level[4] == pytest.approx(level[:4].mean(), rel=1e-6)
     model = open_run(run.folder, record)
     clone, known = (model.predict(law.tx_pos_m[40:], receiver).mean for receiver in ("copy", "anchor1"))
     np.testing.assert_allclose(clone - known, 20 / np.log(10) * (level[4] - level[1]), atol=1e-2)
     broken = np.where(np.arange(5)[:, None] == 4, 1e6, record.observation).astype(np.float32)
     again = train(replace(record, observation=broken), name, out=tmp_path / "broken", split=split, settings=settings)
-    np.testing.assert_allclose(arrays_in(again.folder / "model.npz")["param/level"][0], level, rtol=1e-3)
+    np.testing.assert_allclose(arrays_in(again.folder / "model.npz")["params/level"][0], level, rtol=1e-3)
 
 
 def test_offsets_of_receivers_that_heard_nothing() -> None:

@@ -165,12 +165,12 @@ def test_receivers_poses_are_trained_where_a_rate_is_given(fit: Fit, tmp_path: P
 
 def test_run_that_validated_no_step_opens_with_an_infinite_reach(fit: Fit, tmp_path: Path) -> None:
     run = fit(tmp_path / "run", "steps=20", "validate_every=1000", "patience=0", "optimiser.warm_up=5")
-    assert np.isinf(run.fitted.arrays()["reach_m"])
+    assert np.isinf(run.fitted.reach.length_m)
     position = np.array([[1.9, 2.9, 1.5]])
     assert np.isfinite(run.predict(position).mean).all()
     arrays, seconds = read_fitted(run.folder, MODELS["wrf-gs+"].serving("spectrum", True))
-    write_fitted(run.folder, arrays | {"reach_m": np.array(np.nan)}, seconds)
-    with pytest.raises(InputError, match="reach_m: not a number"):
+    write_fitted(run.folder, arrays | {"reach/length_m": np.array(np.nan)}, seconds)
+    with pytest.raises(InputError, match="reach/length_m: not a number"):
         open_run(run.folder).predict(position)
 
 

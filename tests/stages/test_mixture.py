@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 import wrf_mi
-from wrf_mi.core import InputError, Prediction, Record, Split
-from wrf_mi.core.array_files import stored_arrays, write_arrays
+from wrf_mi.core import Prediction, Record, Split
 from wrf_mi.datasets import make_splits
 from wrf_mi.estimators import held_out
 from wrf_mi.estimators.few_rows import with_few_rows
 from wrf_mi.estimators.model import Arrays, Decomposition, Fitted, Inputs, default_settings
 from wrf_mi.models import MODELS, Problem, Session
-from wrf_mi.runs.folder import FITTED
-from wrf_mi.stages.fitted import DEVIATIONS, STATED, FittedMixture, deviation_weights
+from wrf_mi.stages.fitted import FittedMixture, deviation_weights
 from wrf_mi.stages.mixture import ChosenWeights, MixtureFit, Part
 from wrf_mi.training.by_distance import Intervals, Mixture, constant
 from wrf_mi.training.selection import RowDistance, hold_out
@@ -135,23 +133,6 @@ def test_rows_are_held_out_once_in_a_fit(
     fit = fit_of(["kriging"], (replace(flat[0], hold_outs=[]), flat[1]), tmp_path)
     assert fit.part("kriging").options, "chosen by held-out rows"
     assert sum(split is flat[1] for split in splits) == 1
-
-
-def test_runs_with_intervals_of_an_earlier_version_are_refused(flat_folder: Path, tmp_path: Path) -> None:
-    run = wrf_mi.train(flat_folder, "idw", out=tmp_path / "run", intervals=True)
-    arrays = stored_arrays(run.folder / FITTED)
-    write_arrays(run.folder / FITTED, {key: values for key, values in arrays.items() if key != DEVIATIONS})
-    with pytest.raises(InputError, match=r"intervals of an earlier version.*train the run anew"):
-        wrf_mi.open_run(run.folder).predict([[2.0, 1.0, 1.3]])
-
-
-def test_hybrids_stored_before_deviations_of_some_parts_counted_are_loaded(flat_folder: Path, tmp_path: Path) -> None:
-    run = wrf_mi.train(flat_folder, out=tmp_path / "run")
-    expected = run.predict([[2.0, 1.0, 1.3]]).std
-    assert run.metrics["sizes"] == STATED
-    arrays = stored_arrays(run.folder / FITTED)
-    write_arrays(run.folder / FITTED, {key: values for key, values in arrays.items() if key != DEVIATIONS})
-    np.testing.assert_array_equal(wrf_mi.open_run(run.folder).predict([[2.0, 1.0, 1.3]]).std, expected)
 
 
 def test_distances_of_a_refit_mixture_are_those_to_its_rows(flat: tuple[Problem, Split], tmp_path: Path) -> None:

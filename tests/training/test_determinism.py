@@ -52,7 +52,7 @@ def test_deterministic_fits_of_two_processes_have_equal_bits(folder, tmp_path):
     backend.set_threads(2)
     resume(resumed)
     assert_same_bits(complete, resumed)
-    assert stored_arrays(complete / "model.npz")["param/position"].shape[1] > 8
+    assert stored_arrays(complete / "model.npz")["params/position"].shape[1] > 8
 
 
 @pytest.mark.parametrize("model", ["kriging", "ray-tracing"])

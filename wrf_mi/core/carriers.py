@@ -12,7 +12,7 @@ from .angles import FloatArray
 from .types import IntArray
 
 FREQUENCY = "frequency_hz"  # column of a file, or array, with the carrier of each row in Hz
-MOST_NAMED = 4
+MOST_NAMED = 4  # carriers that a message names one by one; of more, the first and the last
 
 
 def by_carrier(

@@ -14,9 +14,10 @@ from .angles import FloatArray
 from .array_files import stored_arrays, write_arrays
 from .errors import InputError
 from .files import readable
+from .stored import from_arrays, to_arrays
 from .types import IntArray
 
-FORMAT = 1  # version of the file format
+FORMAT = 2  # version of the file format
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,8 @@ ARRAYS = tuple(each.name for each in fields(Paths) if each.name not in ("object_
 
 
 def save_paths(file: str | Path, paths: Paths, extra: Mapping[str, Any] | None = None) -> Path:
-    """Write paths, whose fields become keys, and extra arrays by other keys to a compressed ``.npz``, atomically."""
-    arrays: dict[str, Any] = {name: getattr(paths, name) for name in ARRAYS}
-    arrays |= {"object_names": np.asarray(paths.object_names, dtype=str), "n_tx": paths.n_tx, "n_rx": paths.n_rx}
-    return write_arrays(Path(file), {"format": FORMAT, **arrays, **(extra or {})}, compressed=True)
+    """Write paths (`wrf_mi.core.stored`), and extra arrays by other keys, to a compressed ``.npz``, atomically."""
+    return write_arrays(Path(file), {"format": FORMAT, **to_arrays(paths), **(extra or {})}, compressed=True)
 
 
 def load_paths(file: str | Path) -> Paths:
@@ -98,13 +97,11 @@ def load_paths(file: str | Path) -> Paths:
 
 
 def read_paths_file(file: str | Path) -> tuple[Paths, dict[str, NDArray[Any]]]:
-    """The paths of a file and the further arrays beside them (`load_paths`)."""
+    """The paths of a file, and all its arrays (`load_paths`)."""
     path = Path(file)
     with readable(path, f"{path}: missing; trace the paths first", "trace the paths anew"):
-        arrays: dict[str, Any] = stored_arrays(path)
+        arrays = stored_arrays(path)
         version = int(arrays.pop("format"))
         if version != FORMAT:
             raise InputError(f"{path}: format {version}, this version reads {FORMAT}; use the version that wrote it")
-        facts: dict[str, Any] = {"object_names": tuple(str(name) for name in arrays.pop("object_names"))}
-        facts |= {name: int(arrays.pop(name)) for name in ("n_tx", "n_rx")}
-        return Paths(**facts | {name: arrays.pop(name) for name in ARRAYS}), arrays
+        return from_arrays(Paths, arrays), arrays

@@ -50,12 +50,18 @@ def setting_texts(values: Mapping[str, Any]) -> list[str]:
     >>> setting_texts({"steps": 200, "initial": {"gaussians": 500}})
     ['steps=200', 'initial.gaussians=500']
     """
-    return [f"{key}={_json(value)}" for key, value in flat(values)]
+    return [f"{key}={as_json(value)}" for key, value in flat(values)]
 
 
-def _json(value: Any) -> str:
-    """A value as JSON, which has lists in place of tuples and arrays, and paths as text; else nothing is converted."""
-    return json.dumps(value, default=lambda v: v.tolist() if isinstance(v, np.ndarray | np.generic) else str(v))
+def as_json(value: Any) -> str:
+    """A value as JSON: lists in place of tuples and arrays, dictionaries of dataclasses, texts of paths and others."""
+    return json.dumps(value, default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else str(value)  # type: ignore[arg-type]
 
 
 _adapter = cache(TypeAdapter)
@@ -123,7 +129,7 @@ def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
         if key not in hints:
             known = ", ".join(f"{prefix}{k}" for k in hints)
             raise InputError(f"{source}, setting {name}: unknown; known here: {known}")
-        arguments[key] = _convert(hints[key], value, source, name)
+        arguments[key] = converted(hints[key], value, source, name)
     return kind(**arguments)
 
 
@@ -134,14 +140,14 @@ def _number(value: Any) -> Any:
     return value
 
 
-def _convert(hint: Any, value: Any, source: str, name: str) -> Any:
-    """A value of the type ``hint``, or settings of a dataclass."""
+def converted(hint: Any, value: Any, source: str, name: str) -> Any:
+    """A value of the type ``hint``, or settings of a dataclass, from JSON or YAML; errors as `settings_from`."""
     if dataclasses.is_dataclass(hint):
         return _build(hint, value, source, f"{name}.")
     if float in (hint, *typing.get_args(hint)):
         value = [_number(each) for each in value] if isinstance(value, list | tuple) else _number(value)
     try:
-        return _adapter(hint).validate_json(_json(value), strict=True)
+        return _adapter(hint).validate_json(as_json(value), strict=True)
     except ValidationError as error:
         raise InputError(f"{source}, setting {name}: {_mismatch(hint, value, error)}") from None
 

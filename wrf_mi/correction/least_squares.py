@@ -28,7 +28,7 @@ MEDIAN_OF_MEAN = 0.8
 of freedom, divided by its mean, is 0.79 to 0.93."""
 LEAST_VARIANCE = 1e-10  # smallest variance of a residual in a unit of about 1: reports are rounded to single precision
 TRIALS = 8  # largest number of damping factors tried in a step, each `HARDER` times the one before
-HARDER = 8.0
+HARDER = 8.0  # factor of the damping after a step that fails, and its inverse after one that succeeds
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6  # damping of the first step and the smallest, relative to the diagonal
 CONVERGED = 0.1  # least decrease of the cost in a step: a parameter off by a standard deviation costs 0.5
 

@@ -7,16 +7,12 @@ n . (t + w x (p - c)) and tilted by a . (w x n), b . (w x n): so the planes' pri
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..core.array_files import keyed, under
 from ..core.types import FloatArray, IntArray
 from ..tracing.paths.scene_parameters import (
     EXPONENT,
@@ -64,21 +60,6 @@ class SceneEdit:
         """The state over some rows and paths, which may meet other surfaces: vector and means of their entries."""
         vector, mean = (posterior.vector_of(values) for values in (self.parameters, self.mean))
         return State(posterior, self.stage, vector, mean, self.materials, self.noise)
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a file."""
-        arrays = {name: np.asarray(getattr(self, name)) for name in ("stage", "absent", "planes", "slabs")}
-        arrays["noise"] = np.array([self.noise.variance, self.noise.values])
-        arrays["materials"] = np.asarray(json.dumps(dict(self.materials)))
-        return arrays | keyed("parameters/", self.parameters) | keyed("mean/", self.mean)
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> SceneEdit:
-        """The state that `arrays` described."""
-        parameters, mean = under("parameters/", arrays), under("mean/", arrays)
-        materials, noise = json.loads(str(arrays["materials"])), Noise(*map(float, arrays["noise"]))
-        of_scene = arrays["absent"], arrays["planes"], arrays["slabs"]
-        return cls(str(arrays["stage"]), parameters, mean, materials, *of_scene, noise)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from .folder_files import shown, single_file
 
 SUFFIXES = (".hdf5", ".h5")
 PILOTS = "Pilot_Samples"
-FFT = 64
+FFT = 64  # samples of an OFDM symbol at 20 MHz (IEEE 802.11)
 HALF = 26  # subcarriers of the long training symbol on each side of zero
 SUBCARRIERS = np.concatenate([np.arange(-HALF, 0), np.arange(1, HALF + 1)])
 # IEEE Std 802.11-2020, equation (17-8): the long training symbol at subcarriers -26..-1 and 1..26.
@@ -40,7 +40,7 @@ _SIGNS = "++--++-+-++++++--++-+-++++" + "+--++-+-+-----++--+-+-++++"
 TRAINING = np.array([1.0 if sign == "+" else -1.0 for sign in _SIGNS])
 ARGOS_START, ARGOS_SYMBOLS = 47, 2
 """First sample of the first pilot symbol in a user's slot, and number of symbols (RENEWLab, ``samps2csi``)."""
-FULL_SCALE = 2.0**15
+FULL_SCALE = 2.0**15  # of samples of 16 bits with a sign
 RECORD_BYTES = 2 * HALF * 8  # bytes of a record for each frame, user and antenna
 CHUNK_SIZE = 1 << 26  # bytes of samples in a chunk
 

@@ -49,7 +49,7 @@ SUFFIXES = (".mat", ".npz", ".npy")  # formats of a matrix, in the order in whic
 PATH_MATRICES = ("power", "phase", "delay", "aod_az", "aod_el", "aoa_az", "aoa_el")
 """Matrices [users, paths]: dBW, degrees, seconds; azimuths and zenith angles in degrees. NaN: no path."""
 TEST_FRACTION = 0.2  # share of the users with a path in the official test rows
-SPLIT_SEED = 0
+SPLIT_SEED = 0  # of the official test rows, which are the same for everyone
 VALUES_PER_CHUNK = 1 << 20  # complex values of the largest array in a chunk of users
 SHORTEST_M = 1e-9  # length in place of 0, for which a spherical wave has no amplitude
 Pattern = Literal["isotropic", "halfwave-dipole"]

@@ -23,7 +23,7 @@ from . import folder_files as files
 from .faults import attempt, recoverable, refuse
 
 GATEWAYS, POWERS = "gateway_position.yml", "gateway_rssi.csv"
-NOT_RECEIVED_DBM = -100.0
+NOT_RECEIVED_DBM = -100.0  # what the authors' files state where a gateway received nothing
 CARRIER_HZ = 2.44e9  # the middle of BLE's band, 2402 to 2480 MHz (Bluetooth Core Specification, volume 6, part A)
 FEWEST = 2  # least number of rows: one to train on and one to score
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Record, Split
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.files import readable
+from ..core.stored import from_arrays, to_arrays
 from ..core.types import IntArray
 
 FOLDED = ("blocked", "frequency", "frequency-known", "receiver", "other-run")  # splits of several folds
@@ -28,7 +29,7 @@ FOLD_SEED = 0  # seed of the spatial blocks, which belong to the data and do not
 MOST_RECEIVERS, RECEIVER_FOLDS = 8, 4
 """Largest number of receivers that are held out in turn, and number of folds of more."""
 CLUSTER_STARTS = 10  # starts of k-means; the tightest clusters without an empty one are used
-SPLIT_FORMAT = 1  # version of the split file
+SPLIT_FORMAT = 2  # version of the split file
 
 
 def make_splits(
@@ -162,18 +163,11 @@ def rows_left(record: Record, rows: IntArray, receivers: Sequence[int], count: i
 def save_split(path: str | Path, split: Split) -> None:
     """Write a split as an npz file of plain arrays (no pickle), atomically.
 
-    Keys: ``format``, ``name``, ``seed``, ``train``, ``validation``, ``test`` (rows from 0), and of splits that hold out
-    receivers ``held_receivers`` (numbers from 0) and ``left`` (pairs of such a receiver and a row that trains), and
-    where they are stated ``wanted_m`` (positions where predictions are wanted, metres).
+    Keys: ``format``, ``name``, ``seed``, ``train``, ``validation``, ``test`` (rows from 0), ``held_receivers`` (numbers
+    from 0, as JSON), ``left`` (pairs of such a receiver and a row that trains) and ``wanted_m`` (positions where
+    predictions are wanted, metres).
     """
-    parts: dict[str, NDArray[Any]] = {"train": split.train, "validation": split.validation, "test": split.test}
-    if len(split.wanted_m):
-        parts["wanted_m"] = split.wanted_m
-    if split.held_receivers:
-        parts["held_receivers"] = np.asarray(split.held_receivers, np.int64)
-        parts["left"] = split.left
-    facts = {"format": np.int64(SPLIT_FORMAT), "name": np.str_(split.name), "seed": np.int64(split.seed)}
-    write_arrays(Path(path), {**facts, **parts})
+    write_arrays(Path(path), {"format": np.int64(SPLIT_FORMAT), **to_arrays(split)})
 
 
 def load_split(path: str | Path) -> Split:
@@ -184,18 +178,13 @@ def load_split(path: str | Path) -> Split:
     """
     remedy = "give a split.npz of a run folder"
     with readable(Path(path), f"{path}: missing; {remedy}", remedy):
-        none_held_out = {"held_receivers": np.zeros(0, np.int64), "left": np.zeros((0, 2), np.int64)}
-        arrays = none_held_out | {"wanted_m": np.zeros((0, 3))} | stored_arrays(Path(path))
-        version, name, seed, *lists = (arrays[key] for key in ("format", "name", "seed", *PARTS, "left"))
-    if version != SPLIT_FORMAT:
-        raise InputError(f"{path}: format {version}, not {SPLIT_FORMAT}; use the version that wrote it")
-    _check_rows(path, lists)
-    train, validation, test, left = (part.astype(np.int64) for part in lists)
-    held_receivers = np.ravel(arrays["held_receivers"]).astype(int)
-    split = Split(
-        str(name), int(seed), train, validation, test, tuple(held_receivers.tolist()), left, arrays["wanted_m"]
-    )
-    if not (np.isin(left[:, 0], held_receivers).all() and np.isin(left[:, 1], split.all_train).all()):
+        arrays = stored_arrays(Path(path))
+        if (version := int(arrays["format"])) != SPLIT_FORMAT:
+            raise InputError(f"{path}: format {version}, not {SPLIT_FORMAT}; use the version that wrote it")
+        split = from_arrays(Split, arrays)
+    left = split.left
+    _check_rows(path, [split.train, split.validation, split.test, left])
+    if not (np.isin(left[:, 0], split.held_receivers).all() and np.isin(left[:, 1], split.all_train).all()):
         raise InputError(f"{path}: leaves rows that no held-out receiver trains on; make the split again")
     return split
 

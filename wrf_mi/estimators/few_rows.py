@@ -22,11 +22,12 @@ from ..core import Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
 from ..core.array_files import under
+from ..core.stored import from_arrays, to_arrays
 from ..core.types import IntArray
 from ..datasets.observations import FEW_ROWS, rows_received
 from ..tasks import TASKS
 from .interpolation.path_loss import Trend, fit_path_loss
-from .model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session, field_arrays, from_field_arrays
+from .model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session
 
 FEW = "few/"  # prefix of the arrays of receivers with few rows
 BETWEEN_DB = 4.0  # standard deviation between receivers where fewer than two show it: antennas and their mounting
@@ -175,7 +176,7 @@ class FittedWithFew(Fitted):
 
     def arrays(self) -> Arrays:
         """Arrays of the model and of the law."""
-        return self.fitted.arrays() | field_arrays(self.law, FEW)
+        return self.fitted.arrays() | to_arrays(self.law, FEW)
 
     def facts(self) -> dict[str, Any]:
         """Facts of the model."""
@@ -215,10 +216,9 @@ class WithFewRows(Model):
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
         """The model and the law."""
-        stored = under(FEW, arrays)
-        if not stored:
+        if not under(FEW, arrays):
             return self.model.load(arrays, problem, folder)
-        law = from_field_arrays(SharedLaw, stored)
+        law = from_arrays(SharedLaw, arrays, FEW)
         numbers = np.setdiff1d(np.arange(len(problem.record.receivers)), law.number)
         of_model = {key: values for key, values in arrays.items() if not key.startswith(FEW)}
         return FittedWithFew(self.model.load(of_model, self._part(problem, numbers), folder), numbers, law)

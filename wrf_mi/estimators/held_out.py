@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 
 from ..core import Prediction, Record, Split
 from ..core.antenna import AS_STATED
-from ..core.array_files import keyed, stored_arrays, under, write_arrays
+from ..core.array_files import stored_arrays, write_arrays
+from ..core.stored import from_arrays, to_arrays
 from ..core.types import IntArray
 from ..datasets.observations import fitted_receivers
 from ..scene.correction_data import read_correction_data
 from ..training.selection import HeldOut, hold_out
-from .model import Arrays, Fitted, HeldOutPrediction, Model, Problem, Session, inputs_of
+from .model import Fitted, HeldOutPrediction, Model, Problem, Session, inputs_of
 from .receiver_places import placed_problem
-
-EVERY = "every/"  # prefix of the arrays of `HeldOut.every`
 
 
 class HoldOut(NamedTuple):
@@ -111,28 +110,25 @@ def held_out_predictions(
     if not path.exists():
         session.folder.mkdir(parents=True, exist_ok=True)
         fitted, numbers = fit_fold(entry, problem, fold, labelled(session, f"{name}, held-out rows"))
-        write_arrays(path, arrays_of_held_out(fitted, problem.record, numbers, held_out))
+        write_arrays(path, to_arrays(predicted_held_out(fitted, problem.record, numbers, held_out)))
     return stored_held_out(path, problem, held_out)
 
 
-def arrays_of_held_out(fitted: Fitted, record: Record, numbers: IntArray, held_out: HeldOut) -> Arrays:
-    """Arrays of the predictions of held-out observations by a model of the receivers of some numbers."""
-    arrays = _of_pairs(fitted, record, numbers, held_out.receiver, held_out.row)
-    if len(held_out.every):
-        arrays |= keyed(EVERY, _of_pairs(fitted, record, numbers, *held_out.every.T))
-    return arrays
+def predicted_held_out(fitted: Fitted, record: Record, numbers: IntArray, held_out: HeldOut) -> HeldOutPrediction:
+    """Predictions of held-out observations by a model of the receivers of some numbers."""
+    of_rows = _of_pairs(fitted, record, numbers, held_out.receiver, held_out.row)
+    every = _of_pairs(fitted, record, numbers, *held_out.every.T) if len(held_out.every) else None
+    return HeldOutPrediction(of_rows.mean, of_rows.std, every=every)
 
 
 def stored_held_out(path: Path, problem: Problem, held_out: HeldOut) -> HeldOutPrediction:
-    """Predictions of a file of `arrays_of_held_out`."""
-    arrays = stored_arrays(path)
-    every = under(EVERY, arrays)
-    pairs = Prediction(every["mean"], every.get("std")) if every else None
-    return HeldOutPrediction(with_error_ratio(arrays["mean"], problem, held_out), arrays.get("std"), every=pairs)
+    """Predictions of a file of `predicted_held_out`, with errors as of rows that the scene does not know."""
+    stored = from_arrays(HeldOutPrediction, stored_arrays(path))
+    return replace(stored, mean=with_error_ratio(stored.mean, problem, held_out))
 
 
-def _of_pairs(fitted: Fitted, record: Record, numbers: IntArray, receiver: IntArray, row: IntArray) -> Arrays:
-    """Arrays ``mean`` and, if stated, ``std`` of pairs [q] by a model of the receivers of some numbers."""
+def _of_pairs(fitted: Fitted, record: Record, numbers: IntArray, receiver: IntArray, row: IntArray) -> Prediction:
+    """Predictions, with deviations if stated, of pairs [q] by a model of the receivers of some numbers."""
     predictions = [
         predicted_rows(fitted, record, row[receiver == number], place)
         for place, number in enumerate(numbers)
@@ -140,7 +136,7 @@ def _of_pairs(fitted: Fitted, record: Record, numbers: IntArray, receiver: IntAr
     ]
     # Predicted receiver by receiver, while a fold may hold receivers out in any order.
     order = np.argsort(np.argsort(receiver, kind="stable"), kind="stable")
-    arrays = {"mean": np.concatenate([prediction.mean for prediction in predictions])[order]}
-    if predictions[0].std is not None:
-        arrays["std"] = np.concatenate([prediction.stated_std for prediction in predictions])[order]
-    return arrays
+    mean = np.concatenate([prediction.mean for prediction in predictions])[order]
+    if predictions[0].std is None:
+        return Prediction(mean)
+    return Prediction(mean, np.concatenate([prediction.stated_std for prediction in predictions])[order])

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,9 @@ from numpy.typing import NDArray
 from ..core import AntennaOptions, InputError, Prediction, Receiver, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
-from ..core.settings import changed, settings_from, with_settings
+from ..core.settings import changed, with_settings
+from ..core.stored import Arrays as Arrays
+from ..core.stored import from_arrays, to_arrays
 from ..core.types import Inputs as Inputs
 from ..core.types import IntArray
 from ..parallel import Scheduler
@@ -25,7 +26,6 @@ from ..receivers.spreads import PathStatistics
 from ..training.session import FitSession
 
 Kind = TypeVar("Kind")
-Arrays = dict[str, NDArray[Any]]
 UNUSED_HEADING = "its model does not know how the transmitter is turned; omit heading_rad"
 UNUSED_UPLINK = "its model does not predict from the uplink; omit uplink"
 
@@ -169,9 +169,9 @@ class Fitted(ABC):
         """Whether predictions depend on the heading of the transmitter."""
         return bool(self.uses_heading)
 
-    @abstractmethod
     def arrays(self) -> Arrays:
-        """All that `Model.load` needs; no key begins with ``run/``."""
+        """All that `Model.load` needs: fields of a dataclass (`wrf_mi.core.stored`); no key begins with ``run/``."""
+        return to_arrays(self)
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
         """Stored predictions for rows of the record; None: `predict` makes them."""
@@ -216,26 +216,21 @@ class Model(ABC):
 
     The mean of the training rows as a model; `wrf_mi.models.register` makes it known to `wrf_mi.train`:
 
-    >>> class FittedMean(Fitted):
-    ...     def __init__(self, arrays):
-    ...         self._arrays = arrays
+    >>> @dataclass
+    ... class FittedMean(Fitted):
+    ...     mean: FloatArray
     ...
     ...     def predict(self, inputs, receiver):
-    ...         return Prediction(np.full(len(inputs), self._arrays["mean"][receiver]))
-    ...
-    ...     def arrays(self):
-    ...         return self._arrays
+    ...         return Prediction(np.full(len(inputs), self.mean[receiver]))
     >>> @dataclass(frozen=True)
     ... class NoSettings:
     ...     pass
     >>> class Mean(Model):
     ...     name, source, settings, tasks = "mean", "mean of the training rows", NoSettings, ("rssi",)
+    ...     fitted = FittedMean
     ...
     ...     def fit(self, problem, split, session):
-    ...         return FittedMean({"mean": np.nanmean(problem.record.observation[:, problem.rows(split)], axis=1)})
-    ...
-    ...     def load(self, arrays, problem, folder):
-    ...         return FittedMean(arrays)
+    ...         return FittedMean(np.nanmean(problem.record.observation[:, problem.rows(split)], axis=1))
     >>> Mean().serves("rssi"), Mean().serves("spectrum")
     (True, False)
     """
@@ -243,6 +238,8 @@ class Model(ABC):
     name: str  #: name as in ``wrf-mi train --model``
     source: str  #: publication
     settings: type  #: frozen dataclass of its settings, all with defaults
+    #: dataclass of its fits, which `load` makes of stored fields
+    fitted: type[Fitted] = Fitted  # type: ignore[type-abstract]
     tasks: tuple[str, ...] | None = None  #: tasks that it serves; None: all
     summary: str = ""  #: the model in a few words for readers of a page; "": its source
     scene_summary: str = ", trained jointly with the paths of the scene"  #: the same with a scene, after ``summary``
@@ -271,9 +268,12 @@ class Model(ABC):
         ``session.report``.
         """
 
-    @abstractmethod
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
-        """The model that `Fitted.arrays` described; ``folder`` is that of its fit."""
+        """The model that `Fitted.arrays` described; ``folder`` is that of its fit.
+
+        Fields that are not stored are ``model`` (this object), ``problem`` and ``folder``.
+        """
+        return from_arrays(self.fitted, arrays, model=self, problem=problem, folder=folder)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:  # noqa: B027 - most models refuse nothing
         """Refuse what a fit would, before anything is written.
@@ -359,26 +359,3 @@ def known_positions(record: Record, rows: IntArray, name: str) -> FloatArray:
 def slices(count: int, size: int) -> list[slice]:
     """Slices of ``size`` rows each, the last possibly of fewer, that cover so many rows."""
     return [slice(start, min(start + size, count)) for start in range(0, count, size)]
-
-
-def field_arrays(value: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """Fields of a dataclass instance that are not None, as arrays by ``prefix`` and name."""
-    named = ((field.name, getattr(value, field.name)) for field in fields(value))
-    return {f"{prefix}{name}": np.asarray(content) for name, content in named if content is not None}
-
-
-def from_field_arrays(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Kind:
-    """Instance of the dataclass ``kind`` from `field_arrays`; arrays without axes become numbers."""
-    names = (field.name for field in fields(cast(Any, kind)) if f"{prefix}{field.name}" in arrays)
-    stored = {name: arrays[f"{prefix}{name}"] for name in names}
-    return kind(**{name: value if value.ndim else value.item() for name, value in stored.items()})
-
-
-def settings_array(settings: Any) -> NDArray[Any]:
-    """Settings as an array of a run file."""
-    return np.asarray(json.dumps(asdict(settings)))
-
-
-def stored_settings(kind: type[Kind], arrays: Mapping[str, NDArray[Any]], name: str) -> Kind:
-    """Settings of a run file, from `settings_array`."""
-    return settings_from(kind, json.loads(str(arrays["settings"])), name)

@@ -15,7 +15,7 @@ import json
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from ..core.angles import FloatArray
 from ..core.carriers import carriers_text
 from ..core.files import readable, write_atomically
 from ..core.settings import settings_from, with_settings
+from ..core.stored import NOT_STORED, from_arrays
 from ..core.types import IntArray
 from ..datasets.observations import place_of
 from ..parallel import row_parts
@@ -50,7 +51,6 @@ logger = logging.getLogger(__name__)
 
 NAME = "ray-tracing"
 PATHS, CONVERGENCE, CORRECTED = "paths.npz", "convergence.json", "corrected"
-LOST = "paths_without_gain"  # key of the number of paths that are left out
 WITHOUT_PATH = 0.05  # share of measured values without a path from which on walls that nothing passes are suspected
 TRACED_AT_LEAST, SPECULAR_AT_LEAST = 16, 1024
 """Fewest positions of a scheduler's part: candidates of fewer are not made faster. Where rays start at the receivers
@@ -83,36 +83,41 @@ class TracingSettings(LoopOptions, TraceOptions):  # type: ignore[misc]  # its f
             raise InputError(f"target_kinds {unknown[0]!r}: choose from {', '.join(CHOSEN_KINDS)}")
 
 
+@dataclass(eq=False)
 class FittedTracing(Fitted):
     """A traced scene with offsets that were fitted to training rows."""
 
-    def __init__(self, problem: Problem, arrays: Arrays, paths: Path | None) -> None:
-        self._problem, self._arrays, self._paths = problem, arrays, paths
+    problem: Problem = field(metadata=NOT_STORED)
+    file: Path | None = field(metadata=NOT_STORED)  # stored paths of the record's rows; None: of an edited scene
+    rays: int  # number of rays
+    paths: int  # number of paths
+    trace_seconds: float
+    paths_without_gain: int  # number of paths that are left out
+    offsets: Offsets | None = None  # of signal strengths
+
+    def __post_init__(self) -> None:
         self._last: tuple[Inputs, NDArray[Any], list[PathStatistics], set[int]] | None = None
         self._of_rows: tuple[IntArray, NDArray[Any]] | None = None
-        self._offsets: Offsets | None = None
-        if "offset_db" in arrays:
-            self._offsets = Offsets(arrays["offset_db"], arrays["floor_dbm"])
 
     @cached_property
     def _tracer(self) -> RayTracer:
-        problem = self._problem
+        problem = self.problem
         assert problem.scene is not None
-        options = replace(problem.settings.options, rays=int(self._arrays["rays"]))
+        options = replace(problem.settings.options, rays=self.rays)
         return RayTracer(problem.scene, _instrument(problem.record), options, problem.material)
 
     @cached_property
     def _stored(self) -> TraceResult:
-        assert self._paths is not None
-        return _stored_trace(self._paths, self._problem.record)
+        assert self.file is not None
+        return _stored_trace(self.file, self.problem.record)
 
     def _reported(self, traced: TraceResult) -> NDArray[Any]:
         observed = self._tracer.observe(traced)
-        return observed if self._offsets is None else self._offsets(observed)
+        return observed if self.offsets is None else self.offsets(observed)
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
         """Predictions from the stored paths, which an edited scene has not."""
-        if self._paths is None:
+        if self.file is None:
             return None
         # Receivers are predicted in turn.
         if self._of_rows is None or not np.array_equal(self._of_rows[0], rows):
@@ -137,16 +142,12 @@ class FittedTracing(Fitted):
 
     def in_scene(self, scene: str) -> FittedTracing:
         """Paths of an edited scene, with the offsets of strengths."""
-        return FittedTracing(replace(self._problem, scene=scene, material=None), self._arrays, None)
-
-    def arrays(self) -> Arrays:
-        """Numbers of rays and paths, duration of tracing, and offsets."""
-        return self._arrays
+        return replace(self, problem=replace(self.problem, scene=scene, material=None), file=None)
 
     def facts(self) -> dict[str, Any]:
         """Duration of tracing, numbers of paths, of those left out without a gain if there are any, and of rays."""
-        names = ("trace_seconds", "paths", LOST, "rays")
-        return {name: self._arrays[name].item() for name in names if name in self._arrays}
+        lost = {"paths_without_gain": self.paths_without_gain} if self.paths_without_gain else {}
+        return {"trace_seconds": self.trace_seconds, "paths": self.paths, **lost, "rays": self.rays}
 
 
 def _instrument(record: Record) -> Instrument:
@@ -160,7 +161,7 @@ class FittedCalibration(FittedField):
 
     def facts(self) -> dict[str, Any]:
         """Steps, and the trained parameters."""
-        return super().facts() | {"calibration": self._problem.settings.calibration}
+        return super().facts() | {"calibration": self.problem.settings.calibration}
 
 
 def _graph_problem(problem: Problem) -> Problem:
@@ -284,9 +285,7 @@ class RayTracing(Model):
         stored = path.exists()
         traced = _trace_of_fit(tracer, problem, session)
         seconds = time.perf_counter() - start
-        facts = {"rays": traced.rays, "paths": len(traced.paths), "trace_seconds": seconds}
-        facts |= {LOST: traced.lost} if traced.lost else {}
-        arrays = {name: np.asarray(value) for name, value in facts.items()}
+        offsets = None
         if record.task.has_offsets:
             known = split.all_train
             reported = tracer.observe(traced)[:, known]
@@ -298,17 +297,17 @@ class RayTracing(Model):
                 if not stored:  # else fitted folds have them
                     path.unlink()
                 raise
-            arrays |= {"offset_db": offsets.offset_db, "floor_dbm": offsets.floor_dbm}
-        fitted = FittedTracing(problem, arrays, path)
+        fitted = FittedTracing(problem, path, traced.rays, len(traced.paths), seconds, traced.lost, offsets)
         fitted.train_seconds = 0.0
         return fitted
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
         """The model that a fit's arrays describe; stored paths lie in the run folder, above the folds."""
         if problem.settings.calibration is not None:
-            return FittedCalibration(arrays, _graph_problem(problem).settings, problem, folder)
+            return from_arrays(FittedCalibration, arrays, problem=problem, folder=folder)
         paths = folder / PATHS
-        return FittedTracing(problem, arrays, paths if paths.exists() else folder.parent / PATHS)
+        paths = paths if paths.exists() else folder.parent / PATHS
+        return from_arrays(FittedTracing, arrays, problem=problem, file=paths)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse a scene that cannot be opened at every carrier, and settings that cannot be calibrated or chosen."""

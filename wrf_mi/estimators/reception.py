@@ -16,8 +16,8 @@ follows from the weakest received strength then overstates reception.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,12 +28,10 @@ from scipy.special import expit, logit, ndtr, softmax
 
 from ..core import Prediction, Record
 from ..core.angles import FloatArray
-from ..core.array_files import keyed, under
+from ..core.stored import NOT_STORED
 from ..core.types import IntArray
 from ..training.selection import HeldOut
-from .model import Arrays, field_arrays, from_field_arrays
 
-PREFIX, ROWS = "reception/", "rows"  # prefix of the arrays of a run file, and key of the training rows
 PARTS = ("rate", "strength", "neighbours")  # probabilities that are mixed
 NEIGHBOURS, SOFTENING_M = 16, 0.4  # training rows of the neighbours' share, and addend of their distances, metres
 WIDTH_DB = 6.0  # prior median of the width of the threshold
@@ -183,14 +181,20 @@ class Reception:
     """Probability of reception, fitted to a model's held-out predictions.
 
     Attributes:
-        shares: shares of the training rows that were received.
+        rows: training rows of the record [n].
         sensitivity: reception by the predicted strength.
         weights: weights of `PARTS` by the distance to the nearest training row.
     """
 
-    shares: ReceivedShares
+    record: Record = field(metadata=NOT_STORED)
+    rows: IntArray
     sensitivity: Sensitivity
     weights: Weights
+
+    @cached_property
+    def shares(self) -> ReceivedShares:
+        """Shares of the training rows that were received."""
+        return ReceivedShares(self.record, self.rows)
 
     @classmethod
     def fit(
@@ -215,31 +219,17 @@ class Reception:
             pairs = receiver == number
             at = Prediction(mean[pairs], std[pairs]), record.tx_pos_m[row[pairs]], int(number)
             parts[pairs], distance_m[pairs] = _parts(shares, sensitivity, *at)
-        return cls(ReceivedShares(record, rows), sensitivity, Weights.fit(parts, distance_m, received))
+        return cls(record, rows, sensitivity, Weights.fit(parts, distance_m, received))
 
     def __call__(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
         """A receiver's predictions at positions [m, 3] in metres with their probability of reception."""
         parts, distance_m = _parts(self.shares, self.sensitivity, prediction, tx_pos_m, receiver)
         return replace(prediction, reception=(self.weights(distance_m) * parts).sum(axis=1))
 
-    def arrays(self) -> Arrays:
-        """Arrays of a run file."""
-        of_parts = field_arrays(self.sensitivity) | field_arrays(self.weights) | {ROWS: self.shares.rows}
-        return keyed(PREFIX, of_parts)
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], record: Record) -> Reception | None:
-        """The reception among the arrays of a run file; None where there is none."""
-        stored = under(PREFIX, arrays)
-        if not stored:
-            return None
-        fitted = from_field_arrays(Sensitivity, stored), from_field_arrays(Weights, stored)
-        return cls(ReceivedShares(record, stored[ROWS]), *fitted)
-
-    def facts(self, record: Record) -> dict[str, Any]:
+    def facts(self) -> dict[str, Any]:
         """Entry ``sensitivity`` of ``metrics.json``: sensitivities, ceilings, width and weights."""
         fitted = self.sensitivity
-        limits = zip(record.receivers, fitted.sensitivity_dbm, fitted.ceiling, strict=True)
+        limits = zip(self.record.receivers, fitted.sensitivity_dbm, fitted.ceiling, strict=True)
         of_receivers = {receiver.name: {"dbm": float(dbm), "ceiling": float(c)} for receiver, dbm, c in limits}
         # At the median distance of the held-out rows.
         weights = dict(zip(PARTS, map(float, self.weights(np.array([self.weights.scale_m]))[0]), strict=True))

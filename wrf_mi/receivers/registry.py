@@ -9,7 +9,7 @@ imported with the first class: a command that only reads data does without it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
@@ -29,8 +29,8 @@ Slopes = Callable[[ComplexArray, IntArray], FloatArray]
 """Changes of reports by changes [k, values] of signals of the rows ``which`` [k]."""
 Sums = Literal["fields", "elements", "powers"]
 """Sums over paths: of fields at one antenna on each subcarrier, of fields at the elements of an array, or of powers."""
-GAPS = ("frequencies_hz", "floor_db")
-"""Attributes of a specification that may be NaN: unknown, or none."""
+GAPS = ("floor_db",)
+"""Attributes of a specification that may be NaN."""
 
 
 @dataclass(frozen=True)
@@ -58,32 +58,6 @@ class ObservationSpec:
     headings: bool = False
     floor_db: float = float("nan")
     carriers_hz: FloatArray | None = None
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays for a file."""
-        hz = np.array([np.nan]) if self.frequencies_hz is None else np.asarray(self.frequencies_hz, float)
-        basis = np.zeros((0, 0), complex) if self.basis is None else self.basis
-        carriers = np.zeros(0) if self.carriers_hz is None else np.asarray(self.carriers_hz, float)
-        values = vars(self) | {"frequencies_hz": hz, "outputs": np.asarray(self.outputs, np.int64), "basis": basis}
-        values["carriers_hz"] = carriers
-        return {f"form/{name}": np.asarray(value) for name, value in values.items()}
-
-    @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[Any]]) -> ObservationSpec:
-        """The form that `arrays` describes."""
-        height, width = map(int, arrays["form/size"])
-        hz, basis = np.asarray(arrays["form/frequencies_hz"], float), np.asarray(arrays["form/basis"])
-        return cls(
-            str(arrays["form/receiver"]),
-            (height, width),
-            None if np.isnan(hz).any() else hz,
-            tuple(map(int, arrays["form/outputs"])),
-            basis if basis.size else None,
-            int(arrays["form/features"]),
-            bool(arrays["form/headings"]),
-            float(arrays["form/floor_db"]),
-            carriers if (carriers := arrays.get("form/carriers_hz", np.zeros(0))).size else None,
-        )
 
     @property
     def components(self) -> int:

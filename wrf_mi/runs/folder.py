@@ -46,7 +46,7 @@ from ..models import Model, known_model
 from ..tasks import TASKS
 from ..version import __version__
 
-FORMAT = 4  # version of ``config.yaml`` and ``model.npz``
+FORMAT = 5  # version of ``config.yaml`` and ``model.npz``
 CONFIG, SPLIT, FITTED, METRICS, PREDICTIONS = "config.yaml", "split.npz", "model.npz", "metrics.json", "predictions.npz"
 PLACE = "working_directory"  # key of the folder in which the paths of ``config.yaml`` were stated
 VERSION, SECONDS = "run/format", "run/train_seconds"  # keys of ``model.npz`` beside the model's arrays

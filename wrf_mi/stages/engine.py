@@ -20,8 +20,9 @@ import numpy as np
 
 from ..core import InputError, Split
 from ..core.array_files import stored_arrays, write_arrays
+from ..core.stored import to_arrays
 from ..core.types import FloatArray, IntArray
-from ..estimators.held_out import arrays_of_held_out, fold_of, hold_out_once, stored_held_out
+from ..estimators.held_out import fold_of, hold_out_once, predicted_held_out, stored_held_out
 from ..estimators.model import HeldOutPrediction, Model, Problem, Session
 from ..training.by_distance import unit_means
 from ..training.selection import HeldOut, improves, last_gain
@@ -211,7 +212,7 @@ class Engine:
             assert fitted is not None, "the last stage predicts"
             # Reception is fitted to the chosen chain alone.
             held_out = fold.held_out if finish else replace(fold.held_out, every=fold.held_out.every[:0])
-            arrays = arrays_of_held_out(fitted, record, fold.numbers, held_out)
+            arrays = to_arrays(predicted_held_out(fitted, record, fold.numbers, held_out))
             write_arrays(path, arrays | {"seconds": np.asarray(time.perf_counter() - begun)})
         return stored_held_out(path, self._problem, fold.held_out)
 

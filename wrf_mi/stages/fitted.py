@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.array_files import keyed, under
+from ..core.stored import NOT_STORED, from_arrays, to_arrays
 from ..core.types import IntArray
 from ..estimators.held_out import HoldOut, predicted_rows
 from ..estimators.interpolation.kriging import Kriged, Kriging
@@ -23,8 +23,6 @@ from ..estimators.model import (
     Inputs,
     PredictAll,
     Problem,
-    field_arrays,
-    from_field_arrays,
 )
 from ..estimators.reception import Reception
 from ..training.by_distance import LEAST, Intervals, Mixture, expected_size
@@ -76,19 +74,6 @@ class Residuals:
         kriged = self.by_receiver.get(receiver)
         return 0.0 if kriged is None else kriged.predict(tx_pos_m).reshape(len(tx_pos_m), *shape)
 
-    def arrays(self) -> Arrays:
-        """Arrays of a run file."""
-        arrays: Arrays = {}
-        for receiver, kriged in self.by_receiver.items():
-            arrays |= keyed(f"{receiver}/", kriged.arrays())
-        return arrays
-
-    @classmethod
-    def from_arrays(cls, arrays: Arrays, record: Record) -> Residuals:
-        """The residuals that `arrays` described."""
-        numbers = sorted({int(name.partition("/")[0]) for name in arrays})
-        return cls({k: Kriged.from_arrays(under(f"{k}/", arrays), record.receivers[k]) for k in numbers})
-
 
 PATHS = "paths"
 UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
@@ -96,7 +81,7 @@ UPLINK_PARTS = ("r2f2", "optml", "fire", "linear")
 FIELD_IN_SCENE = "field-scene"  # field beside the paths of a scene, of signal strengths
 TRACED = (PATHS, FIELD_IN_SCENE, "r2f2-scene")  # parts that are given the scene
 NEGLIGIBLE = 1e-3  # weight below which a part is not evaluated: its share of the prediction
-DEVIATIONS = "deviations"  # array of the names of the parts whose standard deviations count
+PARTS = "parts"  # array of the names of the parts, and beginning of the names of their arrays
 STATED, PREDICTED = "stated", "predicted"
 """Sizes of expected errors: standard deviations that parts state, or magnitudes (`expected_size`)."""
 
@@ -130,10 +115,12 @@ def deviation_weights(weights: FloatArray, states: NDArray[np.bool_]) -> FloatAr
 class FittedMixture(Fitted):
     """A weighted mean of fitted models with prediction intervals, or a single one with these."""
 
-    name: str  # name of the model; a part of that name is the model itself, to which intervals alone are added
-    problem: Problem  # problem of the fit
+    name: str = field(
+        metadata=NOT_STORED
+    )  # name of the model; a part of that name is the model itself, to which intervals alone are added
+    problem: Problem = field(metadata=NOT_STORED)  # problem of the fit
     known: IntArray  # training rows that determine distances [n]
-    parts: dict[str, Fitted]  # fitted parts with a weight, by name
+    parts: dict[str, Fitted] = field(metadata=NOT_STORED)  # fitted parts with a weight, by name
     mixture: Mixture  # weights of these parts, and, if there are residuals, of the scene's side with them as the last
     residuals: Residuals | None  # what the scene's side leaves; None: it has no weight
     intervals: Intervals | None  # standard deviations; None: none are stated
@@ -310,33 +297,17 @@ class FittedMixture(Fitted):
         self.reception = Reception.fit(record, self.known, rows.fold.all_train, rows.held_out, stated)
 
     def arrays(self) -> Arrays:
-        """Weights, residuals, intervals, training rows, and the arrays of the parts."""
-        arrays: Arrays = {"known": self.known, "names": np.asarray(list(self.parts))}
-        arrays |= {"facts": np.asarray(json.dumps(self.stated)), DEVIATIONS: np.asarray(self.deviations, str)}
-        arrays |= field_arrays(self.mixture, "mixture/")
-        if self.intervals is not None:
-            arrays |= field_arrays(self.intervals, "intervals/")
-        if self.reception is not None:
-            arrays |= self.reception.arrays()
-        if self.residuals is not None:
-            arrays |= keyed("residuals/", self.residuals.arrays())
+        """Fields, and the arrays of the parts."""
+        arrays = to_arrays(self) | {PARTS: np.asarray(list(self.parts))}
         for name, fitted in self.parts.items():
-            arrays |= keyed(f"{name}/", fitted.arrays())
+            arrays |= keyed(f"{PARTS}/{name}/", fitted.arrays())
         return arrays
 
     @classmethod
     def from_arrays(cls, name: str, arrays: Arrays, problem: Problem, load: Callable[[str, Arrays], Fitted]) -> Self:
         """The mixture that `arrays` described; ``load(part, arrays)`` loads a part."""
-        parts = {part: load(part, under(f"{part}/", arrays)) for part in map(str, arrays["names"])}
-        mixture, stated = from_field_arrays(Mixture, under("mixture/", arrays)), json.loads(str(arrays["facts"]))
-        stored, left = under("intervals/", arrays), under("residuals/", arrays)
-        residuals = Residuals.from_arrays(left, problem.record) if left else None
-        intervals = from_field_arrays(Intervals, stored) if stored else None
-        # Before deviations of some parts could count, those of all or of none did.
-        deviations = arrays.get(DEVIATIONS, arrays["names"] if stated["sizes"] == STATED else np.zeros(0, str))
-        reception = Reception.from_arrays(arrays, problem.record)
-        of_errors = residuals, intervals, tuple(map(str, deviations))
-        return cls(name, problem, arrays["known"], parts, mixture, *of_errors, stated, reception)
+        parts = {part: load(part, under(f"{PARTS}/{part}/", arrays)) for part in map(str, arrays[PARTS])}
+        return from_arrays(cls, arrays, name=name, problem=problem, record=problem.record, parts=parts)
 
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions of the stages up to each but the last."""
@@ -348,7 +319,7 @@ class FittedMixture(Fitted):
 
     def facts(self) -> dict[str, Any]:
         """Entries of ``metrics.json``, and those of the reception."""
-        return self.stated | ({} if self.reception is None else self.reception.facts(self.problem.record))
+        return self.stated | ({} if self.reception is None else self.reception.facts())
 
 
 def _spread(values: FloatArray, shape: tuple[int, ...]) -> FloatArray:

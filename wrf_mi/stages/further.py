@@ -5,17 +5,16 @@ A stage is an instance of `FurtherStage`, which an entry point of the group ``wr
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from copy import copy
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from ..core import Split
-from ..core.array_files import keyed, under
 from ..core.registry import Registry
+from ..core.stored import NOT_STORED, from_arrays, to_arrays
 from ..estimators.model import Arrays, Fitted, Model, PredictAll, Problem, Session
 from .engine import Engine
 from .fitted import FittedMixture
@@ -26,36 +25,33 @@ from .stage import Option, Stage, State
 FURTHER = "further"  # array of the names of such stages in their order, and beginning of the names of their arrays
 
 
+@dataclass(eq=False)
 class Further(Fitted):
-    """A prediction that a stage made of that of the stages ``before``; all but `predict` is theirs."""
+    """A prediction that a stage made of that of the stages ``before``; all but `predict` is theirs.
 
-    stage: str  # name of the stage
+    A subclass is a dataclass, whose further fields are stored (`wrf_mi.core.stored`).
+    """
 
-    def __init__(self, before: Fitted) -> None:
-        self.before = before
+    stage: ClassVar[str]  # name of the stage
+
+    before: Fitted = field(metadata=NOT_STORED)
+
+    def __post_init__(self) -> None:
+        before = self.before
         self.receivers, self.uses_heading, self.carriers_hz = before.receivers, before.uses_heading, before.carriers_hz
-
-    @abstractmethod
-    def own_arrays(self) -> Arrays:
-        """All that `FurtherStage.load` needs beside the prediction before."""
 
     @property
     def depends_on_heading(self) -> bool:
         """As before."""
         return self.before.depends_on_heading
 
-    def _about(self, before: Fitted) -> Self:
-        changed = copy(self)
-        changed.before = before
-        return changed
-
     def tracing_once(self) -> Self:
         """The stage after the model that traces once."""
-        return self._about(self.before.tracing_once())
+        return replace(self, before=self.before.tracing_once())
 
     def in_scene(self, scene: str) -> Self:
         """The stage after the prediction in an edited scene."""
-        return self._about(self.before.in_scene(scene))
+        return replace(self, before=self.before.in_scene(scene))
 
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions by the stages before, up to each and to the last of them."""
@@ -70,7 +66,7 @@ class Further(Fitted):
         """Arrays of the stages before and of this one."""
         arrays = self.before.arrays()
         names = [*np.atleast_1d(arrays.get(FURTHER, np.zeros(0, str))), self.stage]
-        return arrays | {FURTHER: np.asarray(names, str)} | keyed(f"{FURTHER}/{self.stage}/", self.own_arrays())
+        return arrays | {FURTHER: np.asarray(names, str)} | to_arrays(self, f"{FURTHER}/{self.stage}/")
 
     def facts(self) -> dict[str, Any]:
         """As before."""
@@ -91,9 +87,7 @@ class FurtherStage(Stage):
     The first of its options leaves the prediction as it is; the others set ``State.fitted`` to a `Further`.
     """
 
-    @abstractmethod
-    def load(self, arrays: Arrays, before: Fitted) -> Further:
-        """The prediction from `Further.own_arrays` and that of the stages before."""
+    fitted: type[Further]  #: class of its predictions
 
 
 FURTHER_STAGES: Registry[FurtherStage] = Registry("stage", "wrf_mi.stages", {})
@@ -146,5 +140,5 @@ def fit_further(
 def load_further(arrays: Arrays, fitted: Fitted) -> Fitted:
     """The stages of other packages after a fitted model, from the arrays of a run."""
     for name in map(str, np.atleast_1d(arrays.get(FURTHER, np.zeros(0, str)))):
-        fitted = FURTHER_STAGES[name].load(under(f"{FURTHER}/{name}/", arrays), fitted)
+        fitted = from_arrays(FURTHER_STAGES[name].fitted, arrays, f"{FURTHER}/{name}/", before=fitted)
     return fitted

@@ -9,7 +9,6 @@ parts/  in the run folder: files of the parts
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Mapping, Sequence
@@ -231,8 +230,6 @@ class Hybrid(Model):
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
         """The hybrid that `FittedMixture.arrays` described, and stages of other packages after it."""
-        if "sizes" not in json.loads(str(arrays["facts"])):
-            raise InputError(f"{folder}: a hybrid of an earlier version, which mixed other models; train the run anew")
 
         def load(name: str, of_part: Arrays) -> Fitted:
             entry, inner = _part(problem, name, name in TRACED)

@@ -16,8 +16,8 @@ from .engine import Engine
 from .residual import StrengthResidual
 from .runs import Runs
 
-STOPS = "stop.value_dbm"
-"""Array of pooled strengths, which generic kriging has not: readings, NaN where a receiver did not report at a stop."""
+POOLED = "field"  # array of pooled strengths, which generic kriging has not
+STOPS = "value_dbm"  # array of readings, NaN where a receiver did not report at a stop
 
 
 class StrengthKriging(GenericKriging):
@@ -61,7 +61,7 @@ class StrengthKriging(GenericKriging):
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
         """The model of either kind."""
-        return Strengths.from_arrays(arrays) if STOPS in arrays else super().load(arrays, problem, folder)
+        return Strengths.from_arrays(arrays) if POOLED in arrays else super().load(arrays, problem, folder)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse receivers without training rows where receivers are not pooled."""

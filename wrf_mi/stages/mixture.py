@@ -20,7 +20,7 @@ from ..estimators.model import Arrays, Fitted, HeldOutPrediction, Model, Problem
 from ..training import by_distance
 from ..training.by_distance import SINGLE, Intervals, Mixture
 from ..training.selection import HeldOut
-from .fitted import DEVIATIONS, NEGLIGIBLE, PATHS, PREDICTED, STATED, FittedMixture, Residuals, mixed
+from .fitted import NEGLIGIBLE, PATHS, PREDICTED, STATED, FittedMixture, Residuals, mixed
 from .scene import RESIDUAL
 
 HELD_OUT = "held_out"  # folder of the fits without held-out rows
@@ -208,8 +208,6 @@ class WithIntervals(Model):
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedMixture:
         """The model and its intervals."""
-        if DEVIATIONS not in arrays:
-            raise InputError(f"{folder}: intervals of an earlier version, calibrated otherwise; train the run anew")
         return FittedMixture.from_arrays(
             self.name, arrays, problem, lambda _, of_model: self.model.load(of_model, problem, folder)
         )

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ..backend.device import release_memory
 from ..core import InputError, Prediction, Split
 from ..core.settings import with_settings
+from ..core.stored import from_arrays
 from ..core.types import FloatArray, IntArray
-from ..estimators import model
 from ..estimators.gaussian.model import WRF_GS_PLUS, FittedField
 from ..estimators.held_out import hold_out_once
 from ..estimators.model import Arrays, Model, Problem, Session
@@ -79,10 +79,6 @@ class FittedPaths(FittedInScene):
 
     fitted: FittedField
     reports: HeldOutReports | None = None
-
-    def arrays(self) -> Arrays:
-        """Arrays of the graph, and its settings."""
-        return super().arrays() | {"settings": model.settings_array(self.fitted.config)}
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
         """Reports of held-out rows by which the training chose its state; None: other rows are among them."""
@@ -227,8 +223,8 @@ class TracedPaths(Model):
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedPaths:
         """The scene's side that was fitted in a folder."""
-        config, inner = model.stored_settings(TrainConfig, arrays, str(folder)), in_scene(problem, folder)
-        return FittedPaths(FittedField(arrays, config, replace(inner, settings=config), folder), inner)
+        inner = in_scene(problem, folder)
+        return FittedPaths(from_arrays(FittedField, arrays, problem=inner, folder=folder), inner)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse what the training of the graph refuses."""

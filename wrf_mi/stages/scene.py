@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..backend.device import release_memory
 from ..core import Record, Split
 from ..core.array_files import stored_arrays, write_arrays
+from ..core.stored import from_arrays, to_arrays
 from ..core.types import FloatArray, IntArray
 from ..correction import CorrectionOptions, default_options, write_page, write_scene
 from ..correction.edits import TracedScene, fit_edit, refit_edit
@@ -155,10 +156,10 @@ class SceneStage(Stage):
             fitted = fit_edit(posterior, change.parts, edit)
             session.folder.mkdir(parents=True, exist_ok=True)
             write_scene(fitted, traced.kinds, place)
-            write_arrays(path, fitted.edit.arrays())
+            write_arrays(path, to_arrays(fitted.edit))
             del posterior, fitted, traced
             release_memory()
-        edited = Edited(stated, change.options, SceneEdit.from_arrays(stored_arrays(path)))
+        edited = Edited(stated, change.options, from_arrays(SceneEdit, stored_arrays(path)))
         problem = replace(stated, scene=str(place), material=None)
         return replace(state, problem=problem, kept={**state.kept, self.name: edited})
 

@@ -10,8 +10,8 @@ from pydantic import Field
 
 from ..core import InputError
 
-MAX_DEPTH = 12
-MAX_RAYS = 1 << 24
+MAX_DEPTH = 12  # most interactions of a path: each costs walls some decibels, and candidates grow with every one
+MAX_RAYS = 1 << 24  # most rays from a source, whose hits have to fit into the memory
 MAX_DEGREE = 8  # largest degree of trainable antenna patterns, near the limit of Dr.Jit's `sh_eval`
 FACTOR, DISC = "surface.factor", "surface.disc"
 """Parameters of Gaussians on surfaces (`wrf_mi.tracing.paths.surface_gaussians`): trained [2, g], logarithmic

@@ -174,7 +174,7 @@ class LossConfig:
 PATHS_ALONE = "ray-tracing"  # name of the model that trains the paths of a scene without Gaussians
 LONG_ENOUGH: Mapping[str, int] = {"wrf-gs+": 9000}
 """Steps after which held-out scores no longer improve (docs/speed.md); `OTHERWISE` for other models."""
-OTHERWISE = 15000
+OTHERWISE = 15000  # models whose number nobody has measured take clearly more than wrf-gs+
 LEAST_TX_SCALE_M = 1.0
 """Metres per unit for transmitters within two metres; doubled for wider regions as often as needed."""
 

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.settings import describe, settings_from, with_settings
+from wrf_mi.core.stored import from_arrays, to_arrays
 from wrf_mi.datasets import load, make_splits, write_nerf2_csi, write_spectrum_folder
 from wrf_mi.estimators.interpolation.kriging import Kriging, Trend
 from wrf_mi.estimators.interpolation.strength_settings import SHADOWINGS, StrengthSettings
@@ -104,7 +105,7 @@ def test_mri_recovers_an_exact_path_loss_law(flat_folder: Path, tmp_path: Path) 
     for shared in ("false", "true"):
         out = train(record, "mri", out=tmp_path / shared, settings=(f"shared={shared}",)).folder
         with np.load(out / "model.npz") as arrays:
-            np.testing.assert_allclose(arrays["1/law"], [-45, -2], atol=ROUNDING)
+            np.testing.assert_allclose(arrays["models/1/law"], [-45, -2], atol=ROUNDING)
         np.testing.assert_allclose(stored(out)["prediction"], exact[:, 24:], atol=ROUNDING)
 
 
@@ -142,7 +143,7 @@ def test_grown_trees_predict_as_scikit_learn(flat_folder: Path) -> None:
         values, columns = np.sin(positions[:, 0]).astype(np.float32), [positions]
         columns += [] if turned_by is None else [np.cos(heading)[:, None], np.sin(heading)[:, None]]
         model = ExtraTreesRegressor(30, min_samples_leaf=2, random_state=0).fit(np.hstack(columns), values)
-        kept = GrownTrees(**Trees(30, 2).fit(positions, values, turned_by).arrays())
+        kept = from_arrays(GrownTrees, to_arrays(Trees(30, 2).fit(positions, values, turned_by)))
         # At thresholds, where single precision decides the side.
         edge = np.resize(record.tx_pos_m, (300, 3))
         edge[:, 0] = np.resize(kept.threshold[(kept.feature == 0) & (kept.left != kept.right)], 300)

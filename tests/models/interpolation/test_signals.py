@@ -11,6 +11,7 @@ from scipy.stats import rice
 
 from wrf_mi.core.angles import fibonacci_sphere
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.stored import from_arrays, to_arrays
 from wrf_mi.estimators.interpolation import signals as module
 from wrf_mi.estimators.interpolation.signals import (
     Covariances,
@@ -175,9 +176,9 @@ def test_prediction_is_that_of_a_gaussian_process_and_restored(tmp_path: Path) -
         left = covariance[0, 0] - np.diagonal(cross @ np.linalg.solve(known, cross.conj().T)) + process.noise[c]
         np.testing.assert_allclose(posterior.mean @ process.basis.conj()[:, c], mean, atol=1e-8)
         np.testing.assert_allclose(posterior.variance[:, c], left.real, atol=1e-8)
-    np.savez(tmp_path / "process.npz", **process.arrays())
+    np.savez(tmp_path / "process.npz", **to_arrays(process))
     with np.load(tmp_path / "process.npz") as stored:
-        again = SignalProcess.from_arrays(dict(stored)).predict(where)
+        again = from_arrays(SignalProcess, dict(stored)).predict(where)
     np.testing.assert_array_equal(again.mean, posterior.mean)
     np.testing.assert_array_equal(again.variance, posterior.variance)
 

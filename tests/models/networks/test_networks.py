@@ -11,7 +11,7 @@ import pytest
 from wrf_mi.backend.device import to_float, to_tensor
 from wrf_mi.core import InputError
 from wrf_mi.core.settings import with_settings
-from wrf_mi.estimators.model import field_arrays, from_field_arrays
+from wrf_mi.core.stored import from_arrays, to_arrays
 from wrf_mi.estimators.networks.dcgan import (
     NORM_FLOOR,
     BatchShape,
@@ -126,7 +126,7 @@ def test_gradients_of_layouts_and_normalisation():
 
 def test_coordinates_are_centred_and_stored():
     frame = Coordinates.of([[0, 0, 1], [2, 0, 1]])
-    again = from_field_arrays(Coordinates, field_arrays(frame))
+    again = from_arrays(Coordinates, to_arrays(frame))
     features = again.features([[2, 0, 1]], octaves=1, scale_m=2.0).numpy()[:, 0]
     # A unit of plain coordinate; a half turn in two units of scale is 1 m.
     np.testing.assert_allclose(features, [1, 0, 0, 1, 0, 0, 0, 1, 1], atol=1e-6)

@@ -26,7 +26,7 @@ DEGREE_0 = 0.28209479177387814
 """Spherical harmonic of degree 0, 1 / (2 sqrt(pi)): a viewer's colour is 0.5 + `DEGREE_0` f_dc."""
 RANGE_DB = 40.0  # range of magnitudes of the signal, below the strongest, over which colours differ
 OPAQUE = 1e-6  # least distance of an opacity from 0 and 1, whose logits are infinite
-FORMAT = 1  # version of the file with all parameters
+FORMAT = 2  # version of the file with all parameters
 VERSION, SPLIT_ARRAYS, FITTED_ARRAYS = "export/format", "split/", "run/"
 TEXTS = {CONFIG: "export/config", METRICS: "export/metrics"}  # keys of the texts of a run folder's files
 
@@ -116,10 +116,10 @@ def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, A
 def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
     """Write a field of Gaussians (`wrf_mi.apps.exports.source.Write`).
 
-    Keys: ``param/<name>``, the parameters in single precision, [k, n] each; ``form/*``, the form of the observations;
-    ``receiver_*`` and ``tx_antenna``; ``split/*`` and ``run/*`` of the run's ``split.npz`` and ``model.npz``; the texts
-    ``export/config`` and ``export/metrics``. ``docs/export.md`` has the parameters' shapes. `InputError`: no Gaussians,
-    or an unfinished run.
+    Keys: ``params/<name>``, the parameters in single precision, [k, n] each; ``form/*``, the form of the observations;
+    ``receivers/*`` and ``tx_antenna``; ``split/*`` and ``run/*`` of the run's ``split.npz`` and ``model.npz``; the
+    texts ``export/config`` and ``export/metrics``. ``docs/export.md`` has the parameters' shapes. `InputError`: no
+    Gaussians, or an unfinished run.
     """
     run = source.run
     field = field_of(run)

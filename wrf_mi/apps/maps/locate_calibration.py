@@ -27,6 +27,7 @@ from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.array_files import stored_arrays, write_arrays
 from ...core.files import readable, write_atomically
+from ...core.settings import settings_from
 from ...core.types import IntArray
 from ...datasets.observations import fitted_receivers
 from ...estimators.held_out import fit_fold
@@ -140,9 +141,7 @@ def calibration_of(run: Run, fitted: Fitted, candidates: Candidates, session: Se
         with readable(file, f"{file}: missing", "remove it"):
             stored = json.loads(file.read_text(encoding="utf-8"))
             if stored.pop("key") == key:
-                form, near = stored.pop("likelihood"), Neighbours(**stored.pop("neighbours"))
-                silence = None if form["silence"] is None else Silence(**form["silence"])
-                return Calibration(Likelihood(**form | {"silence": silence}), near, **stored)
+                return settings_from(Calibration, stored, str(file))
     record, split = run.problem.record, load_rows(run.folder, run.problem.record)
     folds = folds_of(record, split)
     if not folds:

@@ -7,7 +7,8 @@ calibrates `wrf_mi.estimators.ray_tracing`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, replace
+from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from ...backend.device import release_memory
-from ...core import Antenna, InputError, Prediction, Receiver, Split, receiver_arrays, stored_receivers
-from ...core.array_files import keyed, under
+from ...core import Antenna, InputError, Prediction, Receiver, Split
 from ...core.settings import names_of
+from ...core.stored import NOT_STORED
 from ...graph.graph import Graph
 from ...graph.settings import TRACED_NAMES
 from ...receivers.registry import GAPS, ObservationSpec
@@ -35,14 +36,11 @@ from ...training.loop import FitState, Progress
 from ...training.predictor import Predictor
 from ...training.trainer import Trainer, fit_curriculum
 from ...training.validation import HeldOutReports
-from ..model import Arrays, Decomposition, Fitted, Inputs, Model, Problem, Session
+from ..model import Decomposition, Fitted, Inputs, Model, Problem, Session
 from .new_receivers import Params, of_all_receivers, trained_part, without_rows
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
-PARAM = "param/"  # prefix of a parameter's array in ``model.npz``
-REACH = "reach_m"  # array of the reach in metres: infinite where no validation chose a finite one
-PHASE_ERROR = "phase_error"
-"""Array of the standard deviation of a reflection's phase in predictions, rad, where it is not 0."""
+PARAM = "params/"  # prefix of a parameter's array in ``model.npz``
 
 
 def placed_of(problem: Problem, plan: FitPlan) -> tuple[Receiver, ...]:
@@ -50,44 +48,50 @@ def placed_of(problem: Problem, plan: FitPlan) -> tuple[Receiver, ...]:
     return placed_receivers(problem.record, by_uplink=bool(plan.graph.form.features))
 
 
+@dataclass(eq=False)
 class FittedField(Fitted):
     """Trained Gaussians, alone or with the paths of a scene, or trained paths alone.
 
-    Operators are kept in the folder ``store`` (`wrf_mi.training.evaluator`).
-
     Attributes:
+        folder: folder in which operators are kept (`wrf_mi.training.evaluator`).
+        params: parameters by name.
+        form: form of the observations.
+        receivers: receivers as the graph takes them.
+        reach: region in which the Gaussians are used; None: everywhere.
+        phase_error: standard deviation of a reflection's phase in predictions, rad.
         field: field of Gaussians, see `wrf_mi.gaussians`; None: paths alone.
         held_out: reports of training rows by which its state was chosen; None after loading, or where none were.
     """
 
-    held_out: HeldOutReports | None = None
+    problem: Problem = dataclass_field(metadata=NOT_STORED)
+    folder: Path = dataclass_field(metadata=NOT_STORED)
+    config: TrainConfig
+    params: Params
+    form: ObservationSpec
+    tx_antenna: Antenna
+    receivers: tuple[Receiver, ...]
+    reach: Reach | None = None
+    phase_error: float = 0.0
 
-    def __init__(self, arrays: Arrays, config: TrainConfig, problem: Problem, store: Path) -> None:
-        self._arrays, self._problem, self._store = arrays, problem, store
-        self.config, self.form, self.receivers = config, ObservationSpec.of(arrays), stored_receivers(arrays)
-        self.params: Params = under(PARAM, arrays)
+    def __post_init__(self) -> None:
+        self.held_out: HeldOutReports | None = None
+        if self.reach is not None and np.isnan(self.reach.length_m):
+            raise InputError("array reach/length_m: not a number; train the run anew")
         # Of Gaussians that no held-out row gained by, nothing is stored and nothing evaluated.
-        used = problem.scene is None or "position" in self.params
-        self.field = field_of(config, self.form) if used else None
-        check_params(self.field, self.params, str(store / "model.npz"))
+        used = self.problem.scene is None or "position" in self.params
+        self.field = field_of(self.config, self.form) if used else None
+        check_params(self.field, self.params, str(self.folder / "model.npz"))
         self.uses_heading = self.form.headings
         self.carriers_hz = np.zeros(0) if self.form.carriers_hz is None else self.form.carriers_hz
 
     @cached_property
     def predictor(self) -> Predictor:
         """``predictor(tx_pos_m, receiver)`` gives spectra [m, H, W], powers [m] or channels [m, ...]."""
-        form, config, antenna = self.form, self.config, Antenna(*map(str, self._arrays["tx_antenna"]))
-        assert self.receivers is not None
-        scene = None if self._problem.scene is None else self._problem.open_scene(form.carrier_hz)
-        graph = Graph(self.field, self.receivers, form, scene, config.traced, antenna, config.evaluation)
+        form, config, problem = self.form, self.config, self.problem
+        scene = None if problem.scene is None else problem.open_scene(form.carrier_hz)
+        graph = Graph(self.field, self.receivers, form, scene, config.traced, self.tx_antenna, config.evaluation)
         graph.add_surface_gaussians((), self.params)
-        reach, phase_error = None, float(self._arrays.get(PHASE_ERROR, 0.0))
-        if REACH in self._arrays:
-            if np.isnan(length_m := float(self._arrays[REACH])):
-                raise InputError(f"array {REACH}: not a number; train the run anew")
-            known_m = np.split(self._arrays["known_m"], np.cumsum(self._arrays["known_counts"])[:-1])
-            reach = Reach(tuple(known_m), length_m)
-        return Predictor(graph, self.params, self._problem.operator, self._store, reach, phase_error)
+        return Predictor(graph, self.params, problem.operator, self.folder, self.reach, self.phase_error)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Observations of the receiver of that index, [m, ...]."""
@@ -96,40 +100,41 @@ class FittedField(Fitted):
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """Observations, and with a scene the paths' and the Gaussians' share of them."""
-        if self._problem.scene is None:
+        if self.problem.scene is None:
             return super().decompose(inputs, receiver, std)
         heading = inputs.tx_heading_rad if self.uses_heading else None
         reports, paths = self.predictor.decompose(inputs.tx_pos_m, receiver, heading, inputs.carriers_hz)
         return Decomposition(Prediction(reports["prediction"]), reports.get("traced"), reports.get("learned"), paths)
 
-    def arrays(self) -> Arrays:
-        """Parameters, form of the observations, antennas, receivers and reach."""
-        return self._arrays
-
     def facts(self) -> dict[str, Any]:
         """Steps of the training and number of Gaussians."""
         gaussians = {} if self.field is None else {"gaussians": int(self.params["position"].shape[1])}
-        phases = {PHASE_ERROR: float(self._arrays[PHASE_ERROR])} if PHASE_ERROR in self._arrays else {}
+        phases = {"phase_error": self.phase_error} if self.phase_error else {}
         return {"steps": self.config.steps} | gaussians | phases
 
     def in_scene(self, scene: str) -> Fitted:
         """Paths of an edited scene with the fitted parameters of its surfaces; Gaussians of the field stay."""
-        if self._problem.scene is None:
+        if self.problem.scene is None:
             return super().in_scene(scene)
-        edited = replace(self._problem, scene=scene, material=None)
-        opened, stated = (problem.open_scene(self.form.carrier_hz) for problem in (edited, self._problem))
+        edited = replace(self.problem, scene=scene, material=None)
+        opened, stated = (problem.open_scene(self.form.carrier_hz) for problem in (edited, self.problem))
         try:
             params = parameters_in(opened, stated, self.params)
         except InputError as error:
-            raise InputError(f"{scene}: {error}; trained in {self._problem.scene}") from None
-        other = {name: values for name, values in self._arrays.items() if not name.startswith(PARAM)}
-        return type(self)(other | keyed(PARAM, params), self.config, edited, self._store)
+            raise InputError(f"{scene}: {error}; trained in {self.problem.scene}") from None
+        return replace(self, problem=edited, params=params)
 
     def without_gaussians(self) -> FittedField:
         """The same paths without the Gaussians beside them."""
-        other = {name: values for name, values in self._arrays.items() if not name.startswith((PARAM, REACH))}
         params = {name: values for name, values in self.params.items() if name.startswith(TRACED_NAMES)}
-        return FittedField(other | keyed(PARAM, params), self.config, self._problem, self._store)
+        return replace(self, params=params, reach=None)
+
+
+def _fitted(
+    plan: FitPlan, params: Params, problem: Problem, folder: Path, reach: Reach | None = None, phase_error: float = 0.0
+) -> FittedField:
+    form, antenna, receivers = plan.graph.form, problem.record.tx_antenna, placed_of(problem, plan)
+    return FittedField(problem, folder, plan.config, params, form, antenna, receivers, reach, phase_error)
 
 
 def _used(trainer: Trainer) -> tuple[Params, Reach | None]:
@@ -216,11 +221,11 @@ def _unused_of_paths(plan: FitPlan, splits: Sequence[Split]) -> dict[str, str]:
 class GaussianField(Model):
     """A model of 3D Gaussians, of `wrf_mi.gaussians.FIELDS`, for any task or for data of one."""
 
-    source, settings = SOURCE, TrainConfig
+    source, settings, fitted = SOURCE, TrainConfig, FittedField
     tasks = ("spectrum", "rssi", "csi")
     scene, uplink = "optional", "optional"
     several_carriers, new_receivers = True, True
-    gaps = (*GAPS, REACH)
+    gaps = (*GAPS, "length_m")  # an infinite reach
     train_arguments = ("model", "seed", "deterministic", "receiver", "evaluation")
     presets = PRESETS
 
@@ -304,7 +309,7 @@ class GaussianField(Model):
         plan = self._plan(problem, split)
         # Without a gain no row has to be traced.
         params = starting_values(plan, plan.traced(), (), None) if plan.task.has_gain else {}
-        return FittedField(self._arrays(plan, params, problem, split), plan.config, problem, session.folder)
+        return _fitted(plan, params, problem, session.folder)
 
     def _trainer(self, session: Session, plan: FitPlan, before: Trainer | None) -> Trainer:
         """A trainer of a plan, at the last checkpoint in its folder or at the start."""
@@ -342,25 +347,9 @@ class GaussianField(Model):
 
     def _fitted(self, trainer: Trainer, problem: Problem, split: Split, folder: Path) -> FittedField:
         params, reach = of_all_receivers(*_used(trainer), placed_of(problem, trainer.plan), without_rows(split))
-        arrays = self._arrays(trainer.plan, params, problem, split)
-        if reach is not None:
-            # Receivers observe different numbers of transmitters: flat positions and their counts.
-            arrays[REACH], arrays["known_m"] = np.asarray(reach.length_m), np.concatenate(reach.known_m)
-            arrays["known_counts"] = np.array([len(positions_m) for positions_m in reach.known_m])
-        if trainer.state.phase_error:
-            arrays[PHASE_ERROR] = np.asarray(trainer.state.phase_error)
-        fitted = FittedField(arrays, trainer.plan.config, problem, folder)
+        fitted = _fitted(trainer.plan, params, problem, folder, reach, float(trainer.state.phase_error))
         fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.validation.reports(trainer.state)
         return fitted
-
-    def _arrays(self, plan: FitPlan, params: Params, problem: Problem, split: Split) -> Arrays:
-        """Arrays of a fitted field but for its reach."""
-        return {
-            **keyed(PARAM, params),
-            **plan.graph.form.arrays(),
-            "tx_antenna": np.asarray(astuple(problem.record.tx_antenna)),
-            **receiver_arrays(placed_of(problem, plan)),
-        }
 
     def _plan(self, problem: Problem, split: Split) -> FitPlan:
         """Plan of a fit, taken from `check` where data, rows, settings and scene are the same."""
@@ -373,10 +362,6 @@ class GaussianField(Model):
             if same and all(np.array_equal(*part) for part in parts):
                 return plan
         return FitPlan(record, rows, problem.settings, scene=scene)
-
-    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedField:
-        """The field that `FittedField.arrays` described; operators are stored in the folder."""
-        return FittedField(arrays, problem.settings, problem, folder)
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse settings, files and scenes that a training would refuse."""

@@ -2,45 +2,39 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
-from ...core.array_files import keyed, under
 from ...core.carriers import by_carrier, carriers_text
 from ...core.types import IntArray
 from ...datasets.observations import LEAST_ROWS, rows_received
 from ...training.session import OnProgress
-from ..model import Arrays, Fitted, Inputs, Model, Problem, Session, known_positions
-
-# Keys of the arrays: whether headings are used; of several carriers, these and the numbers of models that are missing.
-HEADING, CARRIERS, WITHOUT = "heading", "carriers_hz", "without"
+from ..model import Fitted, Inputs, Model, Problem, Session, known_positions
 
 
-class Single(Protocol):
-    """The model of one receiver."""
+class Single(ABC):
+    """The model of one receiver; its subclasses are dataclasses, which `wrf_mi.core.stored` stores."""
 
+    @abstractmethod
     def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """Observations [m, ...] at positions [m, 3]."""
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a run file."""
 
-
-@runtime_checkable
-class Probabilistic(Single, Protocol):
+class Probabilistic(Single):
     """The model of one receiver that states standard deviations."""
 
+    @abstractmethod
     def prediction(self, tx_pos: FloatArray) -> Prediction:
         """Observations [m, ...] at positions [m, 3], and their standard deviations."""
 
+    @abstractmethod
     def facts(self) -> dict[str, Any]:
         """Fitted parameters and choices as plain numbers and strings."""
 
@@ -169,16 +163,6 @@ class ByReceiver(Fitted):
             return {}
         return {"fitted": [model.facts() for model in self.models if isinstance(model, Probabilistic)]}
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of all models, use of headings, and carriers."""
-        arrays = {HEADING: np.asarray(self.heading)}
-        if self.carriers_hz is not None:
-            arrays[CARRIERS] = self.carriers_hz
-            arrays[WITHOUT] = np.array([number for number, model in enumerate(self.models) if model is None], np.int64)
-        for number, model in enumerate(self.models):
-            arrays |= {} if model is None else keyed(f"{number}/", model.arrays())
-        return arrays
-
 
 class ByReceiverModel(Model):
     """A method that fits every receiver by itself to all training rows, those of each carrier by themselves."""
@@ -194,10 +178,6 @@ class ByReceiverModel(Model):
         Raises:
             InputError: rows that it cannot be fitted to.
         """
-
-    @abstractmethod
-    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
-        """The model of a receiver from its arrays."""
 
     def takes_headings(self, record: Record, settings: Any) -> bool:
         """Whether headings count where the record has them."""
@@ -245,14 +225,3 @@ class ByReceiverModel(Model):
                     raise InputError(f"{record.name}, receiver {name}: {error}") from None
                 session.report(f"{self.name}: receivers", len(models) / enough.size)
         return self.fitted(self.name, models, headings is not None, carriers)
-
-    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
-        """The models that `ByReceiver.arrays` described."""
-        carriers = arrays.get(CARRIERS)
-        receivers = problem.record.receivers * (1 if carriers is None else len(carriers))
-        without = arrays.get(WITHOUT, np.zeros(0, np.int64))
-        models = [
-            None if number in without else self.load_single(receiver, under(f"{number}/", arrays))
-            for number, receiver in enumerate(receivers)
-        ]
-        return self.fitted(self.name, models, bool(arrays[HEADING]), carriers)

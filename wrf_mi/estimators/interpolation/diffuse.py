@@ -6,7 +6,6 @@ measurements than that; within, the covariance of a diffuse field is sharper tha
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,23 +14,20 @@ from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.spatial import KDTree
 
-from ...core import Prediction, Receiver
+from ...core import Prediction
 from ...core.angles import FloatArray
-from ...core.array_files import keyed, under
-from ..model import Arrays, field_arrays, from_field_arrays
-from .by_receiver import ReceiverRows, Single, observed_rows
+from .by_receiver import Probabilistic, ReceiverRows, Single, observed_rows
 from .kriging import GenericKriging, UncertainKriged, asks_generic, kriged
 from .path_loss import NEAREST_M
 
 Complex = NDArray[np.complexfloating[Any, Any]]
-NEIGHBOURS = 32
+NEIGHBOURS = 32  # nearest rows that predict: farther ones are screened by them, and a solve costs their cube
 SHARES = (0.3, 0.6, 0.9, 0.99, 0.999)
 """Candidate shares of the field in the residual power, the rest being noise; held-out rows choose."""
 CERTAIN = 3.0  # standard errors by which predictions with the field must be better than without
 LEAST_ROWS = 8
 """Least number of rows that may choose the line of sight: its gain, fitted to all of them, flatters them by 2 / n."""
 NEGLIGIBLE = 1e-8  # share of the mean power, -80 dB, below which an error no longer counts in the choice
-GAIN = "gain"  # key of the arrays that generic kriging has not
 
 
 @dataclass(frozen=True)
@@ -107,14 +103,14 @@ def direct_wave(tx_pos_m: FloatArray, receiver_m: FloatArray, k: FloatArray) -> 
 
 
 @dataclass(frozen=True)
-class KrigedChannels:
+class KrigedChannels(Probabilistic):
     """Channels of one receiver: line of sight times a gain, and a diffuse field."""
 
     receiver_m: FloatArray  # position of the receiver [3], metres
     k: FloatArray  # wave number of each subcarrier, rad/m
     gain: complex  # complex gain of the line of sight
     field: DiffuseField
-    dtype: np.dtype[Any]
+    like: Complex  # empty array of the type of observations
 
     @classmethod
     def fit(cls, position_m: FloatArray, observed: Complex, receiver_m: FloatArray, k: FloatArray) -> KrigedChannels:
@@ -123,7 +119,7 @@ class KrigedChannels:
         # One complex gain for all subcarriers: antennas and cables are taken to be flat over the band.
         gain = complex(np.vdot(direct, observed) / np.vdot(direct, direct))
         field = fit_diffuse(position_m, observed - gain * direct, float(k.mean()))
-        return cls(receiver_m, k, gain, field, observed.dtype)
+        return cls(receiver_m, k, gain, field, np.empty(0, observed.dtype))
 
     def left_out(self) -> Complex:
         """Errors of the training rows, each predicted from all others, [n, subcarriers]."""
@@ -136,7 +132,7 @@ class KrigedChannels:
     def prediction(self, tx_pos: FloatArray) -> Prediction:
         """Channels and standard deviations at positions [m, 3], metres."""
         residual, variance = self.field.predict(tx_pos)
-        mean = (self.gain * direct_wave(tx_pos, self.receiver_m, self.k) + residual).astype(self.dtype)
+        mean = (self.gain * direct_wave(tx_pos, self.receiver_m, self.k) + residual).astype(self.like.dtype)
         return Prediction(mean, np.broadcast_to(np.sqrt(variance)[:, None], mean.shape))
 
     def facts(self) -> dict[str, Any]:
@@ -146,18 +142,6 @@ class KrigedChannels:
         gain = {"gain_db": gain_db, "gain_phase_rad": float(np.angle(self.gain))}
         diffuse = {"diffuse_share": self.field.share, "rest_power_db": power_db}
         return {"parts": "line of sight, diffuse field"} | gain | diffuse
-
-    def arrays(self) -> Arrays:
-        """Arrays for `from_arrays`."""
-        return {"k": self.k, GAIN: np.array(self.gain), "like": np.empty(0, self.dtype)} | keyed(
-            "field/", field_arrays(self.field)
-        )
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver) -> KrigedChannels:
-        """The model that `arrays` stored."""
-        field = from_field_arrays(DiffuseField, under("field/", arrays))
-        return cls(receiver.position_m, arrays["k"], complex(arrays[GAIN]), field, arrays["like"].dtype)
 
 
 class ChannelKriging(GenericKriging):
@@ -187,7 +171,3 @@ class ChannelKriging(GenericKriging):
         gain = generic_log - channels_log
         # Few rows prefer one of both by chance, and generic kriging, which assumes least, is then the safer one.
         return channels if gain.mean() > CERTAIN * gain.std() / np.sqrt(len(gain)) else generic
-
-    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
-        """The kriging of a receiver from its arrays."""
-        return KrigedChannels.from_arrays(arrays, receiver) if GAIN in arrays else super().load_single(receiver, arrays)

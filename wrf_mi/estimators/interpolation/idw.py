@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from ...core import InputError, Receiver, Record, Split
+from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.task import NEIGHBOURS
 from ...core.types import IntArray
 from ...training.selection import rows_at_receiver
 from ..held_out import hold_out_once
-from ..model import Arrays, Fitted, Problem, Session, known_positions
-from .by_receiver import ByReceiver, ByReceiverModel, ReceiverRows, observed_rows
+from ..model import Fitted, Problem, Session, known_positions
+from .by_receiver import ByReceiver, ByReceiverModel, ReceiverRows, Single, observed_rows
 
 COUNTS = (4, 8, 16, 32, 64, 100)  # numbers of neighbours that held-out training rows choose from
 MOST_APART = 0.01
@@ -29,7 +29,8 @@ on flat-ble's path with 30 % of the rows 0.20 m at 0.25, test rows 0.07 m.
 """
 
 
-class InverseDistance:
+@dataclass(eq=False)
+class InverseDistance(Single):
     """Inverse-distance weighting of the nearest training rows.
 
     A prediction is sum_i w_i y_i / sum_i w_i over the ``k`` nearest training positions with w_i = (d_i + s)^-power;
@@ -43,12 +44,18 @@ class InverseDistance:
     Source: Shepard, "A two-dimensional interpolation function for irregularly-spaced data" (1968).
     """
 
-    def __init__(self, k: int = 4, power: float = 2, softening_m: float = 0) -> None:
-        if k < 1:
-            raise InputError(f"k = {k}: IDW needs at least one neighbour")
-        if not softening_m >= 0:
-            raise InputError(f"softening {softening_m} m: choose 0 or more")
-        self.k, self.power, self.softening_m = k, power, softening_m
+    k: int = 4
+    power: float = 2.0
+    softening_m: float = 0.0
+    tx_pos_m: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    value: NDArray[Any] = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if self.k < 1:
+            raise InputError(f"k = {self.k}: IDW needs at least one neighbour")
+        if not self.softening_m >= 0:
+            raise InputError(f"softening {self.softening_m} m: choose 0 or more")
+        self._tree, self._values = KDTree(self.tx_pos_m), self.value
 
     def fit(self, tx_pos: ArrayLike, observation: ArrayLike) -> InverseDistance:
         """Keep the rows at positions [n, 3], metres, that were observed: observations [n, ...] without NaN.
@@ -56,20 +63,8 @@ class InverseDistance:
         Raises:
             InputError: no rows, none that was observed, or two different numbers of them.
         """
-        positions, self._values, _ = observed_rows(tx_pos, observation)
-        self._tree = KDTree(positions)
-        return self
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Settings, and the rows that were observed."""
-        settings = np.array([self.k, self.power, self.softening_m], float)
-        return {"settings": settings, "tx_pos_m": np.asarray(self._tree.data), "value": self._values}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> InverseDistance:
-        """The model that `arrays` described."""
-        k, power, softening_m = map(float, arrays["settings"])
-        return cls(int(k), power, softening_m).fit(arrays["tx_pos_m"], arrays["value"])
+        positions, values, _ = observed_rows(tx_pos, observation)
+        return replace(self, tx_pos_m=positions, value=values)
 
     def predict(self, tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None = None) -> NDArray[np.floating]:
         """Observations [m, ...] at positions [m, 3] in metres; headings are not used."""
@@ -148,10 +143,6 @@ class Idw(ByReceiverModel):
         assert settings.neighbours is not None
         how = settings.neighbours, settings.power, _softening_m(rows.problem)
         return InverseDistance(*how).fit(rows.tx_pos_m, rows.observation)
-
-    def load_single(self, receiver: Receiver, arrays: Arrays) -> InverseDistance:
-        """The rows that were kept."""
-        return InverseDistance.from_arrays(arrays)
 
 
 def _softening_m(problem: Problem) -> float:

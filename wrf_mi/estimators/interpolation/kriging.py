@@ -21,8 +21,8 @@ from scipy.optimize import minimize
 from ...core import InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, names_of
-from ..model import Arrays, Problem
-from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
+from ..model import Problem
+from .by_receiver import ByReceiverModel, Probabilistic, ReceiverRows, Single, observed_rows
 from .kriging_equations import KrigingSystem, component_root, correlation
 from .path_loss import Trend
 
@@ -36,12 +36,10 @@ LIKELIHOOD_EVALUATIONS = 200  # Nelder-Mead on three logarithms settles to 0.01 
 
 
 UNKNOWN_MEAN = Trend()  # one unknown mean
-SCALE = "scale"  # key of the arrays that kriging without standard deviations has not
-STORED = ("lengths", "positions_m", "coefficients", "weights", "like")  # attributes of `Kriged` as they are
 
 
 @dataclass(frozen=True)
-class Kriged:
+class Kriged(Single):
     """A fitted kriging: a trend, and weights of the training rows' correlations."""
 
     kernel: str  # a key of `wrf_mi.estimators.interpolation.kriging_equations.KERNELS`
@@ -70,23 +68,9 @@ class Kriged:
         mean = self.trend(positions) @ self.coefficients + cross @ self.weights
         return mean.astype(self.like.dtype).reshape(len(mean), *self.like.shape[1:])
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a run file."""
-        circle = np.zeros((0, 2)) if self.circle is None else self.circle
-        trend = CONSTANT if self.trend.receiver_m is None else LOG_DISTANCE
-        names = {"trend": np.asarray(trend), "kernel": np.asarray(self.kernel)}
-        return names | {"circle": circle} | {name: getattr(self, name) for name in STORED}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver, **more: Any) -> Kriged:
-        """The predictions that `arrays` described, with values ``more`` of further attributes."""
-        circle = arrays["circle"] if len(arrays["circle"]) else None
-        values: dict[str, Any] = {name: arrays[name] for name in STORED} | more
-        return cls(kernel=str(arrays["kernel"]), circle=circle, trend=_trend(str(arrays["trend"]), receiver), **values)
-
 
 @dataclass(frozen=True, kw_only=True)
-class UncertainKriged(Kriged):
+class UncertainKriged(Kriged, Probabilistic):
     """Kriging over positions, with a trend by generalised least squares, that states standard deviations."""
 
     scale: FloatArray  # standard deviation of the field of each component [q]
@@ -124,10 +108,6 @@ class UncertainKriged(Kriged):
     def facts(self) -> dict[str, Any]:
         """Form, correlation length and noise."""
         return {"parts": "generic", "length_m": float(self.lengths[0]), "noise": self.noise}
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a run file."""
-        return super().arrays() | {"noise": np.array(self.noise), SCALE: self.scale}
 
 
 @dataclass(frozen=True)
@@ -326,12 +306,6 @@ class GenericKriging(ByReceiverModel):
     def fit_single(self, rows: ReceiverRows) -> Single:
         """Kriging of the observations themselves, see `kriged`."""
         return kriged(rows)
-
-    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
-        """The kriging of a receiver from its arrays."""
-        if SCALE not in arrays:
-            return Kriged.from_arrays(arrays, receiver)
-        return UncertainKriged.from_arrays(arrays, receiver, noise=float(arrays["noise"]), scale=arrays[SCALE])
 
 
 def _trend_name(problem: Problem) -> str:

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Receiver, Record, Split
+from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..model import Arrays, Problem
-from .by_receiver import ByReceiverModel, ReceiverRows
+from ..model import Problem
+from .by_receiver import ByReceiverModel, ReceiverRows, Single
 from .path_loss import Trend, fit_path_loss, shows_exponent
 
 
@@ -39,7 +39,7 @@ class MriSettings:
 
 
 @dataclass(frozen=True)
-class PathLoss:
+class PathLoss(Single):
     """The fitted law of one receiver."""
 
     receiver_m: FloatArray  # position of the receiver [3], metres
@@ -48,10 +48,6 @@ class PathLoss:
     def predict(self, tx_pos: FloatArray, tx_heading_rad: FloatArray | None = None) -> NDArray[Any]:
         """Power in dBm, [m] float32, at transmitter positions [m, 3]."""
         return (Trend(self.receiver_m)(tx_pos) @ self.law).astype(np.float32)
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """The law."""
-        return {"law": self.law}
 
 
 def _shared_law(record: Record, rows: IntArray) -> FloatArray:
@@ -96,10 +92,6 @@ class Mri(ByReceiverModel):
             # Rows at a single distance state a level but no exponent, which is that of all receivers.
             return PathLoss(receiver_m, fit_path_loss(columns, observed, -_shared_law(record, train)[1]))
         return PathLoss(receiver_m, _law(columns, observed))
-
-    def load_single(self, receiver: Receiver, arrays: Arrays) -> PathLoss:
-        """The law of a receiver from its arrays."""
-        return PathLoss(receiver.position_m, arrays["law"])
 
 
 MODEL = Mri()

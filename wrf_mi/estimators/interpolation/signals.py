@@ -21,7 +21,7 @@ minorise-maximise steps of Zhou, Hu, Zhou and Lange, "MM algorithms for variance
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -35,7 +35,6 @@ from ...core.types import IntArray
 from ...parallel.threads import on_threads
 from ...receivers.array import mirror_order
 from ...receivers.retrieve import align_signals
-from ..model import field_arrays, from_field_arrays
 from .kriging_equations import KrigingSystem, chosen_rows, left_out
 
 ComplexArray = NDArray[np.complex128]
@@ -43,12 +42,11 @@ LEAST_NOISE = 3e-3  # least noise as a share of a signal's power, below the reso
 NEGLIGIBLE = 1e-4  # shares below this part of the greatest are dropped during the iteration
 TINY = 1e-100  # least denominator
 RICH = 8  # principal components with the whole dictionary; the others, some per cent of the power, have no turns
-ROUNDS = 3
-STEPS = 25
+ROUNDS = 3  # fits of the covariances, between which rows are aligned with their predictions
+STEPS = 25  # minorise-maximise steps of a fit of shares, most of its time
 SWEEPS = 3  # sweeps of alignment in each round: rows stop changing after two
 LEAST_POWER = 1e-6  # least power of a component, a row's being 1: with fewer rows than elements some are only rounding
 MOST_ROWS = 320  # rows of the fit of shares at most: its time grows with their cube
-STORED = ("tx_pos_m", "signals", "basis", "weight", "noise")
 
 
 @dataclass(frozen=True)
@@ -239,16 +237,6 @@ class SignalProcess:
                 weights, variance[number, c] = left_out(precision, np.flatnonzero(near[number]), row)
                 mean[number, c] = weights @ self._components[:, c]
         return self._posterior(mean, variance)
-
-    def arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
-        """Arrays for `from_arrays`."""
-        return {f"{prefix}{name}": getattr(self, name) for name in STORED} | field_arrays(self.covariances, prefix)
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> SignalProcess:
-        """The process that `arrays` stored."""
-        positions, signals, *components = (arrays[f"{prefix}{name}"] for name in STORED)
-        return cls(positions, signals, from_field_arrays(Covariances, arrays, prefix), *components)
 
 
 def fit_signals(

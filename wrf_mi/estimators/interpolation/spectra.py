@@ -19,6 +19,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -28,9 +29,8 @@ from scipy.constants import speed_of_light
 from scipy.spatial.distance import cdist
 from scipy.special import i0e, i1e
 
-from ...core import InputError, Prediction, Receiver, Split
+from ...core import InputError, Prediction, Split
 from ...core.angles import FloatArray, pixel_directions
-from ...core.array_files import keyed
 from ...core.settings import Count, names_of
 from ...datasets.observations import rows_received
 from ...parallel.threads import one_blas_thread
@@ -38,8 +38,8 @@ from ...receivers.array import Lags, array_response
 from ...receivers.retrieve import retrieve_signals, unscale
 from ...tasks.scores import LEVEL, REAL_90
 from ...training.session import OnProgress
-from ..model import Arrays, Problem, field_arrays, from_field_arrays
-from .by_receiver import ReceiverRows, Single, observed_rows
+from ..model import Arrays, Fitted, Problem
+from .by_receiver import Probabilistic, ReceiverRows, Single, observed_rows
 from .kriging import GenericKriging, KrigingSettings, UncertainKriged, asks_generic, kriged
 from .kriging_equations import AnisotropicKriging, fit_anisotropic, line_of_sight
 from .signals import ComplexArray, Covariances, Posterior, SignalProcess, departures, fit_signals
@@ -58,8 +58,7 @@ STARTS = 60  # starts of the phase retrieval of one spectrum, at most
 LONGEST, SHORTEST = 4.6, 0.25  # lengths over which a wave stays coherent, in wavelengths
 LEAST_ROWS = 8  # least number of spectra for a covariance of signals
 
-FREQUENCY = "frequency_hz"  # key of the arrays that generic kriging has not
-DRAWS = 64
+DRAWS = 64  # draws of which the expected minimum and maximum of a spectrum are means
 COARSE = 0.1  # spacing of the directions of draws as a share of a lobe's width, wavelength over aperture
 CLEAR = 100.0
 """Ratio above which the Rician's moments are taken from their series, which has six digits where differences cancel."""
@@ -105,6 +104,7 @@ def rician(mean: NDArray[Any], variance: NDArray[Any]) -> tuple[FloatArray, Floa
     return expected.astype(kind), deviation.astype(kind)
 
 
+@dataclass(eq=False)
 class ExpectedSpectrum:
     """Maps uncertain element signals of an array [m, 3] to the expected spectrum [height, width].
 
@@ -112,8 +112,13 @@ class ExpectedSpectrum:
     coarse grid, the same draws for every position.
     """
 
-    def __init__(self, elements_m: FloatArray, frequency_hz: float, height: int, width: int) -> None:
-        self.frequency_hz, self.shape = frequency_hz, (height, width)
+    elements_m: FloatArray
+    frequency_hz: float
+    height: int
+    width: int
+
+    def __post_init__(self) -> None:
+        elements_m, frequency_hz, (height, width) = self.elements_m, self.frequency_hz, self.shape
         grid = pixel_directions(height, width)
         aperture = max(float(np.ptp(elements_m, axis=0).max()), np.finfo(float).tiny)
         apart = COARSE * speed_of_light / frequency_hz / aperture  # rad
@@ -127,6 +132,11 @@ class ExpectedSpectrum:
         rng = np.random.default_rng(0)
         pair = rng.normal(size=(2, DRAWS, len(elements_m))) / np.sqrt(2)
         self._draws: ComplexArray = pair[0] + 1j * pair[1]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.height, self.width
 
     def __call__(self, posterior: Posterior) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of the scaled spectra, [q, height, width]."""
@@ -144,7 +154,7 @@ class ExpectedSpectrum:
 
 
 @dataclass
-class KrigedSpectra:
+class KrigedSpectra(Probabilistic):
     """Fitted model of one receiver.
 
     Attributes:
@@ -214,26 +224,6 @@ class KrigedSpectra:
             "correlation_m": {"along": along, "across": across, "up": up},
             "half_ignorance": self.half,
         }
-
-    def arrays(self) -> Arrays:
-        """Arrays for `from_arrays`."""
-        return {
-            FREQUENCY: np.array(self.report.frequency_hz),
-            "shape": np.array(self.report.shape),
-            "weights": np.array([self.half, self.spread]),
-            **self.signals.arrays("signals/"),
-            **keyed("nearby/", field_arrays(self.nearby)),
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], receiver: Receiver) -> KrigedSpectra:
-        """The model that `arrays` stored."""
-        assert receiver.array_m is not None, "see `SpectrumKriging`"
-        process = SignalProcess.from_arrays(arrays, "signals/")
-        nearby = from_field_arrays(AnisotropicKriging, arrays, "nearby/")
-        height, width = (int(v) for v in arrays["shape"])
-        report = ExpectedSpectrum(receiver.array_m, float(arrays[FREQUENCY]), height, width)
-        return cls(process, nearby, report, *map(float, arrays["weights"]))
 
 
 def signal_weight(ignorance: FloatArray, half: float) -> FloatArray:
@@ -372,9 +362,7 @@ class SpectrumKriging(GenericKriging):
                     return _fit_signals_and_nearby(signals, position_m, observed, rows, receiver.array_m, frequency_hz)
             return UncertainKriged.of(kriged(rows), observed)
 
-    def load_single(self, receiver: Receiver, arrays: Arrays) -> Single:
-        """The model of a receiver from its arrays."""
-        if FREQUENCY not in arrays:
-            return super().load_single(receiver, arrays)
-        with one_blas_thread():  # factors to the last digit those of the fit
-            return KrigedSpectra.from_arrays(arrays, receiver)
+    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:
+        """The models of all receivers, whose factors are to the last digit those of the fit."""
+        with one_blas_thread():
+            return super().load(arrays, problem, folder)

@@ -6,7 +6,7 @@ The processes of the receivers are those of `wrf_mi.estimators.interpolation.poo
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from ...core.angles import FloatArray
+from ...core.stored import NOT_STORED
 from ...core.types import IntArray
 from ...tasks.scores import LEVEL, REAL_90
 from .path_loss import FREE_SPACE, NEAREST_M
@@ -52,7 +53,7 @@ class PriorMean:
     receivers_m: FloatArray
     transmit_dbm: float
     frequency_hz: FloatArray
-    traced: Traced | None
+    traced: Traced | None = field(metadata=NOT_STORED)
     sd: FloatArray
     rx_sd_db: float
 
@@ -74,6 +75,7 @@ class PriorMean:
         return self.columns(nowhere, 0)[2]
 
 
+@dataclass(eq=False)
 class StrengthPosterior:
     """Posterior of the signal strengths, given stops (possibly none) and hyperparameters.
 
@@ -82,23 +84,20 @@ class StrengthPosterior:
     ``trees`` is the number of trees of what the mean terms leave; ``forest``: trees that were grown already.
     """
 
-    def __init__(
-        self,
-        prior: PriorMean,
-        hyperparameters: Hyperparameters,
-        stops: Stops,
-        rounds: int = 0,
-        spread: Hyperparameters | None = None,
-        trees: int = 0,
-        forest: Forest | None = None,
-    ) -> None:
-        self.prior, self.hyperparameters, self.stops = prior, hyperparameters, stops
-        self.spread, self.rounds = spread or hyperparameters, rounds
-        self.headings = stops.poses.heading_rad is not None
-        self._process = self._process_of(hyperparameters)
-        self.trees, self.forest = trees, forest
-        if trees and forest is None:
-            self.forest = Forest.grown(self._process, stops.poses, len(prior.receivers_m), trees)
+    prior: PriorMean
+    hyperparameters: Hyperparameters
+    stops: Stops
+    rounds: int = 0
+    spread: Hyperparameters | None = None
+    trees: int = 0
+    forest: Forest | None = None
+
+    def __post_init__(self) -> None:
+        self.headings = self.stops.poses.heading_rad is not None
+        self._spread = self.spread or self.hyperparameters
+        self._process = self._process_of(self.hyperparameters)
+        if self.trees and self.forest is None:
+            self.forest = Forest.grown(self._process, self.stops.poses, len(self.prior.receivers_m), self.trees)
 
     @cached_property
     def _moved(self) -> Poses:
@@ -126,7 +125,7 @@ class StrengthPosterior:
 
     @cached_property
     def _spread_process(self) -> PooledProcess:
-        return self._process if self.spread == self.hyperparameters else self._process_of(self.spread)
+        return self._process if self._spread == self.hyperparameters else self._process_of(self._spread)
 
     def cost(self, prior: PriorMean, h: Hyperparameters) -> float:
         """Minus twice the logarithm of the marginal likelihood of the stops, up to a constant.
@@ -157,7 +156,7 @@ class StrengthPosterior:
     @property
     def noise(self) -> float:
         """Variance of a single report about the local mean power, dB^2."""
-        return self.spread.drift_db**2 + self.spread.noise_db**2
+        return self._spread.drift_db**2 + self._spread.noise_db**2
 
     def mean(self, poses: Poses, receiver: int) -> FloatArray:
         """The mean of `predict`, dBm."""

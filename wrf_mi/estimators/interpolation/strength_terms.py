@@ -30,7 +30,7 @@ from .path_loss import NEAREST_M
 
 HARMONICS = 3
 """Harmonics of the transmitter's pattern over psi; more changed the held-out error of flat-ble by under 0.005 dB."""
-RX_HARMONICS = 2
+RX_HARMONICS = 2  # harmonics of each receiver's pattern, which its rows alone determine
 GAP = 5  # a stop ends where so many rows of the record are not among the given rows
 PARTS_OF_NOISE = ("drift_db", "noise_db")
 OF_HEADINGS = ("body_db", "body_m", "concentration", "lever_m")  # hyperparameters that count with headings alone

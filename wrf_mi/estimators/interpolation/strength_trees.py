@@ -7,12 +7,11 @@ with enough stops, and add nothing at the others.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from ...core.angles import FloatArray
-from ...core.array_files import keyed, under
-from ..model import Arrays
 from .pooled_process import PooledProcess
 from .strength_terms import Poses
 from .trees import GrownTrees, Trees
@@ -20,14 +19,13 @@ from .trees import GrownTrees, Trees
 TREES, TREES_OF_FOLD, LEAF = 50, 20, 3
 """Numbers of trees, of all rows and of each fold of a calibration, and least number of stops in a leaf."""
 LEAST_STOPS = 12 * LEAF  # stops of a receiver below which a tree would be little more than its mean
-STORED = "trees"  # beginning of the names of arrays
 
 
+@dataclass(frozen=True)
 class Forest:
     """Trees by the number of the receiver."""
 
-    def __init__(self, of_receiver: Mapping[int, GrownTrees]) -> None:
-        self._of_receiver = of_receiver
+    of_receiver: Mapping[int, GrownTrees]
 
     @classmethod
     def grown(cls, process: PooledProcess, poses: Poses, receivers: int, trees: int) -> Forest:
@@ -43,19 +41,7 @@ class Forest:
 
     def predict(self, poses: Poses, receiver: int) -> tuple[FloatArray, FloatArray]:
         """Mean and variance of the trees at poses, [m] each, dB and dB^2; zeros at receivers without any."""
-        if receiver not in self._of_receiver:
+        if receiver not in self.of_receiver:
             return np.zeros(len(poses)), np.zeros(len(poses))
-        values = self._of_receiver[receiver].of_each(poses.position_m, poses.heading_rad)
+        values = self.of_receiver[receiver].of_each(poses.position_m, poses.heading_rad)
         return values.mean(axis=0), values.var(axis=0)
-
-    def arrays(self) -> Arrays:
-        """Arrays for `from_arrays`."""
-        parts = [keyed(f"{STORED}.{receiver}.", trees.arrays()) for receiver, trees in self._of_receiver.items()]
-        return {name: array for part in parts for name, array in part.items()}
-
-    @classmethod
-    def from_arrays(cls, arrays: Arrays) -> Forest | None:
-        """The trees that `arrays` described; None: without any."""
-        receivers = sorted({int(name.split(".")[1]) for name in arrays if name.startswith(f"{STORED}.")})
-        trees = {receiver: GrownTrees(**under(f"{STORED}.{receiver}.", arrays)) for receiver in receivers}
-        return cls(trees) if trees else None

@@ -7,7 +7,6 @@ training rows (`strength_fit`). Terms that all receivers share serve receivers w
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, replace
@@ -19,13 +18,15 @@ from numpy.typing import NDArray
 
 from ...core import InputError, Prediction, Record
 from ...core.angles import FloatArray
+from ...core.array_files import under
 from ...core.settings import changed
+from ...core.stored import from_arrays, to_arrays
 from ...core.types import IntArray
 from ...datasets.observations import FEW_ROWS, trained_runs
 from ...parallel.threads import one_blas_thread
 from ...tasks import require
 from ...training.session import OnProgress, quiet
-from ..model import Arrays, Fitted, Inputs, field_arrays, from_field_arrays
+from ..model import Arrays, Fitted, Inputs
 from .by_receiver import finite_positions
 from .run_offsets import RunOffsets
 from .strength_fit import (
@@ -52,7 +53,7 @@ from .strength_settings import (
 )
 from .strength_terms import Hyperparameters, Measured, Poses, Stops, run_numbers, stops_of
 from .strength_trees import TREES as TREES_OF_ALL
-from .strength_trees import TREES_OF_FOLD, Forest
+from .strength_trees import TREES_OF_FOLD
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced, Tracer
@@ -61,7 +62,7 @@ HEADINGS = 8  # headings over which the prediction is averaged where the heading
 CHUNK = 1024  # transmitters predicted together, which bounds the memory of their covariances with the rows
 MOST_COVARIANCES = 2e8
 """Covariances between stops over all receivers, whose factors take 1.6 GB; with more, stops are thinned."""
-ROBUST_ROUNDS = 2
+ROBUST_ROUNDS = 2  # rounds of weights for Student-t noise, by the residuals of the one before
 LEAST_HEARD = 4  # receivers with more than a few rows that tell how well the others are predicted from them
 NO_SHADOW_DB = 1e-3  # standard deviation of shadowing where there is none: it has to be above zero
 OFFSET_SD_DB = 10.0  # standard deviation of the common offset of all receivers about the transmit power a priori
@@ -73,7 +74,8 @@ BODY_PATTERN_DB = (
     0.2,
 )  # standard deviations, common and of each receiver, of the first harmonic of the transmitter's pattern
 RECEIVER_PATTERN_DB = 2.0  # standard deviation of the first harmonic of each receiver's pattern
-EXACT = "exact.traced_dbm"  # array of powers traced at the stops, NaN without a path
+MAP, EXACT = "map/", "exact_dbm"
+"""Prefix of the arrays of a local mean, and array of powers traced at the stops, NaN without a path."""
 
 
 @dataclass(eq=False, repr=False)
@@ -155,66 +157,28 @@ class Strengths(Fitted):
         return [(rows, [poses.take(rows) for poses in every]) for rows in chunks]
 
     def arrays(self) -> Arrays:
-        """Arrays for `from_arrays`."""
-        field = self.field
-        stops, prior = field.stops, field.prior
-        arrays: dict[str, Any] = {
-            **field_arrays(stops.poses, "stop."),
-            **{f"stop.{name}": getattr(stops, name) for name in ("value_dbm", "count", "row")},
-            "receivers_m": prior.receivers_m,
-            "base": np.append(prior.transmit_dbm, prior.frequency_hz),
-            "prior.shared": prior.sd,
-            "prior.rx": prior.rx_sd_db,
-            "rounds": field.rounds,
-            "widen": self.widen,
-            "shadowing": self.shadowing,
-            "options": json.dumps(list(self.options)),
-            "fact.name": np.array(list(self.fit_facts)),
-            "fact.value": np.array(list(self.fit_facts.values()), float),
-            **field_arrays(field.hyperparameters, "knob."),
-            **field_arrays(field.spread, "spread."),
-        }
-        if self.offsets is not None:
-            arrays |= field_arrays(self.offsets, "run.")
-        if field.forest is not None:
-            arrays |= field.forest.arrays() | {"trees": field.trees}
-        if prior.traced is not None:
-            arrays |= field_arrays(prior.traced.local if prior.traced.exact else prior.traced, "map.")
-            if prior.traced.exact:
-                arrays[EXACT] = prior.traced.traced_dbm(stops.poses.position_m)
-        return {name: np.asarray(value) for name, value in arrays.items()}
+        """Fields, the traced mean, and of an exact one the powers at the stops."""
+        arrays, traced = to_arrays(self), self.field.prior.traced
+        if traced is not None:
+            arrays |= to_arrays(traced.local if traced.exact else traced, MAP)
+            if traced.exact:
+                arrays[EXACT] = traced.traced_dbm(self.field.stops.poses.position_m)
+        return arrays
 
     @classmethod
     def from_arrays(cls, arrays: Arrays, trace: Tracer | None = None) -> Strengths:
         """The model that `arrays` stored; ``trace`` of `wrf_mi.tracing.power_map.TracedPower`, if that is its mean."""
         traced: Traced | None = None
-        if "map.power_dbm" in arrays:
+        if under(MAP, arrays):
             from ...tracing.power_map import PowerMap, TracedPower  # the tracer is imported where there is a scene
 
-            traced = from_field_arrays(PowerMap, arrays, "map.")
+            traced = from_arrays(PowerMap, arrays, MAP)
             if EXACT in arrays:
                 assert trace is not None
-                positions_m = arrays["stop.position_m"]
-                power_dbm = arrays[EXACT].T
+                positions_m, power_dbm = arrays["field/stops/poses/position_m"], arrays[EXACT].T
                 known = dict(zip(map(np.ndarray.tobytes, positions_m), power_dbm, strict=True))
                 traced = TracedPower(traced, trace, np.arange(power_dbm.shape[1]), known, keeps=False)
-        transmit_dbm, frequency_hz = float(arrays["base"][0]), arrays["base"][1:]
-        sd, rx_sd_db = arrays["prior.shared"], float(arrays["prior.rx"])
-        prior = PriorMean(arrays["receivers_m"], transmit_dbm, frequency_hz, traced, sd, rx_sd_db)
-        poses = from_field_arrays(Poses, arrays, "stop.")
-        stops = Stops(poses, *(arrays[f"stop.{name}"] for name in ("value_dbm", "count", "row")))
-        hyperparameters = from_field_arrays(Hyperparameters, arrays, "knob.")
-        spread = hyperparameters  # earlier versions stored no other
-        if "spread.shadow_m" in arrays:
-            spread = from_field_arrays(Hyperparameters, arrays, "spread.")
-        rounds, trees = int(arrays["rounds"]), int(arrays.get("trees", 0))
-        forest = Forest.from_arrays(arrays)
-        field = StrengthPosterior(prior, hyperparameters, stops, rounds, spread, trees, forest)
-        facts = dict(zip(map(str, arrays["fact.name"]), map(float, arrays["fact.value"]), strict=True))
-        shadowing = str(arrays.get("shadowing", DEFAULT))
-        options = json.loads(str(arrays.get("options", "[]")))
-        offsets = from_field_arrays(RunOffsets, arrays, "run.") if "run.names" in arrays else None
-        return cls(field, arrays["widen"], facts, shadowing, options, offsets)
+        return from_arrays(cls, arrays, traced=traced)
 
     def facts(self) -> dict[str, Any]:
         """Hyperparameters, calibration, and error on held-out rows."""

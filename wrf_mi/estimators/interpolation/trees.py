@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError, Receiver, Record, Split
+from ...core import InputError, Record, Split
 from ...core.angles import FloatArray
 from ...core.settings import CheckedSettings, Count
-from ..model import Arrays, Problem
-from .by_receiver import ByReceiverModel, ReceiverRows, observed_rows
+from ..model import Problem
+from .by_receiver import ByReceiverModel, ReceiverRows, Single, observed_rows
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Trees(CheckedSettings):
 
 
 @dataclass(frozen=True)
-class GrownTrees:
+class GrownTrees(Single):
     """Trees as plain arrays, over all nodes of all trees: a run file holds arrays, not pickled objects."""
 
     root: NDArray[np.int32]  # first node of each tree
@@ -108,10 +108,6 @@ class GrownTrees:
             left = single[rows, self.feature[node]] <= self.threshold[node]
             node = np.where(left, self.left[node], self.right[node])
         return np.asarray(self.value[node])
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a run file."""
-        return dict(vars(self))
 
 
 def _features(tx_pos: ArrayLike, tx_heading_rad: ArrayLike | None, like: NDArray[Any]) -> FloatArray:
@@ -147,10 +143,6 @@ class TreesModel(ByReceiverModel):
         """Grow the trees of a receiver."""
         trees: Trees = rows.problem.settings
         return trees.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad, rows.problem.seed)
-
-    def load_single(self, receiver: Receiver, arrays: Arrays) -> GrownTrees:
-        """The trees of a receiver."""
-        return GrownTrees(**arrays)
 
 
 MODEL = TreesModel()

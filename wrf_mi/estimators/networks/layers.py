@@ -42,19 +42,19 @@ class Module:
         changed: Self = _mapped(self, "", lambda path, _: weights[path])
         return changed
 
-    def arrays(self, prefix: str = "") -> dict[str, NDArray[Any]]:
-        """All weights by prefix and path, as NumPy arrays."""
-        return {f"{prefix}{path}": np.asarray(weight) for path, weight in self.state().items()}
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All weights by path, as NumPy arrays."""
+        return {path: np.asarray(weight) for path, weight in self.state().items()}
 
-    def on_device(self, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Self:
+    def on_device(self, arrays: Mapping[str, NDArray[Any]]) -> Self:
         """The same network with the weights of `arrays`, as single-precision tensors; errors as `check`."""
-        self.check(arrays, prefix)
-        return self.with_state({path: to_tensor(arrays[f"{prefix}{path}"]) for path in self.state()})
+        self.check(arrays)
+        return self.with_state({path: to_tensor(arrays[path]) for path in self.state()})
 
-    def check(self, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> None:
+    def check(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Refuse weights that are missing, of another shape, or not finite: the backend would end the process."""
         for path, like in self.state().items():
-            weight = arrays.get(f"{prefix}{path}")
+            weight = arrays.get(path)
             if weight is None or weight.shape != tuple(like.shape) or not np.isfinite(weight).all():
                 text = "missing" if weight is None else f"of shape {weight.shape}, or not finite"
                 raise InputError(f"weight {path} is {text}, where the settings need {tuple(like.shape)}")

@@ -17,11 +17,9 @@ receivers of a record share a pair of networks, unless ``shared`` is false. Chos
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Any
 
 import drjit as dr
@@ -33,11 +31,11 @@ from ...backend.device import Recorded, to_tensor
 from ...core import InputError, Prediction, Record, Split
 from ...core.angles import FloatArray, fibonacci_sphere, pixel_directions
 from ...core.settings import Count
+from ...core.stored import NOT_STORED
 from ...core.types import IntArray
 from ...tasks import conditions
 from ...training.config import AdamConfig, unused_of_loop, validates
 from ...training.session import FitSession
-from .. import model
 from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions, received_rows, slices
 from .layers import Coordinates, columns, feature_count
 from .nerf2_march import Nerf2Network, Networks, RayPoints, constant_parts, look, march
@@ -55,8 +53,8 @@ class Nerf2Settings(NetworkSettings):
     steps: int = 5000
     batch: int = 16  #: spectra of a step, at most
     validate_every: int = 500
-    optimiser: AdamConfig = dataclasses.field(default_factory=lambda: network_adam(2e-3))
-    networks: Networks = dataclasses.field(default_factory=Networks)  #: sizes of the networks
+    optimiser: AdamConfig = field(default_factory=lambda: network_adam(2e-3))
+    networks: Networks = field(default_factory=Networks)  #: sizes of the networks
     rays: Count = 256  #: pixels of a spectrum in a step
     sphere_rays: Count = 64  #: rays over the full sphere, for signal strengths and channels
     #: transmitters of a step, at most, for signal strengths and channels; with an uplink, antennas of transmitters
@@ -81,30 +79,36 @@ def rays_of(data: Mapping[str, Any], receiver: Any, picked: Any, count: int) -> 
     return {**data, "direction": direction, "origin": origin}
 
 
+@dataclass(eq=False)
 class Nerf2Field(Fitted):
     """A fitted field, evaluated in two steps that are recorded once.
 
-    Rays go through the pixels of spectra (`wrf_mi.core.angles`), or cover the full sphere, and end at ``far_m`` metres;
-    ``scales`` are the units of the receivers' channels, [n_rx].
+    Rays go through the pixels of spectra (`wrf_mi.core.angles`), or cover the full sphere.
 
     Attributes:
+        far_m: distance from the receiver at which rays end, metres.
+        scales: units of the receivers' channels [n_rx].
+        weights: weights of the networks of each group; none during the fit.
         by_pixel: whether rays go through the pixels of spectra.
         groups: indices of the receivers that share networks.
         data: constants of every evaluation on the device: rays of all receivers, and `constant_parts`.
         network: networks whose weights are to be replaced.
-        networks: fitted networks of each group.
 
     Raises:
         InputError: a receiver without a pose that is needed.
     """
 
-    def __init__(
-        self, record: Record, settings: Nerf2Settings, coordinates: Coordinates, far_m: float, scales: FloatArray
-    ) -> None:
-        self.settings, self.coordinates, self.far_m, self.scales = settings, coordinates, far_m, scales
+    problem: Problem = field(metadata=NOT_STORED)
+    settings: Nerf2Settings
+    coordinates: Coordinates
+    far_m: float
+    scales: FloatArray
+    weights: list[Arrays]
+
+    def __post_init__(self) -> None:
+        record, settings, coordinates, far_m = self.problem.record, self.settings, self.coordinates, self.far_m
         self.outputs, self.task = conditions.outputs_of(record), record.task
         self._shape = record.observation.shape[2:]
-        self.networks: list[Nerf2Network] = []
         self._points: tuple[int, list[RayPoints]] | None = None
         receivers = conditions.placed_receivers(record, self.outputs.by_uplink)
         everyone = tuple(range(len(receivers)))
@@ -143,6 +147,11 @@ class Nerf2Field(Fitted):
         receivers = sum(len(members) for members in self.groups)
         return Nerf2Network(self.settings.networks, self._condition, self.outputs.count, receivers, rng)
 
+    @cached_property
+    def networks(self) -> list[Nerf2Network]:
+        """Networks of each group with the fitted weights."""
+        return [self.network.on_device(weights) for weights in self.weights]
+
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Spectra [m, height, width], powers [m] in dBm, or channels [m, subcarriers] or [m, antennas, subcarriers]."""
         network = next(n for n, members in zip(self.networks, self.groups, strict=True) if receiver in members)
@@ -152,14 +161,6 @@ class Nerf2Field(Fitted):
         condition, divisor = self.condition_of(inputs, receiver)
         values, shape = self.march(network, self._points[1], condition, receiver), (len(inputs), *self._shape)
         return Prediction(conditions.observations_from(self.task, values, divisor, shape))
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Settings, frame and weights."""
-        arrays = {"settings": model.settings_array(self.settings), "far_m": np.asarray(self.far_m)}
-        arrays |= {"scales": self.scales, **model.field_arrays(self.coordinates, "frame/")}
-        for g, network in enumerate(self.networks):
-            arrays |= network.arrays(f"group{g}/")
-        return arrays
 
     def look(self, network: Nerf2Network, receiver: int, rays: IntArray | None = None) -> list[RayPoints]:
         """Points of a receiver's rays, all by default, evaluated: in parts for spectra, else in one."""
@@ -276,7 +277,7 @@ def _fit_group(
 class Nerf2Model(Model):
     """NeRF2."""
 
-    name, settings = "nerf2", Nerf2Settings
+    name, settings, fitted = "nerf2", Nerf2Settings, Nerf2Field
     source = "Zhao, An, Pan and Yang, 'NeRF2: neural radio-frequency radiance fields' (MobiCom 2023) and its code"
     summary = "neural field of voxels, marched along rays"
     tasks = ("spectrum", "rssi", "csi")
@@ -307,16 +308,9 @@ class Nerf2Model(Model):
         else:
             where, farthest = rx, FAR_M
         scales = conditions.channel_scales(record, known)
-        field = Nerf2Field(record, settings, Coordinates.of(where), settings.far_m or farthest, scales)
-        field.networks = [_fit_group(record, split, field, problem.seed, session, members) for members in field.groups]
-        return field
-
-    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Nerf2Field:
-        """The fields that `Nerf2Field.arrays` described."""
-        settings = model.stored_settings(Nerf2Settings, arrays, "nerf2")
-        coordinates = model.from_field_arrays(Coordinates, arrays, "frame/")
-        field = Nerf2Field(problem.record, settings, coordinates, float(arrays["far_m"]), arrays["scales"])
-        field.networks = [field.network.on_device(arrays, f"group{g}/") for g in range(len(field.groups))]
+        field = Nerf2Field(problem, settings, Coordinates.of(where), settings.far_m or farthest, scales, [])
+        for members in field.groups:
+            field.weights.append(_fit_group(record, split, field, problem.seed, session, members).arrays())
         return field
 
 

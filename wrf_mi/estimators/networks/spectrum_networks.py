@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -14,11 +13,11 @@ from numpy.typing import NDArray
 
 from ...backend.device import to_float, to_tensor
 from ...core import Prediction, Split
+from ...core.stored import NOT_STORED
 from ...tasks import TASKS
 from ...tasks.losses import ssim
 from ...training.config import unused_of_loop, validates
 from ...training.session import FitSession
-from .. import model
 from ..model import Arrays, Fitted, Inputs, Model, Problem, known_positions, received_rows, slices
 from .layers import Coordinates
 from .training import Network, train_network
@@ -36,10 +35,34 @@ class NetworkRows:
     train: int  # number of rows that train while the others choose
 
 
+@dataclass(eq=False)
+class FittedNetworks(Fitted):
+    """Fitted networks: weights of a generator for each receiver, of spectra of ``shape`` (height, width)."""
+
+    model: SpectrumNetwork = field(metadata=NOT_STORED)
+    problem: Problem = field(metadata=NOT_STORED)
+    coordinates: Coordinates
+    weights: list[Arrays]
+    shape: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        initial = self.model.generator_class(self.problem.settings, self.shape, np.random.default_rng(0))
+        self.generators = [initial.on_device(weights) for weights in self.weights]
+
+    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
+        """Spectra [m, height, width], float32."""
+        s, out = self.problem.settings, np.empty((len(inputs), *self.shape), np.float32)
+        for part in slices(len(inputs), self.model.at_once):
+            where = self.coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
+            with dr.suspend_grad():
+                out[part] = self.generators[receiver].spectra(where).numpy().reshape(-1, *self.shape)
+        return Prediction(out)
+
+
 class SpectrumNetwork(Model):
     """A model with a network for each receiver."""
 
-    tasks = ("spectrum",)
+    tasks, fitted = ("spectrum",), FittedNetworks
     uplink, headings = "optional", True
     generator: str  # attribute of the trained network that makes spectra; no other part is stored
     # Its class: ``generator_class(settings, (height, width), rng)``. The method ``spectra`` makes greys [m * height *
@@ -73,51 +96,14 @@ class SpectrumNetwork(Model):
         """Train the networks of all receivers in turn (InputError: unknown positions, or fewer than two rows)."""
         record, settings, seed = problem.record, problem.settings, problem.seed
         coordinates = Coordinates.of(known_positions(record, split.all_train, self.name))
-        generators = []
+        weights = []
         for r, receiver in enumerate(record.receivers):
             train, validation = received_rows(record, split, r, self.name)
             known = np.concatenate([train, validation])
             where = coordinates.features(record.tx_pos_m[known], settings.octaves, settings.scale_m)
             rows = NetworkRows(receiver.name, np.asarray(record.observation[r, known], np.float32), where, len(train))
             network = self.network(rows, settings, np.random.default_rng([seed, r]))
-            generators.append(getattr(train_network(network, settings, (seed, r), session)[0], self.generator))
+            trained = train_network(network, settings, (seed, r), session)[0]
+            weights.append(getattr(trained, self.generator).arrays())
         height, width = record.observation.shape[-2:]
-        return FittedNetworks(self, settings, coordinates, generators, (height, width))
-
-    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedNetworks:
-        """The networks that `FittedNetworks.arrays` described."""
-        settings: Any = model.stored_settings(self.settings, arrays, self.name)
-        height, width = (int(side) for side in arrays["shape"])
-        initial = self.generator_class(settings, (height, width), np.random.default_rng(0))
-        receivers = range(len(problem.record.receivers))
-        generators = [initial.on_device(arrays, f"receiver{r}/{self.generator}.") for r in receivers]
-        coordinates = model.from_field_arrays(Coordinates, arrays, "frame/")
-        return FittedNetworks(self, settings, coordinates, generators, (height, width))
-
-
-@dataclass(frozen=True)
-class FittedNetworks(Fitted):
-    """Fitted networks: a generator for each receiver, of spectra of ``shape`` (height, width)."""
-
-    model: SpectrumNetwork
-    settings: Any
-    coordinates: Coordinates
-    generators: list[Any]
-    shape: tuple[int, int]
-
-    def predict(self, inputs: Inputs, receiver: int) -> Prediction:
-        """Spectra [m, height, width], float32."""
-        s, out = self.settings, np.empty((len(inputs), *self.shape), np.float32)
-        for part in slices(len(inputs), self.model.at_once):
-            where = self.coordinates.features(inputs.tx_pos_m[part], s.octaves, s.scale_m)
-            with dr.suspend_grad():
-                out[part] = self.generators[receiver].spectra(where).numpy().reshape(-1, *self.shape)
-        return Prediction(out)
-
-    def arrays(self) -> Arrays:
-        """Settings, frame and weights."""
-        arrays = {"settings": model.settings_array(self.settings), "shape": np.asarray(self.shape)}
-        arrays |= model.field_arrays(self.coordinates, "frame/")
-        for r, generator in enumerate(self.generators):
-            arrays |= generator.arrays(f"receiver{r}/{self.model.generator}.")
-        return arrays
+        return FittedNetworks(self, problem, coordinates, weights, (height, width))

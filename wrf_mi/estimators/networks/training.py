@@ -136,13 +136,13 @@ def train_network(network: Network, config: LoopConfig, seed: Sequence[int], ses
     folder, finished = session.folder, f"{FINISHED}{network.name}"
     stored = read_checkpoint(folder) if folder is not None and (folder / CHECKPOINT).exists() else {}
     if f"{finished}/score" in stored:
-        return network.module.on_device(stored, f"{finished}/mean/"), float(stored[f"{finished}/score"])
+        return network.module.on_device(under(f"{finished}/mean/", stored)), float(stored[f"{finished}/score"])
     beside = keyed(FINISHED, under(FINISHED, stored))
     beside["network"] = np.asarray(network.name)
     # A checkpoint of another network of this fit says which have finished, and nothing of this one.
     begun = "network" in stored and str(stored["network"]) == network.name
     if begun:
-        network.module.check(stored, "param/")
+        network.module.check(under("param/", stored))
     state = FitState.from_arrays(stored, network.momentum) if begun else None
     trainer = NetworkTrainer(network, config, seed, state)
     trainer.seconds = float(stored.get("seconds", 0.0))

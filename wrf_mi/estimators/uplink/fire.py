@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import drjit as dr
@@ -34,7 +33,6 @@ from ...core.types import IntArray
 from ...tasks.conditions import real_parts
 from ...training.config import unused_of_loop, validates
 from ...training.session import FitSession
-from .. import model
 from ..model import Arrays, Fitted, Inputs, Problem, slices
 from ..networks.layers import Linear, Mlp, Module, columns
 from ..networks.training import Network, NetworkSettings, opaque_rows, train_network
@@ -122,14 +120,18 @@ def fire_loss(fire: Fire, data: Any, drawn: Any) -> Any:
     return ((error + BETA * normal_divergence(mean, log_variance)) / mean.shape[1]).array
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class FittedFire(Fitted):
     """A fitted network for samples of an ``antenna`` or a ``row``."""
 
     sample: str
-    network: Fire
+    weights: Arrays
     bands: Bands
     settings: FireSettings
+
+    def __post_init__(self) -> None:
+        sizes = self.weights["q.0.hidden"].shape[1], len(self.weights["p.out.bias"])
+        self.network = Fire(self.settings, *sizes, np.random.default_rng(0)).on_device(self.weights)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
@@ -137,11 +139,6 @@ class FittedFire(Fitted):
         samples = samples_of(uplink, self.sample)
         out = predict_samples(self.network, samples, units_of(samples), len(self.bands.downlink_hz))
         return Prediction(out.reshape(len(uplink), self.bands.antennas, -1).astype(np.complex64))
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Kind of sample, settings, bands and weights."""
-        arrays = {"sample": np.asarray(self.sample), "settings": model.settings_array(self.settings)}
-        return arrays | model.field_arrays(self.bands) | self.network.arrays("network/")
 
 
 def predict_samples(
@@ -198,7 +195,7 @@ def _fit(
 class FireModel(UplinkModel):
     """FIRE."""
 
-    name, settings = "fire", FireSettings
+    name, settings, fitted = "fire", FireSettings, FittedFire
     source = "Liu et al., FIRE: enabling reciprocity for FDD MIMO systems (MobiCom 2021)"
     summary = "variational autoencoder from uplink to downlink"
 
@@ -221,14 +218,7 @@ class FireModel(UplinkModel):
             kinds = ("antenna",)
         fits = [(*_fit(problem, train, validation, session, kind), kind) for kind in kinds]
         network, _, kind = max(fits, key=lambda fit: fit[1])
-        return FittedFire(kind, network, bands, settings)
-
-    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedFire:
-        """The network that `FittedFire.arrays` described."""
-        settings, bands = model.stored_settings(FireSettings, arrays, "fire"), model.from_field_arrays(Bands, arrays)
-        sizes = arrays["network/q.0.hidden"].shape[1], len(arrays["network/p.out.bias"])
-        fire = Fire(settings, *sizes, np.random.default_rng(0)).on_device(arrays, "network/")
-        return FittedFire(str(arrays["sample"]), fire, bands, settings)
+        return FittedFire(kind, network.arrays(), bands, settings)
 
 
 MODEL = FireModel()

@@ -17,8 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,7 @@ from ...core import InputError, Prediction, Record, Split
 from ...core.settings import CheckedSettings
 from ...core.types import IntArray
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, slices
+from ..model import Fitted, Inputs, Problem, slices
 from .uplink_waves import UplinkModel, relative_error
 
 PENALTIES = tuple(float(10.0**half) for half in np.arange(-10, 1.25, 0.5))
@@ -56,10 +55,6 @@ class LinearMap(Fitted):
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
         return Prediction((np.asarray(inputs.uplink, complex) @ self.matrix).astype(np.complex64))
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Matrix, number of antennas and penalty."""
-        return field_arrays(self)
 
 
 def ridge(record: Record, rows: IntArray) -> Callable[[float], NDArray[np.complex128]]:
@@ -106,7 +101,7 @@ def choose(record: Record, train: IntArray, judges: IntArray, on_progress: OnPro
 class LinearModel(UplinkModel):
     """The linear estimator."""
 
-    name, settings = "linear", LinearSettings
+    name, settings, fitted = "linear", LinearSettings, LinearMap
     source = "Kay, Fundamentals of statistical signal processing: estimation theory (1993), chapter 12"
     summary = "linear map from uplink to downlink"
 
@@ -122,10 +117,6 @@ class LinearModel(UplinkModel):
         matrix = ridge(record, known)(penalty)
         session.report(f"linear: penalty {penalty:.2g}", 1.0)
         return LinearMap(matrix, record.observation.shape[2], penalty)
-
-    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> LinearMap:
-        """The map that `LinearMap.arrays` described."""
-        return from_field_arrays(LinearMap, arrays)
 
 
 MODEL = LinearModel()

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import drjit as dr
@@ -34,7 +33,6 @@ from ...core.angles import FloatArray
 from ...core.settings import Count
 from ...training.config import AdamConfig, unused_of_loop
 from ...training.session import FitSession
-from .. import model
 from ..model import Arrays, Inputs, Problem, slices
 from ..networks.layers import Linear, Module, columns
 from ..networks.training import Network, NetworkSettings, network_adam, opaque_rows, train_network
@@ -194,13 +192,17 @@ class OptMLSettings(PathSettings, NetworkSettings):
     final: int = 5
 
 
+@dataclass(eq=False)
 class OptML(R2F2):
     """A fitted network with the bands and the array that it was fitted for."""
 
-    def __init__(self, kind: str, bands: Bands, settings: OptMLSettings, network: PathMap) -> None:
-        super().__init__(kind, bands, settings)
-        self.settings: OptMLSettings = settings
-        self.network = network
+    settings: OptMLSettings
+    weights: Arrays
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        initial = PathMap(self.waves, self.settings.width, np.random.default_rng(0))
+        self.network = initial.on_device(self.weights)
 
     def paths(self, h: Complex, inputs: Inputs) -> UplinkPaths:
         """Paths of uplinks [m, antennas, f]."""
@@ -219,11 +221,6 @@ class OptML(R2F2):
             present = np.concatenate([present, is_peak], axis=1)
             theta, present, residual = (np.concatenate(p) for p in zip(*in_parts(pruned, len(h)), strict=True))
         return refine_paths(waves, h, theta, present, s.final)
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Settings, wave model, bands and weights."""
-        settings = {"settings": model.settings_array(self.settings), "wavefront": np.array(self.kind)}
-        return settings | model.field_arrays(self.bands) | self.network.arrays("network/")
 
 
 def prune(
@@ -253,7 +250,7 @@ def prune(
 class OptMLModel(R2F2Model):
     """OptML."""
 
-    name, settings = "optml", OptMLSettings
+    name, settings, fitted = "optml", OptMLSettings, OptML
     source = "Bakshi et al., Fast and efficient cross band channel prediction using machine learning (MobiCom 2019)"
     summary = "paths fitted to the uplink, started by a network"
     scene = "none"
@@ -296,15 +293,8 @@ class OptMLModel(R2F2Model):
         maps = Network(
             "paths", initial, loss, data, lambda rows, *_: opaque_rows(rows), *rows, score, "mean squared error"
         )
-        return OptML(kind, bands, settings, train_network(maps, settings, (problem.seed,), session)[0])
-
-    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> OptML:
-        """The model that `OptML.arrays` described."""
-        settings, kind = model.stored_settings(OptMLSettings, arrays, "optml"), str(arrays["wavefront"])
-        bands = model.from_field_arrays(Bands, arrays)
-        waves = waves_of(kind, bands, settings.max_distance_m)
-        network = PathMap(waves, settings.width, np.random.default_rng(0)).on_device(arrays, "network/")
-        return OptML(kind, bands, settings, network)
+        network: PathMap = train_network(maps, settings, (problem.seed,), session)[0]
+        return OptML(problem, kind, bands, settings, network.arrays())
 
 
 MODEL = OptMLModel()

@@ -25,21 +25,20 @@ bands.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...core import Antenna, InputError, Prediction, Receiver, Record, Split
 from ...core.angles import FloatArray
-from ...core.array_files import keyed, under
 from ...core.settings import CheckedSettings, Count, Positive, names_of
+from ...core.stored import NOT_STORED
 from ...core.types import IntArray
 from ...tracing.options import SpecularOptions, TraceOptions, without_effect
 from ...training.session import FitSession, OnProgress
-from ..model import Arrays, Fitted, Inputs, Problem, field_arrays, from_field_arrays, slices
+from ..model import Fitted, Inputs, Problem, slices
 from .uplink_paths import Start, UplinkPaths, expected_gains, find_paths, in_parts
 from .uplink_waves import (
     Bands,
@@ -219,12 +218,25 @@ def choose(
     return options[int(np.argmin(errors))]
 
 
+@dataclass(eq=False)
 class R2F2(Fitted):
     """Downlink from paths of the uplink, with the chosen wave model ``kind`` and bands, and the paths of a scene."""
 
-    def __init__(self, kind: str, bands: Bands, settings: PathSettings, scene: ScenePaths | None = None) -> None:
-        self.kind, self.bands, self.settings, self.scene = kind, bands, settings, scene
-        self.waves = waves_of(kind, bands, settings.max_distance_m)
+    problem: Problem = field(metadata=NOT_STORED)
+    kind: str
+    bands: Bands
+    settings: PathSettings
+
+    def __post_init__(self) -> None:
+        self.waves = waves_of(self.kind, self.bands, self.settings.max_distance_m)
+
+    @cached_property
+    def scene(self) -> ScenePaths | None:
+        """Paths of the problem's scene; None without one."""
+        if self.problem.scene is None:
+            return None
+        record = self.problem.record
+        return ScenePaths(self.problem.opened_scene, record.receivers[0], record.tx_antenna, self.settings.options)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Downlink coefficients [m, antennas, subcarriers] of the uplinks of ``inputs``."""
@@ -239,24 +251,13 @@ class R2F2(Fitted):
             known = self.scene(self.waves, h, inputs.tx_pos_m, inputs.tx_heading_rad)
         return find_paths(self.waves, h, s.max_paths, s.between, s.final, known)
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Wave model, bands and settings."""
-        settings = {name: np.array(value) for name, value in asdict(self.settings).items()}
-        return {"wavefront": np.array(self.kind)} | field_arrays(self.bands) | keyed("settings/", settings)
-
-
-def _scene_paths(problem: Problem, settings: PathSettings) -> ScenePaths | None:
-    if problem.scene is None:
-        return None
-    record = problem.record
-    return ScenePaths(problem.opened_scene, record.receivers[0], record.tx_antenna, settings.options)
-
 
 class R2F2Model(UplinkModel):
     """R2F2, from the paths of a scene where there is one."""
 
     name = "r2f2"
     settings: type = PathSettings
+    fitted: type[Fitted] = R2F2
     source = "Vasisht et al., Eliminating channel feedback in next-generation cellular networks (SIGCOMM 2016)"
     summary = "paths fitted to the uplink"
     scene: Literal["none", "optional", "required"] = "optional"
@@ -276,13 +277,7 @@ class R2F2Model(UplinkModel):
         """Choose the wave model and, where frequencies are unknown, the bands."""
         settings, rows = problem.settings, self.known_rows(problem.record, split)
         kind, bands = choose(rows, problem.record, settings, session.report, directions=problem.scene is not None)
-        return R2F2(kind, bands, settings, _scene_paths(problem, settings))
-
-    def load(self, arrays: Arrays, problem: Problem, folder: Path) -> R2F2:
-        """The model that `R2F2.arrays` described."""
-        settings = PathSettings(**{name: value.item() for name, value in under("settings/", arrays).items()})
-        bands = from_field_arrays(Bands, arrays)
-        return R2F2(str(arrays["wavefront"]), bands, settings, _scene_paths(problem, settings))
+        return R2F2(problem, kind, bands, settings)
 
 
 MODEL = R2F2Model()

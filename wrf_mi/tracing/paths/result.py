@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import Antenna, InputError, Paths, Receiver, receiver_arrays, stored_receivers
+from ...core import Antenna, InputError, Paths, Receiver
 from ...core.antenna import ANTENNA
 from ...core.carriers import by_carrier
 from ...core.paths import ARRAYS, read_paths_file, save_paths
-from ...core.settings import settings_from
+from ...core.stored import NOT_STORED, from_arrays, to_arrays
 from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
 from ..search.chains import SPECULAR, PathInteractions
@@ -50,7 +49,7 @@ class TraceResult:
         lost: number of paths that are left out, as their gain is not a number.
     """
 
-    paths: Paths
+    paths: Paths = field(metadata=NOT_STORED)
     tx_pos_m: FloatArray
     receivers: tuple[Receiver, ...]
     primitives: NDArray[np.int32]
@@ -236,42 +235,15 @@ def join_traces(parts: Sequence[TraceResult]) -> TraceResult:
 
 def save_trace(file: str | Path, traced: TraceResult) -> Path:
     """Write a trace to an ``.npz`` of plain arrays that `wrf_mi.core.load_paths` reads too."""
-    extra = {
-        "tx_pos_m": traced.tx_pos_m,
-        **receiver_arrays(traced.receivers),
-        "primitives": traced.primitives,
-        "probability": traced.probability,
-        "options": json.dumps(asdict(traced.options)),
-        "rays": traced.rays,
-        "from_receivers": traced.from_receivers,
-        "frequency_hz": traced.frequency_hz,
-        "tx_antenna": np.array(astuple(traced.tx_antenna)),
-        **({} if traced.carriers_hz is None else {"carriers_hz": traced.carriers_hz}),
-        "lost": traced.lost,
-    }
-    return save_paths(file, traced.paths, extra | {f"wedge/{name}": values for name, values in traced.wedge.items()})
+    return save_paths(file, traced.paths, to_arrays(traced))
 
 
 def load_trace(file: str | Path) -> TraceResult:
     """Read a file of `save_trace`; `InputError` of one that is missing, damaged, or holds paths without their trace."""
-    paths, extra = read_paths_file(file)
+    paths, arrays = read_paths_file(file)
     try:
-        return TraceResult(
-            paths,
-            extra["tx_pos_m"],
-            stored_receivers(extra),
-            extra["primitives"],
-            extra["probability"],
-            {key.removeprefix("wedge/"): values for key, values in extra.items() if key.startswith("wedge/")},
-            settings_from(TraceOptions, json.loads(str(extra["options"])), str(file)),
-            int(extra["rays"]),
-            bool(extra["from_receivers"]),
-            float(extra["frequency_hz"]),
-            Antenna(*map(str, extra["tx_antenna"])),
-            extra.get("carriers_hz"),
-            int(extra.get("lost", 0)),  # files of earlier versions have no such paths
-        )
-    except (KeyError, ValueError, TypeError) as error:
+        return from_arrays(TraceResult, arrays, paths=paths)
+    except ValueError as error:
         raise InputError(f"{file}: holds paths alone, not how they were traced ({error}); trace them anew") from None
 
 

@@ -21,7 +21,7 @@ CLEAR = 2.5e-5  # that distance as a share of `Surfaces.scale_m`: twice as far a
 ON_M = 1e-6  # distance from a sheet within which rounding decides an antenna's side; it then takes that of the normal
 ON_SHARE = 0.1  # depth behind a surface, as a share of `clear_m`, up to which an antenna is on it but for rounding
 OUTSIDE_M = 0.02  # distance beyond the scene's box from which an antenna is named: a wall may let no path pass
-PAIRS_PER_CHUNK = 1 << 20
+PAIRS_PER_CHUNK = 1 << 20  # pairs of a position and a triangle or plane in a chunk: bounds the memory
 
 
 def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
