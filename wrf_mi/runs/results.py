@@ -17,14 +17,12 @@ from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays
 from ..core.files import readable
 from ..core.types import IntArray
+from ..core.types import Observations as Observations
 from ..datasets import load_split
 from ..tasks import TASKS, Task
 from ..tasks.scores import summary
 from ..training.checkpoint import LOG
 from .folder import METRICS, PREDICTIONS, SPLIT, check_format, run_parts
-
-Observations = NDArray[np.float32] | NDArray[np.complex64]
-"""Grey values, powers in dBm or channel coefficients (`wrf_mi.core.Record`)."""
 
 REMEDY = "run evaluate to write it anew"
 CONSTANT = "constant"  # key of the block in ``metrics.json``
