@@ -282,7 +282,8 @@ def test_fitted_materials_move_with_their_surfaces(scene: Path, tmp_path: Path) 
     opened = open_scene(scene, CARRIER_HZ[0])
     params = TracedField(opened, TX, UPRIGHT_ARRAY, TracedOptions(materials="surface")).parameters()
     rng = np.random.default_rng(0)
-    params = {k: v + rng.normal(0, 0.5, v.shape) for k, v in params.items() if k.startswith("material")}
+    drawn = {k: v + rng.normal(0, 0.5, v.shape) for k, v in params.items() if k.startswith("material")}
+    params = {name: values.astype(np.float32) for name, values in drawn.items()}
     corrected = write_corrected_scene(tmp_path / "corrected", opened, params, grouping="surface")
     cabinet = Move(("cabinet*",), MOVES[0].shift_m, MOVES[0].turn_deg)
     want = channels(edit_scene(corrected, tmp_path / "want", (cabinet,), remove=("board*",)))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.core.array_files import write_arrays
 from wrf_mi.datasets import layouts
 from wrf_mi.tasks import TASKS, instrument_of, require
 
@@ -48,7 +49,7 @@ def test_layout_is_recognised_by_files(tmp_path: Path) -> None:
         folder.mkdir()
         name = layout.files[0] if layout.files else f"data{layout.suffixes[0]}"
         if layout.array:
-            np.savez(folder / name, **{layout.array: np.array(1)})
+            write_arrays(folder / name, {layout.array: 1})
         else:
             (folder / name).touch()
         assert layouts.layout_of(folder) is layout
