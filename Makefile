@@ -3,11 +3,12 @@
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: help setup demo lint test test-gpu test-slow docs docs-quick package-test bench bench-quick clean
+.PHONY: help setup demo lint test coverage test-gpu test-slow docs docs-quick package-test bench bench-quick clean
 
 help:
 	@echo "make demo       a scanned room and 40 measurements: hybrid, ray tracing and interpolation compared"
 	@echo "make test       lint, types, import order, tests, notebooks"
+	@echo "make coverage   the share of lines that make test runs; minutes"
 	@echo "make test-gpu   the tests that need a CUDA device"
 	@echo "make test-slow  the tests and notebooks that take minutes"
 	@echo "make docs       the documentation site with executed notebooks; minutes, then seconds for what has changed"
@@ -35,14 +36,21 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# A worker for each core; four at most, of one to two gigabytes each. The laboratory is traced first where it is not
-# kept yet, so that no two workers do. Notebooks take longest and begin first, so that no worker is left alone with one
-# in the end; a file stays with one worker, whose tests share what its fixtures fitted. A browser is installed for tests
-# of pages: as root or with a sudo that asks nothing.
+# A worker for each core; four at most, of one to two gigabytes each. Notebooks take longest and begin first, so that no
+# worker is left alone with one in the end; a file stays with one worker, whose tests share what its fixtures fitted.
+TESTS := $(BIN)/pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --nbmake notebooks tests
+
+# The laboratory is traced first where it is not kept yet, so that no two workers do. A browser is installed for tests of
+# pages: as root or with a sudo that asks nothing.
 test: lint
 	@.ci/test_programs.sh
 	@$(BIN)/python -c 'import wrf_mi; wrf_mi.load("laboratory")'
-	$(BIN)/pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --nbmake notebooks tests
+	$(TESTS)
+
+# Lines that other processes run, such as kernels of notebooks, are not counted.
+coverage: $(READY)
+	@.ci/test_programs.sh
+	$(TESTS) --cov=wrf_mi --cov-report=term-missing:skip-covered
 
 test-slow: $(READY)
 	$(BIN)/pytest -m "slow and not gpu" --nbmake notebooks tests
@@ -69,5 +77,5 @@ bench-quick: $(READY)
 	$(BIN)/wrf-mi bench --quick
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache docs/_build docs/notebooks docs/api
+	rm -rf .venv build dist *.egg-info .coverage .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache docs/_build docs/notebooks docs/api
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

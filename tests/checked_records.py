@@ -1,5 +1,7 @@
 """Made-up records with what `wrf_mi.apps.checking` looks for: lines of sight, distance laws, headings along a path."""
 
+from typing import Any
+
 import numpy as np
 
 from wrf_mi.core import Receiver, Record
@@ -51,7 +53,11 @@ def strengths(rows: int = 120, receivers: int = 4, seed: int = 0, noise_db: floa
     distance = np.linalg.norm(tx[None] - places[:, None], axis=-1)
     levels = -40 - 20 * np.log10(distance) + rng.normal(0, noise_db, distance.shape)
     anchors = tuple(Receiver(f"anchor{k + 1}", place, UPRIGHT) for k, place in enumerate(places))
-    facts = {"official": _split(rows), "frequencies_hz": CARRIER_HZ, "tx_heading_rad": np.arctan2(way[:, 1], way[:, 0])}
+    facts: dict[str, Any] = {
+        "official": _split(rows),
+        "frequencies_hz": CARRIER_HZ,
+        "tx_heading_rad": np.arctan2(way[:, 1], way[:, 0]),
+    }
     return Record("walk", "rssi", tx, anchors, levels.astype(np.float32), **facts)
 
 

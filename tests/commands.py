@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from calling import call, refused
 
+from wrf_mi.core.array_files import write_arrays
+
 
 def arrays_in(file: Path) -> dict[str, np.ndarray]:
     with np.load(file, allow_pickle=False) as arrays:
@@ -25,9 +27,9 @@ def rows_of(file: Path) -> list[dict[str, str]]:
 
 def positions_file(file: Path, tx_pos_m: Any, heading_rad: np.ndarray | None = None) -> Path:
     """Positions of transmitters for `wrf-mi predict`, as CSV or npz by the file's name."""
-    headings = {} if heading_rad is None else {"heading_rad": heading_rad}
+    headings: dict[str, Any] = {} if heading_rad is None else {"heading_rad": heading_rad}
     if file.suffix == ".npz":
-        np.savez(file, tx_pos=tx_pos_m, **headings)
+        write_arrays(file, {"tx_pos": tx_pos_m} | headings)
     else:
         table = np.column_stack([tx_pos_m, *headings.values()])
         np.savetxt(file, table, "%.17g", ",", header=",".join(["x,y,z", *headings]), comments="")

@@ -69,7 +69,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     This precedes each test and its fixtures, as deterministic fits leave the process on one thread. Runs time two
     single predictions instead of twenty.
     """
-    if evaluate := sys.modules.get("wrf_mi.runs.evaluate"):
+    evaluate: Any = sys.modules.get("wrf_mi.runs.evaluate")
+    if evaluate:
         evaluate.REPEATS = 2
     if "drjit" in sys.modules:
         from wrf_mi.backend import set_threads

@@ -177,7 +177,7 @@ def damaged_scene(kind: str, turn: int, folder: Path, damage: bool = True) -> Da
     block = next(b for b in re.findall(r"(?s)    <shape .*?</shape>\n", damaged.text) if f'"mesh-{shape}"' in b)
     changed, kind = block, kind if damage else ""
     if kind in IN_FILE or kind in IN_SHAPE:
-        choices = (IN_FILE | IN_SHAPE)[kind]
+        choices = {**IN_FILE, **IN_SHAPE}[kind]
         pattern, new = choices[turn % len(choices)]
         if kind in IN_FILE:
             damaged.text, damaged.at = re.sub(pattern, new, damaged.text, count=1), ""

@@ -1,5 +1,7 @@
 """Uplink and downlink of a base station with three antennas."""
 
+from typing import Any
+
 import numpy as np
 
 from wrf_mi.core import Receiver, Record
@@ -17,7 +19,7 @@ def channels(positions: bool = True) -> Record:
     place, upright = np.array([0.0, 0, 2]), np.array([0.0, 0, 0, 1])
     receiver = Receiver("base-station", place, upright, array_m=array_m)
     downlink, official = (uplink * np.exp(0.1j)).astype(np.complex64)[None], (np.arange(20), np.arange(20, ROWS))
-    carriers = {
+    carriers: dict[str, Any] = {
         name: hz + 1e6 * np.arange(SUBCARRIERS) for name, hz in (("frequencies_hz", 2.4e9), ("uplink_hz", 2.3e9))
     }
     return Record("made-up", "csi", tx_pos, (receiver,), downlink, official=official, uplink=uplink, **carriers)

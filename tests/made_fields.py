@@ -2,17 +2,15 @@
 
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.backend.device import on_device
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import Receiver, pixel_directions
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.training.step import device_pose
 
-Float64 = dr.float64_array_t(mi.Float)
 RECEIVER = Receiver("r", np.array([0.3, -0.2, 0.1]), np.array([0.1, -0.3, 0.2, 0.9]))
 POSE = device_pose(RECEIVER, Float64)
 SIZE = (23, 61)
@@ -75,4 +73,4 @@ def oracle_image(
 def off_edges(image: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
     """The share of pixels on a cut-off, which may fall to either side in float32, and the others' relative L2 error."""
     off = np.abs(image - expected) > 1e-3 * np.abs(expected).max()
-    return off.mean(), np.linalg.norm((image - expected)[~off]) / np.linalg.norm(expected)
+    return float(off.mean()), float(np.linalg.norm((image - expected)[~off]) / np.linalg.norm(expected))

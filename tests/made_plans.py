@@ -1,9 +1,12 @@
 """A storey with known walls, and what a robot with a LiDAR would see of it."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import shapely
 
-from wrf_mi.scene.plan.sources import PlanGrid, grid_from_points
+from wrf_mi.scene.plan.sources import PlanGrid, grid_from_points, read_plan
 
 WIDTH_M, DEPTH_M, INNER_M = 6.0, 4.0, 3.5
 DOOR_M = (1.0, 1.9)
@@ -12,6 +15,13 @@ DOOR_M = (1.0, 1.9)
 L_ROOM_M = np.array([[0, 0], [5, 0], [5, 2], [2.5, 2], [2.5, 4.5], [0, 4.5], [0, 0]], float)
 """Vertices of a room without any symmetry."""
 POSES_M = np.array([[1.0, 1.0], [2.5, 3.0], [4.5, 1.4], [5.0, 3.0]])
+
+
+def read_grid(path: Path, resolution_m: float | None = None, row_0: Any = None) -> PlanGrid:
+    """A plan from a file of cells."""
+    grid = read_plan(path, resolution_m, row_0)
+    assert isinstance(grid, PlanGrid)
+    return grid
 
 
 def box(x, y, width, depth):

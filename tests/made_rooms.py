@@ -1,5 +1,6 @@
 """Small rooms of known planes, and points on them as a scanner would see or measure them."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,12 +54,18 @@ def two_rooms(z: float = 2.6) -> list[Mesh]:
     ]
 
 
+def joined(parts: Sequence[Mesh]) -> Mesh:
+    """One mesh of all parts."""
+    mesh: Any = trimesh.util.concatenate(list(parts))
+    return mesh
+
+
 def sampled(
     parts: list[Mesh], count: int = 150_000, noise_m: float = 0.01, strays: float = 0.01, seed: int = 1
 ) -> np.ndarray:
     """Points [n, 3] spread evenly over all surfaces, with noise across them, and strays all over the room."""
     rng = np.random.default_rng(seed)
-    mesh = trimesh.util.concatenate(parts)
+    mesh = joined(parts)
     points, face = trimesh.sample.sample_surface(mesh, count, seed=seed)
     points = points + mesh.face_normals[face] * rng.normal(0, noise_m, count)[:, None]
     low, high = mesh.bounds

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from wrf_mi.core.array_files import write_arrays
+
 CARRIER_HZ = 3.5e9
 LACKING = "the package deepmimo is not installed (pip install '.[deepmimo]')"
 CHOSEN: dict[str, dict[str, Any]] = {
@@ -87,7 +89,7 @@ def write_scenario(
                 elif suffix == ".npy":
                     np.save(file, values)
                 else:
-                    np.savez(file, **{key: values})
+                    write_arrays(file, {key: values})
     np.savez(folder / "vertices.npz", vertices=np.zeros((0, 3)))
     (folder / "objects.json").write_text("[]")
     return folder

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from wrf_mi.apps.viewer.content import (
@@ -37,7 +39,7 @@ def made_view(observed: str = "image") -> ViewContent:
     fall = np.sort(rng.uniform(-60, -20, (STORED, GAUSSIANS)))[:, ::-1]
     places = rng.uniform([0, 0, 0], [4, 3, 2], (GAUSSIANS, 3))
     gaussians = GaussiansContent(places, np.full((STORED, GAUSSIANS, 3), np.log(0.2)), turns, fall, 9)
-    corners, tx, rx, order = [], [], [], []
+    corners, tx, rx, order = list[Any](), list[int](), list[int](), list[int]()
     for t in range(STORED):
         for r in range(2):
             for bounces in (0, 1):

@@ -1,5 +1,7 @@
 """Plane waves that leave transmitters in a cone around the line of sight, and what an array reports of them."""
 
+from typing import Any
+
 import numpy as np
 from scipy.constants import speed_of_light
 
@@ -57,7 +59,7 @@ def wave_record(rows: int = 40, held_out: int = 12, receivers: int = 2, seed: in
         spectra.append(minmax_scale(bartlett_spectrum(h, ELEMENTS_M, FREQUENCY_HZ, *SIZE)))
     every = np.arange(rows)
     observation = (np.floor(255 * np.stack(spectra)) / 255).astype(np.float32)
-    rows_of = {"official": (every[:-held_out], every[-held_out:]), "folds": every % 2}
+    rows_of: dict[str, Any] = {"official": (every[:-held_out], every[-held_out:]), "folds": every % 2}
     hz = np.array([FREQUENCY_HZ])
     record = Record("made-waves", "spectrum", tx_pos, RECEIVERS[:receivers], observation, frequencies_hz=hz, **rows_of)
     return record.with_array(ELEMENTS_M)

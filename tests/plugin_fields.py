@@ -14,7 +14,7 @@ from wrf_mi.runs.api import train
 
 RECEIVER = Receiver("gateway1", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
-FIELDS = {
+FIELDS: dict[str, Any] = {
     "wrf-gs": WrfGs(Encoding(3, 4.0, 3, 1.0), layers=2, width=8, signal_widths=(8, 8)),
     "wrf-gs+": WrfGsPlus(Encoding(3, 4.0, 3, 1.0), layers=3, width=8, skip=1),
 }

@@ -5,7 +5,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from made_fields import Float64, device_gaussians
+from made_fields import device_gaussians
 from wrf_mi_bench import field_oracle as oracle
 from wrf_mi_plugins.blend_rays import Walls, blend_rays
 from wrf_mi_plugins.bundles import all_lists, ray_bundles
@@ -14,7 +14,7 @@ from wrf_mi_plugins.sensor import receiver_to_world
 from wrf_mi_plugins.shape import gaussian_shape
 
 from wrf_mi.backend.device import on_device
-from wrf_mi.backend.vectors import Pose
+from wrf_mi.backend.vectors import Float64, Pose
 from wrf_mi.core import Receiver, rotation_matrix, unit_vectors
 from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M, depth_order
@@ -76,11 +76,11 @@ def blended(field: dict[str, np.ndarray], blending: str, directions: np.ndarray)
 
 
 def gaussians_of(field: dict[str, np.ndarray], blending: str, float_type: Any = Float64) -> Gaussians:
-    geometry = {name: field[name].T for name in ("position", "scale", "rotation")}
-    product = {"attenuation": field["attenuation"] @ [1, 1j]} if blending == "product" else {}
-    return device_gaussians(
-        float_type, **geometry, signal=field["signal"] @ [1, 1j], **product or {"opacity": field["opacity"][:, 0]}
-    )
+    geometry: dict[str, Any] = {name: field[name].T for name in ("position", "scale", "rotation")}
+    blend: dict[str, Any] = {"opacity": field["opacity"][:, 0]}
+    if blending == "product":
+        blend = {"attenuation": field["attenuation"] @ [1, 1j]}
+    return device_gaussians(float_type, **geometry, signal=field["signal"] @ [1, 1j], **blend)
 
 
 def pose_of(float_type: Any = Float64) -> Pose:

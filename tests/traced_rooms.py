@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ WAVELENGTH_M = speed_of_light / FREQUENCY_HZ
 LENGTH, WIDTH, HEIGHT = 6.0, 5.0, 3.0
 THICKNESS_M = {"itu_concrete": 0.2, "itu_brick": 0.1, "itu_plasterboard": 0.05}
 
-Parts = Mapping[str, tuple[str, trimesh.Trimesh]]
+Parts = dict[str, tuple[str, trimesh.Trimesh]]
 SHOEBOX: Parts = {
     "floor": ("itu_concrete", sheet(2, 0.0, (0.0, LENGTH), (0.0, WIDTH))),
     "ceiling": ("itu_plasterboard", sheet(2, HEIGHT, (0.0, LENGTH), (0.0, WIDTH))),

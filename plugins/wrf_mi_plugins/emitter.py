@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
@@ -123,7 +124,7 @@ class GaussianEmitter(mi.Emitter):
 
 
 def gaussian_emitter(
-    field: Any, params: dict[str, ArrayLike], tx_position_m: ArrayLike, name: str = "transmitter"
+    field: Any, params: Mapping[str, ArrayLike], tx_position_m: ArrayLike, name: str = "transmitter"
 ) -> GaussianEmitter:
     """An emitter from a user-defined model, or from parameters without a run folder; an entry for ``mi.load_dict``.
 

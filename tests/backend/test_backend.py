@@ -70,8 +70,9 @@ def real_llvm(major: int) -> libraries.LlvmLibrary:
 
 
 def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    pipes = {"capture_output": True, "text": True, "timeout": SECONDS_PER_CHILD}
-    return subprocess.run([sys.executable, "-c", code], env=os.environ | environment, **pipes)
+    command = [sys.executable, "-c", code]
+    environment = os.environ | environment
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=SECONDS_PER_CHILD)
 
 
 VERSIONS = {

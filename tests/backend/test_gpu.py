@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from small_fits import QUICK
 
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.gaussians.footprint import depth_order
 from wrf_mi.parallel import run_module
 from wrf_mi.runs.api import train
@@ -30,19 +31,18 @@ def on_cpu(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_sorting_in_a_recording_is_replayed():
     """Dr.Jit 1.5 records its own sort on CUDA, and its replay ends the process."""
-    double, frozen = dr.float64_array_t(mi.Float), dr.freeze(depth_order)
+    frozen = dr.freeze(depth_order)
     rng = np.random.default_rng(0)
     for size in (50, 50, 3000, 3000):
         depth = rng.integers(1, 9, size).astype(float)
         position = rng.integers(-2, 3, (3, size)).astype(np.float32)
-        order = frozen(double(depth), [mi.Float(row) for row in position]).numpy()
+        order = frozen(Float64(depth), [mi.Float(row) for row in position]).numpy()
         np.testing.assert_array_equal(order, np.lexsort((*position[::-1], depth)))
 
 
 def test_division_and_roots_are_exact():
-    double = dr.float64_array_t(mi.Float)
     values = np.random.default_rng(0).uniform(0.1, 1000, 1000)
-    x = double(values)
+    x = Float64(values)
     for result, expected in ((1 / x, 1 / values), (dr.sqrt(x), np.sqrt(values)), (dr.rcp(x), 1 / values)):
         np.testing.assert_allclose(result.numpy(), expected, rtol=1e-15)
 

@@ -8,8 +8,10 @@ from wrf_mi_bench.wave_formulas import half_plane, knife_edge, wedge
 
 ASYMPTOTIC = 1e-4  # of the incident field: the diffracted one is exact to 1 / (k s), with s of 160 wavelengths
 HZ = 140e9  # carrier at which single precision counts most
-CASES = closed_forms.free_space_errors, closed_forms.two_ray_errors, closed_forms.wall_errors
-CASES += closed_forms.half_plane_errors, closed_forms.wedge_errors, closed_forms.scattering_errors
+CASES = (
+    *(closed_forms.free_space_errors, closed_forms.two_ray_errors, closed_forms.wall_errors),
+    *(closed_forms.half_plane_errors, closed_forms.wedge_errors, closed_forms.scattering_errors),
+)
 
 
 @pytest.mark.parametrize("case", CASES)

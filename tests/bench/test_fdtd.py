@@ -1,5 +1,7 @@
 """Published calibration against quadrature; channels from a field whose channel is known; tables."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.constants import c, epsilon_0, mu_0
@@ -51,7 +53,7 @@ def test_amplitudes_are_calibrated_whatever_the_phases():
     )
     np.testing.assert_allclose(np.exp(found), [1.0, 0.5], rtol=0.02)
     assert prior < 1.5
-    certain = [10.0 * np.ones(4, complex)]
+    certain = [np.full(4, 10.0 + 0.0j)]
     assert resultant(np.array(prior_concentration(certain))) == pytest.approx(float(resultant(np.array(10.0))))
     assert prior_concentration([-certain[0]]) == 0
 
@@ -70,8 +72,8 @@ def test_channel_of_a_dipole_in_free_space(tmp_path):
     """From the field that the source radiates in the grid, to 0.2 %: linear interpolation, and 1 / f by the grid's."""
     h5py = pytest.importorskip("h5py")
     count, distance_m = 4096, np.array([2.0, 2.5, 3.0])
-    hz = np.fft.rfftfreq(count, STEP_S)
-    current = np.fft.rfft(fdtd.ricker(STEP_S * np.arange(count)))
+    hz = np.asarray(np.fft.rfftfreq(count, STEP_S), float)
+    current = np.fft.rfft(fdtd.ricker(STEP_S * np.arange(float(count))))
     k = 2 * np.pi * hz / c
     grid = np.zeros(len(hz))
     low = (hz > 0) & (hz < 20e9)  # beyond, the source radiates nothing
@@ -89,7 +91,9 @@ def test_channel_of_a_dipole_in_free_space(tmp_path):
 
 
 def test_tables_have_a_line_for_each_row():
-    rows = [{"what": "true scene", "unexplained_db": [-10.0, -11.0, -9.0], "power_db": [0.4, 0.1, -0.1]}]
+    rows: list[dict[str, Any]] = [
+        {"what": "true scene", "unexplained_db": [-10.0, -11.0, -9.0], "power_db": [0.4, 0.1, -0.1]}
+    ]
     assert fdtd.table(rows).splitlines()[2] == "| true scene | -9.0 | -0.1 |"
     errors = {far_scans.SCAN: 0.6, far_scans.WITHOUT: 0.6, far_scans.WITH: 0.1}
     rows = [

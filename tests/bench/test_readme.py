@@ -110,10 +110,10 @@ def test_questions_of_the_readme_are_answered_by_stored_results():
 def test_columns_of_the_readme_separate_methods_with_a_scene():
     asked = {question.data.strip("`").split(" ")[0] for question in QUESTIONS if question.columns is OF_TABLES}
     entries = {name: entry for part in PARTS if part.dataset in asked for name, entry in part.entries.items()}
-    scenes = [(OF_TABLES[name], entry.scene) for name, entry in entries.items() if name in OF_TABLES]
-    scenes += [(column, ALONE[name].scene) for name, column in OF_STAGES.items() if name in ALONE]
+    scenes = [(OF_TABLES[name], bool(entry.scene)) for name, entry in entries.items() if name in OF_TABLES]
+    scenes += [(column, bool(ALONE[name].scene)) for name, column in OF_STAGES.items() if name in ALONE]
     assert len(scenes) == 13
-    assert all((column < SCENE) == bool(scene) for column, scene in scenes)
+    assert all((column < SCENE) == scene for column, scene in scenes)
 
 
 @pytest.mark.parametrize("path", PAGES, ids=PAGE_NAMES)

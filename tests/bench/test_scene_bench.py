@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from wrf_mi_bench.trace import confirm_paths, image_method_agreement, match_path
 from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.core import Receiver
+from wrf_mi.core.array_files import write_arrays
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.plan.sources import PlanGrid, read_layout, read_plan
 from wrf_mi.scene.plan.storey import layout_walls
@@ -50,9 +52,9 @@ def test_a_reference_that_lacks_a_path_at_every_position_is_compared(tmp_path, l
     gain = WAVELENGTH_M / (4 * np.pi * length) * np.exp(-2j * np.pi / WAVELENGTH_M * length)
     csi = gain if line_of_sight else np.zeros(3, complex)
     offsets = np.arange(4) if line_of_sight else np.zeros(4, np.int64)
-    paths = {"path_offsets": offsets, "path_gain": gain, "path_last_point": np.tile(fixed, (count, 1))}
-    channels = {"frequency_hz": FREQUENCY_HZ, "csi": csi, "line_of_sight": np.full(3, line_of_sight)}
-    np.savez(tmp_path / "room.npz", tx_pos=fixed, rx_pos=moving, **channels, **paths)
+    paths: dict[str, Any] = {"path_offsets": offsets, "path_gain": gain, "path_last_point": np.tile(fixed, (count, 1))}
+    channels: dict[str, Any] = {"frequency_hz": FREQUENCY_HZ, "csi": csi, "line_of_sight": np.full(3, line_of_sight)}
+    write_arrays(tmp_path / "room.npz", {"tx_pos": fixed, "rx_pos": moving} | channels | paths)
     agreement = image_method_agreement(tmp_path / "room.npz", rays=1 << 12)
     assert agreement["receivers_matlab_lacks_paths"] == agreement["receivers"] == 3
     assert agreement["of_these_confirmed"] == agreement["paths_matlab_lacks"] > 50

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,7 +115,7 @@ def test_rows_of_other_data_or_commands_are_measured_again_and_of_other_versions
         tables.tables(tmp_path, tmp_path / "runs")
         assert asked == [row.name for row in short_plan]
     assert "stored rows" not in capsys.readouterr().err
-    older = {"data": "other"}, {"versions": {"numpy": "0.1"}}, {"data": None}
+    older: tuple[dict[str, Any], ...] = {"data": "other"}, {"versions": {"numpy": "0.1"}}, {"data": None}
     for row, changes in zip(short_plan, older, strict=True):
         change(row, **changes)
     tables.tables(tmp_path, tmp_path / "runs")
@@ -297,9 +298,9 @@ def test_text_and_picture_show_both_fronts():
     assert {axes.get_xscale() for axes in figure.axes} == {"log"}
     assert [text.get_text() for text in figure.legends[0].texts] == list(POINTS)
     (step,) = figure.axes[0].lines
-    assert (step.get_xdata()[-1], step.get_ydata()[-1]) == (10, 0.99)
+    assert np.asarray(step.get_data())[:, -1].tolist() == [10, 0.99]
     # A method without training lies at the left end.
-    assert figure.axes[1].lines[0].get_xdata()[0] == LEAST
+    assert np.asarray(figure.axes[1].lines[0].get_xdata())[0] == LEAST
 
 
 def test_missing_rows_are_reported(tmp_path):

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -13,7 +14,7 @@ from wrf_mi.apps.checking.scene_geometry import ShapePart
 def test_solids_are_those_of_the_solid_angle():
     """A box, and a ring whose middle is air."""
     places = np.random.default_rng(0).uniform(-1, 2, (400, 3))
-    box = np.asarray(trimesh.creation.box(bounds=[[0, 0, 0], [1, 0.4, 2]]).triangles)
+    box = np.asarray(trimesh.creation.box(bounds=[[0.0, 0, 0], [1, 0.4, 2]]).triangles)
     deep = DEEP_M
     true = ((places >= deep) & (places <= np.array([1, 0.4, 2]) - deep)).all(axis=1)
     assert true.any()
@@ -36,7 +37,7 @@ def test_positions_of_a_scene_without_floor_below_are_named():
     inside, beside = [[1, 1, 1], [3, 0.5, 1], [2, 1, 1], [3.5, 1.5, 2]], [[6, 0, 1], [7, 0, 1]]
     receivers = [SimpleNamespace(position_m=np.array([1.0, 1, 2]))]
     cases = [np.array(rows, float) for rows in (inside + beside, [*inside, [30, 0, 1]], beside)]
-    records = [SimpleNamespace(tx_pos_m=rows, receivers=receivers) for rows in cases]
+    records: list[Any] = [SimpleNamespace(tx_pos_m=rows, receivers=receivers) for rows in cases]
     findings = [list(device_findings(parts, Path("room"), record)) for record in records]
     assert [[finding.kind for finding in each] for each in findings] == [["no-floor"], [], []]
     assert "2 of 6 transmitters inside the scene, first number 5, have no floor" in findings[0][0].text

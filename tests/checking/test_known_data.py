@@ -53,10 +53,11 @@ def test_copies_of_rows(name):
     record = known(name)
     rows = np.arange(len(record))
     rows[[5, 9]] = 3
-    parts = (record.tx_heading_rad, record.uplink, record.carriers_hz)
-    heading, up, carriers = (None if values is None else values[rows] for values in parts)
-    observed = replace(record, observation=record.observation[:, rows], truth=None, carriers_hz=carriers)
-    found = suspected(replace(observed, tx_pos_m=record.tx_pos_m[rows], tx_heading_rad=heading, uplink=up))
+    taken = record.inputs(rows)
+    observed = replace(record, observation=record.observation[:, rows], truth=None, carriers_hz=taken.carriers_hz)
+    found = suspected(
+        replace(observed, tx_pos_m=taken.tx_pos_m, tx_heading_rad=taken.tx_heading_rad, uplink=taken.uplink)
+    )
     assert found
     assert set(found) <= {"repeated-rows", "train-test"}
 

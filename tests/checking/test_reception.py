@@ -55,7 +55,7 @@ def test_rows_at_one_place_and_few_strengths_in_whole_decibels_are_no_repetition
     assert list(repeated_rows(still)) == []
     turning = taken(record, rows)
     assert [name for name, _ in repeated_rows(turning)] == ["train-test", "repeated-rows"]
-    assert list(repeated_rows(replace(turning, tx_heading_rad=np.arange(len(record)) * 0.01))) == []
+    assert list(repeated_rows(replace(turning, tx_heading_rad=np.arange(float(len(record))) * 0.01))) == []
     record = taken(strengths(receivers=3), np.arange(120) // 2 * 2)
     assert list(repeated_rows(record)) == []
     four = taken(strengths(receivers=4), np.arange(120) // 2 * 2)

@@ -127,7 +127,7 @@ def test_national_grid_is_shifted_and_stated(tmp_path):
     facts = yaml.safe_load((tmp_path / "out" / "scene.yml").read_text())
     assert facts["origin_m"] == [701_300, 4_485_500, 0]
     mesh = trimesh.load_mesh(tmp_path / "out" / "meshes" / "utm.ply")
-    np.testing.assert_allclose(mesh.bounds, [[0, 0, 611], [5.3, 4.2, 613.5]], atol=1e-3)
+    np.testing.assert_allclose(mesh.bounds, [[0.0, 0, 611], [5.3, 4.2, 613.5]], atol=1e-3)
     assert repair.done[0].startswith("origin: 701300, 4485500, 0 m subtracted")
 
 

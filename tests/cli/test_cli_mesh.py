@@ -63,7 +63,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(
 
 
 def test_mesh_reports_faults_of_the_scene_that_it_writes(tmp_path: Path, command: Command) -> None:
-    room = trimesh.creation.box(bounds=[[0, 0, 0], [4, 3, 2.5]])
+    room = trimesh.creation.box(bounds=[[0.0, 0, 0], [4, 3, 2.5]])
     room.invert()
     corners = [[0.001, y, z] for y, z in ((0.5, 0), (2.5, 0), (2.5, 2.5), (0.5, 2.5))]
     sheet = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)

@@ -67,7 +67,7 @@ def of(record: Record, carrier_hz: float) -> tuple[Record, Split]:
 
 @pytest.mark.parametrize("name", [name for name in MODELS if not MODELS[name].several_carriers])
 def test_models_of_one_carrier_refuse_several(name: str, flat: Record, one_gateway: Record, tmp_path: Path) -> None:
-    several = one_gateway.at_carriers(np.arange(len(one_gateway)) % 2 + 1.0)
+    several = one_gateway.at_carriers(np.arange(float(len(one_gateway))) % 2 + 1.0)
     for record in (flat, several):
         model = MODELS[name]
         if model.serves(record.task.name) and model.uplink != "required":
@@ -79,12 +79,12 @@ def test_models_of_one_carrier_refuse_several(name: str, flat: Record, one_gatew
 def test_inconsistent_carriers_are_refused(flat: Record) -> None:
     message = r"choose another model \(wrf-gs, wrf-gs\+, factorised, hybrid, idw, kriging, tre"
     refusal(plan_run, flat, RunRequest("nerf2"), message)
-    for change, message in (
-        ({"carriers_hz": np.ones(3)}, r"carriers_hz \[3\]; give 30 positive"),
-        ({"carriers_hz": np.zeros(len(flat))}, r"carriers_hz \[30\]; give 30 positive"),
-        ({"frequencies_hz": np.ones(1)}, "set one of the two to None"),
+    for changed, message in (
+        (replace(flat, carriers_hz=np.ones(3)), r"carriers_hz \[3\]; give 30 positive"),
+        (replace(flat, carriers_hz=np.zeros(len(flat))), r"carriers_hz \[30\]; give 30 positive"),
+        (replace(flat, frequencies_hz=np.ones(1)), "set one of the two to None"),
     ):
-        refusal(plan_run, replace(flat, **change), RunRequest("idw"), message)
+        refusal(plan_run, changed, RunRequest("idw"), message)
     record = replace(channels(), frequencies_hz=None, carriers_hz=np.ones(30))
     refusal(plan_run, record, RunRequest("linear"), "carriers_hz belongs to spectra and signal strengths")
 

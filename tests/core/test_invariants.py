@@ -3,8 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from traced_fields import RECEIVER, any_field
 from wrf_mi_plugins.optical_depth import attenuators, optical_depth
 
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import Receiver
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Gaussians
@@ -20,7 +19,6 @@ from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
 from wrf_mi.training.step import device_pose
 
-Float64: Any = dr.float64_array_t(mi.Float)
 ROUNDING = 1e-9
 """Float64 through some tens of operations; pixels on the edge of a footprint may fall to either side."""
 SIZE = (20, 40)

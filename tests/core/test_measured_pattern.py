@@ -204,7 +204,8 @@ def test_file_is_part_of_the_antenna(tmp_path: Path, monkeypatch: pytest.MonkeyP
 )
 def test_wrong_files_are_refused(name: str, old: str, new: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / name
-    {"sphere.csv": sphere, "cuts.csv": cuts, "beam.msi": planet}[name](path, beam)
+    writers: dict[str, Callable[..., object]] = {"sphere.csv": sphere, "cuts.csv": cuts, "beam.msi": planet}
+    writers[name](path, beam)
     path.write_text(path.read_text().replace(old, new, 1))
     refusal(Antenna, str(path), message)
 

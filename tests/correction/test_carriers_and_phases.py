@@ -87,7 +87,8 @@ def test_antennas_of_transmitters_are_those_of_the_record(truth):
     """Of horizontal dipoles, with which paths of vertical antennas have other powers."""
     scene, record = truth
     rows, hz = np.arange(20), np.array([CARRIER_HZ])
-    vertical = Record("made-up", "rssi", record.tx_pos_m[rows], record.receivers, np.zeros((1, 20)), frequencies_hz=hz)
+    silent = np.zeros((1, 20), np.float32)
+    vertical = Record("made-up", "rssi", record.tx_pos_m[rows], record.receivers, silent, frequencies_hz=hz)
     horizontal = replace(vertical, tx_antenna=Antenna("dipole", "H"))
     powers = RayTracer(scene, instrument_of(horizontal), TRACE)(vertical.tx_pos_m).astype(np.float32)
     for stated, below in ((horizontal, True), (vertical, False)):

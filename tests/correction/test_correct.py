@@ -50,7 +50,7 @@ def first_split(record):
 
 def mean_scores(found: Correction) -> tuple[float, float]:
     """Of held-out rows, in the stated scene and in the one that is kept."""
-    return np.nanmean(found.scores[""]), np.nanmean(found.scores[found.kept])
+    return float(np.nanmean(found.scores[""])), float(np.nanmean(found.scores[found.kept]))
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +116,9 @@ def test_error_ratio_is_the_larger_one_of_equal_rows(held, left_out, expected):
     # Rows that were not held out have errors of another size.
     fitted[[0, 2, 4, 6]] *= 10
     record = SimpleNamespace(receivers=(SimpleNamespace(name="a"), SimpleNamespace(name="b")))
-    final = SimpleNamespace(record=record, rows=np.array([2, 4, 6, 8]), residual=lambda vector: fitted)
+    final: Any = SimpleNamespace(record=record, rows=np.array([2, 4, 6, 8]), residual=lambda vector: fitted)
     rows = np.array([4, 8])
-    unseen = SimpleNamespace(record=record, rows=rows, residual=lambda vector: -held * fitted[[1, 3, 5, 7]])
+    unseen: Any = SimpleNamespace(record=record, rows=rows, residual=lambda vector: -held * fitted[[1, 3, 5, 7]])
     held_out = _held_out_ratio(unseen, np.zeros(1), final, np.zeros(1))
     assert max(error_ratio(left_out * fitted, fitted), held_out) == pytest.approx(expected)
 

@@ -163,6 +163,6 @@ def test_motions_are_found_again_with_their_uncertainty(planes):
     precision = np.zeros(3 * count)
     upright = np.abs(planes.normal[:, 2]) > 0.9
     precision[:count][upright] = 1.0  # floor and ceiling alone
-    _, deviation = rigid_motion(planes, np.zeros(3 * count), precision)
-    assert np.isinf(deviation[:2]).all()
-    assert np.isfinite(deviation[2])
+    _, stated = rigid_motion(planes, np.zeros(3 * count), precision)
+    assert np.isinf(stated[:2]).all()
+    assert np.isfinite(stated[2])

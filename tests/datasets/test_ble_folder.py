@@ -187,7 +187,8 @@ def test_patterns_are_files_of_the_folder(tmp_path: Path):
     assert record.receivers[0].antenna.measured.peak_dbi == -1
     copied = read_ble_folder(write_ble_folder(tmp_path / "copy", record))
     shutil.rmtree(folder)
-    images = replace(copied, task="spectrum", observation=np.zeros((2, len(copied), 3, 6)), n_readings=None, std=None)
+    black = np.zeros((2, len(copied), 3, 6), np.float32)
+    images = replace(copied, task="spectrum", observation=black, n_readings=None, std=None)
     unstated = {"tx_heading_rad": None, "official": None, "runs": None}
     spectra = read_spectrum_folder(write_spectrum_folder(tmp_path / "spectra", replace(images, **unstated)))
     for again in (copied, spectra):
@@ -201,7 +202,7 @@ def antennas_of(record):
 
 
 WRONG |= {
-    f"antenna: {message}": (lambda folder, columns=columns: with_columns(folder, **columns), "anchors.csv", message)
+    f"antenna: {message}": (lambda folder, columns=columns: with_columns(folder, **columns), "anchors.csv", message)  # type: ignore[misc]
     for columns, message in (
         ({"pattern": ["iso", "horn"]}, "row 2: antenna: pattern is 'horn'; choose from"),
         ({"polarization": ["vertical", "V"]}, "row 1: antenna: polarization is 'vertical'; choose from V, H"),

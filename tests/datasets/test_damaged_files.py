@@ -184,7 +184,7 @@ def samples(folder: Path, flat_folder: Path, room: Path, tmp_path_factory: pytes
     export(run.folder, "field", place / "field.npz")
     with pytest.raises(Interrupted):
         train(folder, "wrf-gs+", out=place / "stopped", settings=short, stop=stop_after(3))
-    ends = {"tx_pos_m": np.array([[1.0, 2, 1]]), "rx_pos_m": np.array([[3.0, 1, 2]])}
+    ends: dict[str, Any] = {"tx_pos_m": np.array([[1.0, 2, 1]]), "rx_pos_m": np.array([[3.0, 1, 2]])}
     export(room, "paths", place / "paths.csv", ExportOptions(frequency_hz=CARRIER_HZ, **ends))
     (place / "heard.csv").write_text("x,y,rssi_one,other_dbm\n1,2,-60.5,-71\n2,2,,-70\n")
     np.savetxt(place / "inputs.csv", positions, delimiter=",", header="x,y,z", comments="")

@@ -16,6 +16,7 @@ from made_scenarios import CARRIER_HZ, CHOSEN, package_channels, package_dataset
 from scipy.constants import speed_of_light
 
 from wrf_mi.core import Antenna
+from wrf_mi.core.array_files import write_arrays
 from wrf_mi.datasets import load, make_splits, read_deepmimo
 from wrf_mi.datasets.deepmimo import CHANNEL_PARAMS, PARAMS
 from wrf_mi.receivers.array import array_response
@@ -133,7 +134,7 @@ def test_carrier_phase_is_added_where_asked(tmp_path: Path) -> None:
 def test_path_without_delay_has_its_power_and_phase(tmp_path: Path) -> None:
     folder = scenario(tmp_path, paths=1, users=(4,))
     for key, value in {"delay": 0.0, "power": -20.0, "phase": 90.0}.items():
-        np.savez(folder / f"{key}_t000_tx000_r001.npz", **{key: np.array([[np.nan], *[[value]] * 3])})
+        write_arrays(folder / f"{key}_t000_tx000_r001.npz", {key: [[np.nan], *[[value]] * 3]})
     np.testing.assert_allclose(read_deepmimo(folder).observation[0, 1:], 0.1j, atol=1e-8)
 
 

@@ -16,13 +16,16 @@ import pytest
 from changed_folders import DATA, error_line, needs, refusal
 from spectrum_records import assert_same, make_record
 
+from wrf_mi.core.array_files import write_arrays
 from wrf_mi.datasets import datasets, fetch, load, read_newrf, read_spectrum_folder, registry, write_spectrum_folder
 from wrf_mi.datasets.download import download
 from wrf_mi.datasets.newrf import arrays_sha256, convert_newrf
 from wrf_mi.datasets.registry import DATA_VARIABLE, DataSet, RemoteFile, known, remote_files
 
-NAMES = ("rfid-lab", "flat-ble", "newrf-conference", "newrf-office", "laboratory", "traced-room", "traced-room-bands")
-NAMES += ("traced-csi-flat", "traced-csi-office", "traced-floor-receivers", "traced-floor-receivers-csi")
+NAMES = (
+    *("rfid-lab", "flat-ble", "newrf-conference", "newrf-office", "laboratory", "traced-room", "traced-room-bands"),
+    *("traced-csi-flat", "traced-csi-office", "traced-floor-receivers", "traced-floor-receivers-csi"),
+)
 Server = tuple[str, Path]
 """The URL and the folder that it serves."""
 PICKLES = Path(__file__).parent / "data"
@@ -204,7 +207,7 @@ def test_a_room_is_found_in_its_own_folder_or_beside_others(home: Path, monkeypa
     place = home / "data" / folder
     place.mkdir(parents=True)
     refusal(load, "newrf-office", "run `wrf-mi data fetch newrf-office`")
-    np.savez(place / "office.npz", **convert_newrf(PICKLES / "newrf_protocol5.pkl"))
+    write_arrays(place / "office.npz", convert_newrf(PICKLES / "newrf_protocol5.pkl"))
     assert load("newrf-office").source == str(place / "office.npz")
     refusal(load, "newrf-conference", "newrf-conference: not on this machine")
     assert {s.dataset.name for s in datasets() if s.location} == {"newrf-office"}

@@ -49,7 +49,7 @@ def test_reads_a_folder(folder: Path) -> None:
     assert not record.has_positions
     assert [part.tolist() for part in record.official] == [[5, 0, 3, 1], [4, 2]]  # NeRF2 counts these from 0
     np.testing.assert_allclose(record.receivers[0].position_m, [0.5, 0, 1])
-    np.testing.assert_allclose(record.receivers[0].array_m, [[-0.5, 0, 0], [0, 0, 0], [0.5, 0, 0]])
+    np.testing.assert_allclose(record.receivers[0].array_m, [[-0.5, 0, 0], [0.0, 0, 0], [0.5, 0, 0]])
     assert record.frequencies_hz is None
     assert record.uplink_hz is None
     np.testing.assert_array_equal(record.scored, record.observation)

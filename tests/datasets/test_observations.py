@@ -27,6 +27,7 @@ from wrf_mi.runs.evaluate import evaluate
 from wrf_mi.runs.folder import RunRequest
 from wrf_mi.runs.results import read_run
 from wrf_mi.tracing import TraceOptions
+from wrf_mi.tracing.tracer import fit_offsets
 
 
 def changed(record: Record, *changes: tuple[Any, float]) -> Record:
@@ -177,7 +178,6 @@ def test_a_fold_that_is_refused_leaves_the_paths_of_fitted_folds(
             raise InputError("a fault; a remedy")
         return fit_offsets(*values)
 
-    fit_offsets = ray_tracing.fit_offsets
     monkeypatch.setattr(ray_tracing, "fit_offsets", refused_later)
     options = {"scene": room, "settings": DIRECT, "split": "blocked"}
     refusal(train, flat_folder, "ray-tracing", "a fault", out=tmp_path / "run", **options)

@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ ONE, TWO = make_record(4), make_record(4, gateways=2)
 CARRIERS_HZ = np.array([915e6, 2.44e9, 915e6, 5.1e9])
 RUNS = np.array(["day 1", "day 1", "2", "with, comma"])
 DIRECTED = zip(TWO.receivers, (Antenna("dipole", "H"), Antenna("tr38901", "V", "array")), strict=True)
-ANTENNAS = {"receivers": tuple(replace(one, antenna=own) for one, own in DIRECTED)}
+ANTENNAS: dict[str, Any] = {"receivers": tuple(replace(one, antenna=own) for one, own in DIRECTED)}
 
 
 @pytest.mark.parametrize(
@@ -224,7 +225,7 @@ def named(name: str) -> tuple[Receiver, ...]:
     return (replace(ONE.receivers[0], name=name),)
 
 
-BEYOND = {  # what the layout cannot state
+BEYOND: dict[str, tuple[dict[str, Any], str]] = {  # what the layout cannot state
     "receiver named array": ({"receivers": named("array")}, "a receiver is named 'array'"),
     "receiver named tx_antenna": ({"receivers": named("tx_antenna")}, "a receiver is named 'tx_antenna'"),
     "truth": ({"truth": ONE.observation}, "has truth, which this layout does not state; set Record.truth to"),

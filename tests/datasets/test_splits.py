@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.cluster.vq import kmeans2
 
 from wrf_mi.core import Receiver, Record, Split
+from wrf_mi.core.array_files import write_arrays
 from wrf_mi.core.stored import to_arrays
 from wrf_mi.datasets import load_split, make_splits, save_split
 from wrf_mi.datasets.splits import SPLIT_FORMAT, position_folds
@@ -68,7 +70,8 @@ def test_split_rules_select_the_stated_rows():
     assert [split.name for split in blocked] == [f"blocked:{k}" for k in range(5)]
     for k, split in enumerate(blocked):
         np.testing.assert_array_equal(split.test, np.flatnonzero(record.folds == k))
-    assert_same(*make_splits(record, "blocked:2"), blocked[2])
+    (third,) = make_splits(record, "blocked:2")
+    assert_same(third, blocked[2])
     # Without a file of folds blocks are the clusters of positions.
     clusters = {tuple(split.test) for split in make_splits(replace(record, folds=None), "blocked")}
     assert clusters == {tuple(split.test) for split in blocked}
@@ -116,7 +119,8 @@ def test_carriers_and_positions_are_held_out_together(official: bool):
         np.testing.assert_array_equal(beside.all_train, np.flatnonzero(record.carriers_hz != carrier_hz))
     if official:
         assert set(np.concatenate([split.test for split in splits])) == set(record.official[1])
-    assert_same(*make_splits(record, "frequency:1", seed=2), splits[1])
+    (second,) = make_splits(record, "frequency:1", seed=2)
+    assert_same(second, splits[1])
 
 
 def several_receivers(count: int, official: bool = True) -> Record:
@@ -144,7 +148,8 @@ def test_each_receiver_is_held_out_once(count: int, folds: int, official: bool):
         assert abs(len(held) - count / folds) < 1
         np.testing.assert_array_equal(split.test, base.test[received[held][:, base.test].any(axis=0)])
         np.testing.assert_array_equal(split.all_train, base.all_train[received[others][:, base.all_train].any(axis=0)])
-    assert_same(*make_splits(record, "receiver:1", seed=3), splits[1])
+    (second,) = make_splits(record, "receiver:1", seed=3)
+    assert_same(second, splits[1])
 
 
 def test_rows_are_left_to_held_out_receivers():
@@ -193,8 +198,8 @@ def test_splits_depend_on_the_seed():
     one, two = (make_splits(record, "random", seed=seed)[0] for seed in (5, 6))
     assert set(one.test.tolist()) != set(two.test.tolist())
     # The blocks belong to the data: no seed moves them.
-    blocks = [[split.test for split in make_splits(record, "blocked", seed=seed)] for seed in (5, 6)]
-    np.testing.assert_equal(*blocks)
+    blocks, same_blocks = ([split.test for split in make_splits(record, "blocked", seed=seed)] for seed in (5, 6))
+    np.testing.assert_equal(blocks, same_blocks)
 
 
 RUNS = np.array(["tuesday"] * 20 + ["monday", "10"] * 15)
@@ -307,15 +312,15 @@ def test_bad_split_files_are_refused(tmp_path: Path):
     refusal(load_split, path, "not readable")
     rows = np.arange(3)
     whole = Split("a", 0, rows, rows + 3, rows + 6)
-    head = {"format": SPLIT_FORMAT, **to_arrays(whole)}
+    head: dict[str, Any] = {"format": SPLIT_FORMAT, **to_arrays(whole)}
     for wrong, message in (
         ({"validation": rows, "test": rows + 3}, "twice"),
         ({"validation": rows + 3, "test": rows - 9}, "whole numbers"),
         ({"validation": rows + 3.5, "test": rows + 9}, "whole numbers"),
         ({"validation": rows + 3, "test": rows + 9, "format": 9}, "format 9, not"),
     ):
-        np.savez(path, **{**head, **wrong})
+        write_arrays(path, head | wrong)
         refusal(load_split, path, message)
     (split,) = make_splits(RECEIVERS, "receiver+5:1")
-    save_split(path, replace(split, left=split.left - [1, 0]))
+    save_split(path, replace(split, left=split.left - np.array([1, 0])))
     refusal(load_split, path, "leaves rows that no held-out receiver trains on")

@@ -67,7 +67,7 @@ def test_examples_of_how_to_pages_run(tmp_path, monkeypatch):
         assert wrf_mi.check_data("office").suspicions == ()
         assert wrf_mi.open_run("run").predict([[2.0, 3.0, 1.2]], "kitchen").mean.shape == (1,)
         assert run.metrics["abs_error_db"]["median"] < 5
-        kind = receivers.receiver_model("power-pixel", "spectrum")
+        kind: Any = receivers.receiver_model("power-pixel", "spectrum")
         form = receivers.ObservationSpec("power-pixel", (4, 8))
         assert kind.of(form, run.record.receivers[0]).how == "power"
         assert names["main"]()["rows"]

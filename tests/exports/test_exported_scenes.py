@@ -10,6 +10,7 @@ import trimesh
 from changed_folders import error_line
 from commands import Command
 from traced_rooms import SHOEBOX, write_xml
+from trimesh.visual import ColorVisuals
 
 from wrf_mi import backend
 from wrf_mi.apps.exports import ExportOptions, export
@@ -122,7 +123,7 @@ def test_glb_has_named_surfaces_and_materials_and_is_the_scene_again(scene: Path
 def test_ply_has_colours_materials_and_is_a_scene_again(scene: Path, tmp_path: Path) -> None:
     facts = export(scene, "ply", tmp_path / "scene.ply")
     assert facts == {"surfaces": 6, "faces": 12, "materials": 4}
-    mesh = trimesh.load(tmp_path / "scene.ply", process=False)
+    mesh = trimesh.load_mesh(tmp_path / "scene.ply", process=False)
     head = (tmp_path / "scene.ply").read_bytes().partition(b"end_header")[0].decode()
     names = {
         kind: [line.split()[3] for line in head.splitlines() if f"comment {kind}" in line]
@@ -132,6 +133,7 @@ def test_ply_has_colours_materials_and_is_a_scene_again(scene: Path, tmp_path: P
     known = open_scene(scene, 2.4e9)
     for surface, material in zip(stored["surface"].ravel(), stored["material"].ravel(), strict=True):
         assert names["material"][material] == known.objects[names["surface"][surface]].radio_material.name
+    assert isinstance(mesh.visual, ColorVisuals)
     assert mesh.visual.face_colors[0][:3].tolist() == [115, 115, 115]  # concrete
     np.testing.assert_array_equal(triangles(np.array(mesh.triangles)), triangles(known))
     again = open_scene(make_scene(tmp_path / "scene.ply", tmp_path / "again").folder, 2.4e9)

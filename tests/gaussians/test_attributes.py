@@ -14,8 +14,10 @@ from wrf_mi.core import InputError, Receiver
 from wrf_mi.gaussians import ATTRIBUTES, FIELDS, Encoding, WithAttributes, random_gaussians
 from wrf_mi.gaussians.attributes import grown_attributes, with_attributes
 
-SETTINGS = ("steps=60", "batch=8", "initial.gaussians=6", "density.every=20", "density.stop=0.7", "view.height=4")
-SETTINGS += ("network.layers=2", "network.width=8", "view.columns=8", "attributes=roughness")
+SETTINGS = (
+    *("steps=60", "batch=8", "initial.gaussians=6", "density.every=20", "density.stop=0.7", "view.height=4"),
+    *("network.layers=2", "network.width=8", "view.columns=8", "attributes=roughness"),
+)
 RECEIVER = Receiver("r", np.zeros(3), np.array([0.0, 0, 0, 1]))
 
 
@@ -49,7 +51,7 @@ def test_commands_train_an_attribute_of_an_installed_package(flat_folder: Path, 
     with np.load(run / "model.npz") as arrays:
         stored = arrays["params/roughness"]
     assert stored.shape[0] == 1
-    assert not np.isin(stored, np.float32([0.1, 0.05])).any()  # all have been trained
+    assert not np.isin(stored, np.array([0.1, 0.05], np.float32)).any()  # all have been trained
     exported = trimesh.load(tmp_path / "splat.ply").metadata["_ply_raw"]["vertex"]["data"]["roughness"]
     np.testing.assert_array_equal(np.ravel(exported), stored[0])
 
@@ -71,9 +73,9 @@ def test_attribute_changes_signals_of_any_field(name: str, roughness: Any) -> No
 
 
 def test_density_control_follows_the_rule_of_the_attribute(roughness: Any) -> None:
-    before = {"roughness": np.float32([[0.3, 0.4]])}
+    before = {"roughness": np.array([[0.3, 0.4]], np.float32)}
     grown = grown_attributes(WithAttributes(None, (roughness,)), before, np.array([0, 1, 1]))
-    np.testing.assert_array_equal(grown["roughness"], np.float32([[0.3, 0.05, 0.05]]))
+    np.testing.assert_array_equal(grown["roughness"], np.array([[0.3, 0.05, 0.05]], np.float32))
 
 
 def test_unknown_and_clashing_attributes_are_refused(roughness: Any) -> None:

@@ -141,7 +141,7 @@ def test_invariants_of_a_density_round(n, max_gaussians, growth_fraction, seed, 
 
 
 def test_opacity_reset():
-    before = np.float32([[-9.0, logit(RESET_OPACITY), 0.0, 5.0]])
+    before = np.array([[-9.0, logit(RESET_OPACITY), 0.0, 5.0]], np.float32)
     after = reset_opacity(before)
     np.testing.assert_allclose(after, [[-9.0, *[logit(RESET_OPACITY)] * 3]], rtol=FLOAT32_EPS)
     assert after.dtype == np.float32
@@ -185,12 +185,12 @@ def test_density_round_keeps_momentum_of_old_gaussians():
         for new, old in ((new_first, first), (new_second, second)):
             assert not new[name][:, change.fresh].any()
             np.testing.assert_array_equal(new[name][:, ~change.fresh], old[name][:, change.source[~change.fresh]])
-        new = change.fresh.copy()
+        fresh = change.fresh.copy()
         if name == "opacity":  # that of the clone's original has changed with the clone's
-            new |= np.bincount(change.source, minlength=n)[change.source] == 2
-            assert new.sum() == change.fresh.sum() + 1
-        np.testing.assert_array_equal(new_mean[name][:, new], values[:, new])
-        np.testing.assert_array_equal(new_mean[name][:, ~new], mean[name][:, change.source[~new]])
+            fresh |= np.bincount(change.source, minlength=n)[change.source] == 2
+            assert fresh.sum() == change.fresh.sum() + 1
+        np.testing.assert_array_equal(new_mean[name][:, fresh], values[:, fresh])
+        np.testing.assert_array_equal(new_mean[name][:, ~fresh], mean[name][:, change.source[~fresh]])
     for new, old in ((new_first, first), (new_second, second), (state.params(), before), (new_mean, mean)):
         np.testing.assert_array_equal(new["net.bias"], old["net.bias"])
     assert state.view_gradient_steps == 0

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from made_fields import Float64
 from scipy.special import expit
 
 from wrf_mi.backend.device import to_tensor
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import Receiver
 from wrf_mi.gaussians import FIELDS, Encoding, WrfGs, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.network import dense, dense_of_pairs, encode, encoded_size, init_layer, linear, unambiguous_scale
@@ -147,9 +147,9 @@ def test_gradient_of_a_hidden_layer_matches_its_parts(batch, with_hidden):
         return [dr.grad(p).numpy().copy() for p in inputs.values()]
 
     def written_out() -> Any:
-        of_gaussians = dr.reshape(params["layer.position"] @ x, (7, 1, n))
-        of_transmitters = dr.reshape(params["layer.transmitter"] @ y + params["layer.bias"], (7, batch, 1))
-        total = dr.reshape(of_gaussians + of_transmitters, (7, batch * n))
+        of_gaussians: Any = dr.reshape(params["layer.position"] @ x, (7, 1, n))
+        of_transmitters: Any = dr.reshape(params["layer.transmitter"] @ y + params["layer.bias"], (7, batch, 1))
+        total: Any = dr.reshape(of_gaussians + of_transmitters, (7, batch * n))
         return dr.maximum(total + params["layer.hidden"] @ h if with_hidden else total, 0)
 
     hidden = h if with_hidden else None

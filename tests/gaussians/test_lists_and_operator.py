@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from made_fields import BATCH, COUNT, POSE, RECEIVER, SIZE, Float64, device_gaussians, fields, oracle_image
+from made_fields import BATCH, COUNT, POSE, RECEIVER, SIZE, device_gaussians, fields, oracle_image
 from made_spectra import RECEIVERS, true_field
 from made_spectra import SIZE as SPECTRUM_SIZE
 from scipy.special import logit
 from wrf_mi_bench import field_oracle as oracle
 
 from wrf_mi.backend.device import to_tensor
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import InputError, Receiver, unit_vectors
 from wrf_mi.gaussians import FIELDS, Gaussians, random_gaussians, tiles
 from wrf_mi.gaussians.blend import splat
@@ -103,8 +104,9 @@ def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch):
     monkeypatch.setattr(tiles, "RESERVED", 0)
     parts = Predictor.of_field(field, params, RECEIVERS, *SPECTRUM_SIZE)
     np.testing.assert_allclose(parts(tx), expected, atol=ROUNDING)
-    assert not parts.evaluate.recordings
-    assert all(recording.frozen.n_recordings > 0 for recording in recorded.evaluate.recordings.values())
+    evaluators: tuple[Any, Any] = parts.evaluate, recorded.evaluate
+    assert not evaluators[0].recordings
+    assert all(recording.frozen.n_recordings > 0 for recording in evaluators[1].recordings.values())
 
 
 GEOMETRY = ("position", "scale", "rotation")
@@ -185,8 +187,8 @@ def hard(product: bool, float_type: Any, n: int = 40, seed: int = 0) -> tuple[Ga
     signal = rng.standard_normal(n) + 1j * rng.standard_normal(n)
     delta = np.sqrt(rng.uniform(0, 1, n)) * 0.99 * np.exp(1j * rng.uniform(-np.pi, np.pi, n))
     opacity = rng.uniform(0.01, 0.99, n)
-    blending = {"attenuation": delta} if product else {"opacity": opacity}
-    arrays = {"position": position.T, "scale": scale, "rotation": rotation, "signal": signal}
+    blending: dict[str, Any] = {"attenuation": delta} if product else {"opacity": opacity}
+    arrays: dict[str, Any] = {"position": position.T, "scale": scale, "rotation": rotation, "signal": signal}
     return device_gaussians(float_type, **arrays, **blending), signal
 
 
@@ -252,8 +254,8 @@ def test_operator_without_visible_gaussians_is_zero():
 @pytest.mark.parametrize("product", [True, False])
 def test_no_gaussians(product):
     """All pruned: dark as well."""
-    blending = {"attenuation": np.zeros(0, complex)} if product else {"opacity": np.zeros(0)}
-    rows = {"position": np.zeros((3, 0)), "scale": np.zeros((3, 0)), "rotation": np.zeros((4, 0))}
+    blending: dict[str, Any] = {"attenuation": np.zeros(0, complex)} if product else {"opacity": np.zeros(0)}
+    rows: dict[str, Any] = {"position": np.zeros((3, 0)), "scale": np.zeros((3, 0)), "rotation": np.zeros((4, 0))}
     operator = operator_of(device_gaussians(mi.Float, signal=np.zeros(0, complex), **rows, **blending), SIZES[1])
     assert operator.weights.shape == (23 * 61, 0)
     assert not operator.magnitude(np.zeros((2, 0), np.complex64)).any()

@@ -9,10 +9,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from made_fields import SIZE, Float64, device_gaussians, off_edges, oracle_image
+from double_precision import Tensor64
+from made_fields import SIZE, device_gaussians, off_edges, oracle_image
 from made_spectra import OCTAVES, RECEIVERS, spectra
 
 from wrf_mi.backend.device import to_float, to_tensor
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import Receiver, pixel_directions, unit_vectors
 from wrf_mi.gaussians import FIELDS, Encoding, Factorised, Gaussians, WrfGs, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.blend import GROUP, group_size, splat
@@ -36,7 +38,6 @@ SMALL: dict[str, Any] = {
     "factorised": {"terms": 4, "layers": 2, "width": 16},
 }
 """Networks for finite differences; test_encoding_and_networks.py has the derivatives of their layers."""
-Tensor64 = dr.tensor_t(Float64)
 RECEIVER = Receiver("r", np.array([5.0, 0.26, 0]), np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602]))
 
 
@@ -53,7 +54,7 @@ def make(model: str, n: int, tensor: Any, **options: Any) -> tuple[Any, dict[str
 @pytest.mark.parametrize("size", [(90, 360), (23, 61)])
 @pytest.mark.parametrize("single", [True, False])
 def test_splat_matches_the_oracle(model, size, single):
-    tensor = mi.TensorXf if single else Tensor64
+    tensor: Any = mi.TensorXf if single else Tensor64
     floats, (field, params) = dr.array_t(tensor), make(model, 60, tensor)
     gaussians = field.gaussians(params, tensor(np.random.default_rng(1).standard_normal((3, 2))))
     re, im = splat(gaussians, device_pose(RECEIVER, floats), perception_plane(*size, floats))
@@ -69,7 +70,11 @@ def test_seam_and_zenith():
     for azimuth, elevation in ((0.0, 0.3), (1.0, 1.55), (3.1, 0.02)):
         direction = unit_vectors(azimuth, elevation)
         position = RECEIVER.position_m + RECEIVER.to_world @ direction * 4.0
-        geometry = {"position": position[:, None], "scale": np.full((3, 1), 0.3), "rotation": np.eye(4)[:, 3:]}
+        geometry: dict[str, Any] = {
+            "position": position[:, None],
+            "scale": np.full((3, 1), 0.3),
+            "rotation": np.eye(4)[:, 3:],
+        }
         gaussian = device_gaussians(Float64, **geometry, signal=np.array([1 + 0.5j]), opacity=np.array([0.7]))
         re, im = splat(gaussian, device_pose(RECEIVER, Float64), perception_plane(90, 360, Float64))
         angle = np.arccos(np.clip(pixel_directions(90, 360) @ direction, -1, 1))
@@ -173,7 +178,7 @@ def test_shared_geometry_equals_repeated_geometry(name, batch):
         dr.backward(dr.sum(re * weight[0] + im * weight[1]))
         images.append(np.concatenate([re.numpy(), im.numpy()]))
         slopes.append({key: dr.grad(p).numpy().copy() for key, p in params.items()})
-    np.testing.assert_allclose(*images, atol=TOLERANCE * np.abs(images[1]).max())
+    np.testing.assert_allclose(images[0], images[1], atol=TOLERANCE * np.abs(images[1]).max())
     for key, expected in slopes[1].items():
         np.testing.assert_allclose(slopes[0][key], expected, atol=TOLERANCE * np.abs(expected).max(), err_msg=key)
         assert expected.any(), key
@@ -207,7 +212,11 @@ def gradient_descent(field: Any) -> Iterator[list[dict[str, Any]]]:
 
 @pytest.mark.parametrize("model", FIELDS)
 def test_kernels_of_a_loop_of_gradient_descent_do_not_grow(model: str) -> None:
-    sizes = {"wrf-gs": {"width": 16, "signal_widths": (16, 8)}, "wrf-gs+": {"width": 16}, "factorised": {"width": 16}}
+    sizes: dict[str, Any] = {
+        "wrf-gs": {"width": 16, "signal_widths": (16, 8)},
+        "wrf-gs+": {"width": 16},
+        "factorised": {"width": 16},
+    }
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         steps = list(gradient_descent(FIELDS[model](encoding=OCTAVES, **sizes[model])))

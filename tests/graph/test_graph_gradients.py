@@ -4,11 +4,12 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from box_room import CEILING, FREQUENCY_HZ, PARTITION, WALLS, receiver, room, transmitters
+from double_precision import Tensor64
 
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.tiles import perception_plane
@@ -19,9 +20,6 @@ from wrf_mi.tracing.options import FACTOR
 from wrf_mi.tracing.paths.instrument_parameters import receiver_pose
 from wrf_mi.tracing.paths.surface_gaussians import SurfaceGaussians
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
-
-Float64 = dr.float64_array_t(mi.Float)
-Tensor64 = dr.tensor_t(Float64)
 
 TOLERANCE = 1e-6
 """Error of a derivative along a direction of standard normal numbers, relative to the gradient's norm: the standard

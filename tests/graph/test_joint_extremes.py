@@ -12,6 +12,7 @@ from scipy.constants import speed_of_light
 from wrf_mi_scenes.build_laboratory import sheet
 
 from wrf_mi.backend.device import on_device
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import Antenna
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import Encoding, WrfGsPlus, random_gaussians
@@ -22,7 +23,6 @@ from wrf_mi.tracing import TraceOptions
 from wrf_mi.tracing.paths.instrument_parameters import receiver_pose
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 
-Float64 = dr.float64_array_t(mi.Float)
 VALUE, GRADIENT = 1e-4, 1e-3  # bounds on relative errors in norm of float32, as in the stress benchmark
 DIFFERENCE = 1e-5  # of central differences in float64, relative to the sum of the terms' magnitudes
 STEP = 1e-6  # of the differences, in natural steps of the parameters (`natural`)
@@ -66,7 +66,8 @@ def rounded(values: dict[str, Any]) -> dict[str, np.ndarray]:
 
 def tensor(value: Any, kind: Any) -> Any:
     array = np.ascontiguousarray(value)
-    return dr.tensor_t(kind)(on_device(array.ravel(), kind), array.shape)
+    tensor_type: Any = dr.tensor_t(kind)
+    return tensor_type(on_device(array.ravel(), kind), array.shape)
 
 
 class Joint:
@@ -85,7 +86,7 @@ class Joint:
         # An encoding of positions that hardly changes, as it is detached.
         self.field = WrfGsPlus(encoding=Encoding(1, 1e6, 2), layers=2, width=16, skip=1)
         start = self.field.init(random_gaussians([self.receiver], 25, rng, opacity=0.4, signal=0.5), rng)
-        values = {f"field.{key}": value for key, value in start.items()} | self.traced.parameters()
+        values: dict[str, Any] = {f"field.{key}": value for key, value in start.items()} | self.traced.parameters()
         values["field.rotation"] = rng.normal(size=values["field.rotation"].shape)
         values[self.traced.gain_name] = values[self.traced.gain_name] + [np.log(100.0), 0.0]
         if name == "coplanar planes":

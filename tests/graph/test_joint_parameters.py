@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -39,7 +40,7 @@ QUICK = ("optimiser.warm_up=10", "optimiser.ema_decay=0.9", "holdout_steps_fract
 def record_of(task, scene, receivers, tx):
     """Observations traced by Sionna RT, independent of the graph."""
     shape = {"spectrum": (30, 120), "rssi": (), "csi": (16, 4)}[task]
-    empty = np.zeros((len(receivers), len(tx), *shape), np.complex64 if task == "csi" else np.float32)
+    empty: Any = np.zeros((len(receivers), len(tx), *shape), np.complex64 if task == "csi" else np.float32)
     hz = BAND_HZ if task == "csi" else np.array([FREQUENCY_HZ])
     arrays = receivers if task == "rssi" else tuple(replace(station, array_m=ARRAY_M) for station in receivers)
     record = Record("room", task, tx, arrays, empty, frequencies_hz=hz)

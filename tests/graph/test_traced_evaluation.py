@@ -1,6 +1,7 @@
 """Fields that are trained by tracing: ``mi.render`` with the plugins in place of splatting, in the same graph."""
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +16,7 @@ from wrf_mi_plugins.bundles import all_lists, ray_bundles
 from wrf_mi_plugins.ray_response import ray_footprints
 
 from wrf_mi.backend.device import on_device, to_tensor
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import InputError, Record, pixel_directions
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import with_settings
@@ -34,12 +36,11 @@ from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 from wrf_mi.training.trainer import Trainer
 
-Float64 = dr.float64_array_t(mi.Float)
 SIZE, FINE = (30, 60), (45, 180)
 TX = np.random.default_rng(5).uniform(-1, 1, (3, 3))
 SMALL_DEG, CONE = 2.0, 0.1
 """Standard deviation of a Gaussian, and of its direction in rad: they overlap, so that each hides others."""
-MODELS = {
+MODELS: dict[str, Any] = {
     "wrf-gs": WrfGs(Encoding(2, 4.0, 2, 1.0), layers=2, width=16, signal_widths=(16, 8)),
     "wrf-gs+": WrfGsPlus(Encoding(2, 4.0, 2, 1.0), layers=3, width=16, skip=1),
 }
@@ -128,11 +129,11 @@ def test_traced_gradients_match_splatting_for_small_gaussians(model, form):
         values["level"] = np.full((1, 1), -1.0, np.float32)
         values["position"] = values["position"] * np.where(np.arange(15) % 2, 1, -1)
     weights = np.random.default_rng(3).uniform(0.5, 1.5, 3 if form.receiver == "power" else 3 * FINE[0] * FINE[1])
-    found = [
+    traced, splatted = (
         gradients(values, reported(Graph(MODELS[model], RECEIVERS[:1], form, evaluation=name), TX), weights)
         for name in ("traced", "splatted")
-    ]
-    assert_close(*found, PROJECTED)
+    )
+    assert_close(traced, splatted, PROJECTED)
 
 
 def test_traced_pose_gradient_matches_splatting_for_small_gaussians():
@@ -151,7 +152,8 @@ def test_traced_pose_gradient_matches_splatting_for_small_gaussians():
         return of
 
     values = dict(zip(pose_names(RECEIVERS[0]), (np.full(3, 0.01), np.array([0.02, -0.01, 0.03])), strict=True))
-    assert_close(*(gradients(values, greys(name), weights) for name in ("traced", "splatted")), PROJECTED)
+    traced, splatted = (gradients(values, greys(name), weights) for name in ("traced", "splatted"))
+    assert_close(traced, splatted, PROJECTED)
 
 
 def made_record(rows=60):
@@ -162,8 +164,8 @@ def made_record(rows=60):
     values |= {name: 4 * value for name, value in values.items() if name.startswith("deform.signal.")}
     tx = np.random.default_rng(1).uniform(-1, 1, (rows, 3))
     spectra = Predictor.of_field(field, values, RECEIVERS[:1], *SIZE)(tx)
-    spectra, split = np.minimum(spectra / spectra.max(), 1)[None], tuple(np.split(np.arange(rows), [40]))
-    return Record("made", "spectrum", tx, RECEIVERS[:1], spectra, official=split), start
+    spectra, (train, test) = np.minimum(spectra / spectra.max(), 1)[None], np.split(np.arange(rows), [40])
+    return Record("made", "spectrum", tx, RECEIVERS[:1], spectra, official=(train, test)), start
 
 
 FEW_STEPS = (
@@ -175,7 +177,8 @@ FEW_STEPS = (
 def test_traced_training_scores_like_splatting_and_reuses_kernels():
     """The traced fit's median SSIM lies in the splatted one's 95 % bootstrap interval over the test rows."""
     record, start = made_record()
-    split, scores, known, new = official(record), {}, set(), []
+    split, known, new = official(record), set[str](), list[int]()
+    scores: dict[str, np.ndarray] = {}
 
     def count_kernels(progress):
         # A kernel is its code, constants included, whether this process or another one compiled it.
@@ -191,7 +194,8 @@ def test_traced_training_scores_like_splatting_and_reuses_kernels():
             trainer.run(progress)
         scores[name] = ssim(trainer.predictor().of_rows(record, split.test, 0), record.observation[0, split.test])
     # A scene whose parameters keep derivatives hands them to whatever is traced in the process later.
-    kept = [scene.params[key] for scene in trainer.graph.evaluation._scenes for key in scene.params.keys()]  # noqa: SIM118
+    evaluation: Any = trainer.graph.evaluation
+    kept = [scene.params[key] for scene in evaluation._scenes for key in scene.params.keys()]  # noqa: SIM118
     assert kept
     assert not dr.grad_enabled(kept)
     draws = np.random.default_rng(0).choice(scores["splatted"], (4000, len(split.test)))
@@ -225,7 +229,8 @@ def test_slab_attenuates_traced_gaussians_behind_it(tmp_path):
     board = graph.scene.radio_materials["itu_plasterboard"]
     names = "relative_permittivity", "conductivity", "thickness"
     up = Float64(pixel_directions(*SIZE)[..., 2].ravel())
-    factor = slab(up, *(Float64(float(np.ravel(getattr(board, name))[0])) for name in names), WALLS_HZ).transmitted_tm
+    constants = (Float64(float(np.ravel(getattr(board, name))[0])) for name in names)
+    factor = slab(*(up, *constants, WALLS_HZ)).transmitted_tm
     expected = np.hypot(factor.real.numpy(), factor.imag.numpy()).reshape(SIZE)
     lit = without > 0.01
     assert lit.sum() > 100
@@ -262,7 +267,12 @@ def test_traced_run_with_a_scene_reproduces_its_score(tmp_path):
     station, spectra = replace(INSIDE, array_m=planar_array(4, 4, 0.06)), made_record(24)[0].observation
     record = Record("made", "spectrum", tx, (station,), spectra, frequencies_hz=np.array([WALLS_HZ]))
     asked = ["steps=4", *QUICK[:-1], "validate_every=2", "traced.rays=1024", "batch=2"]
-    how = {"receiver": "pixel", "evaluation": "traced", "split": "random", "scene": write_xml(tmp_path, SHOEBOX)}
+    how: dict[str, Any] = {
+        "receiver": "pixel",
+        "evaluation": "traced",
+        "split": "random",
+        "scene": write_xml(tmp_path, SHOEBOX),
+    }
     run = train(record, "wrf-gs+", out=tmp_path / "run", settings=asked, **how).folder
     stored = np.load(run / "predictions.npz")
     again = open_run(run, record).predict(tx[stored["row"]]).mean

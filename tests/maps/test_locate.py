@@ -60,7 +60,7 @@ def law(candidates: Candidates, std_db: float) -> np.ndarray:
 def record_of(tx_pos_m: np.ndarray, rssi_dbm: np.ndarray, train_rows: int) -> Record:
     receivers = tuple(Receiver(f"anchor{number}", place, UPRIGHT) for number, place in enumerate(CORNERS_M))
     rows = np.arange(len(tx_pos_m))
-    known = {"frequencies_hz": np.array([2.44e9]), "official": (rows[:train_rows], rows[train_rows:])}
+    known: dict[str, Any] = {"frequencies_hz": np.array([2.44e9]), "official": (rows[:train_rows], rows[train_rows:])}
     return Record("made-up", "rssi", tx_pos_m, receivers, rssi_dbm.astype(np.float32), **known)
 
 
@@ -305,14 +305,15 @@ def test_bad_arguments_are_refused(fitted: tuple[Path, Record], tmp_path: Path, 
     run, record = fitted
     value = record.observation[:, :2]
     without_std = train(write_ble_folder(tmp_path / "data", record), "idw", out=tmp_path / "run").folder
-    for folder, strengths_dbm, options, message in (
+    cases: tuple[tuple[Path, Any, dict[str, Any], str], ...] = (
         (run, value[:2], {}, r"give strengths \[3, m\]"),
         (run, np.full((3, 1), np.nan), {}, "no receiver received transmitter 0"),
         (run, value, {"level": 90}, "probability between 0 and 1"),
         (run, value, {"step_m": -1}, "positive number of metres"),
         (run, value, {"offset_db": -1}, "standard deviation of 0 or more"),
         (without_std, value, {}, "train it with --intervals"),
-    ):
+    )
+    for folder, strengths_dbm, options, message in cases:
         with pytest.raises(InputError, match=message):
             locate(folder, strengths_dbm, **options)
     command.refused(["locate", run, "--out", tmp_path / "out.txt"], "written as .csv")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,14 +61,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     )
     traced = np.asarray(RayTracer(scene, Instrument("power", receivers, HZ), PLAIN)(tx_pos_m), float)
     observed = traced + rng.normal(0, NOISE_DB, traced.shape)
-    known = {"frequencies_hz": HZ, "official": (np.arange(TRAINED), np.arange(TRAINED, ROWS))}
+    known: dict[str, Any] = {"frequencies_hz": HZ, "official": (np.arange(TRAINED), np.arange(TRAINED, ROWS))}
     record = Record("room", "rssi", tx_pos_m, receivers, observed.astype(np.float32), **known)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(of_strengths, "TRACE", PLAIN)
         data = write_ble_folder(folder / "data", record)
         settings = ("stages=mean,residual",)
         trained = train(data, "hybrid", out=folder / "run", scene=str(scene), settings=settings)
-        assert trained.fitted.parts["paths"].fitted.field.prior.traced.exact
+        fitted: Any = trained.fitted
+        assert fitted.parts["paths"].fitted.field.prior.traced.exact
         yield trained
 
 

@@ -15,6 +15,7 @@ from made_channels import channels
 from made_waves import wave_record
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 
 import wrf_mi
 from wrf_mi.apps.maps import picture
@@ -90,6 +91,7 @@ def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
     dataset = dataset.assign_coords(amid)
     estimated = map_figure(dataset, run)
     (ellipse,) = estimated.axes[0].patches
+    assert isinstance(ellipse, Ellipse)
     assert (ellipse.get_width(), ellipse.get_height()) == (1.0, 0.5)
     assert marks(estimated) == {"training rows", "other measured rows", picture.AT_ESTIMATED}
     assert "not drawn" not in heading(estimated)
@@ -148,7 +150,7 @@ def two_bands() -> Record:
     carriers = np.array(BANDS_HZ)[rows % 2]
     receiver = wrf_mi.Receiver("wall", np.array([0.0, 0, 2]), np.array([0.0, 0, 0, 1]))
     observed = np.where(rows % 2, -60.0, -40.0) + rng.normal(0, 0.5, 40)
-    known = {"carriers_hz": carriers, "official": (rows[:30], rows[30:])}
+    known: dict[str, Any] = {"carriers_hz": carriers, "official": (rows[:30], rows[30:])}
     positions = np.column_stack([rng.uniform(1, 4, (40, 2)), np.full(40, 1.3)])
     return Record("bands", "rssi", positions, (receiver,), observed[None].astype(np.float32), **known)
 
@@ -176,12 +178,13 @@ def test_picture_of_a_surface_shows_the_mesh(
     more = ("--surface", tmp_path / "table.ply", "--receiver", "anchor1")
     dataset, figure, run = mapped(flat_folder, tmp_path, command, *more)
     faces = figure.axes[0].collections[0]
-    colours = np.unique(faces.get_facecolor()[:, :3], axis=0)
-    assert len(faces.get_facecolor()) == dataset.sizes["point"]
+    drawn = np.asarray(faces.get_facecolor())
+    colours = np.unique(drawn[:, :3], axis=0)
+    assert len(drawn) == dataset.sizes["point"]
     assert len(colours) > 1
     assert "transmitter at z" not in heading(figure)
     assert write_map(dataset, tmp_path / "map.csv").read_text().startswith("receiver,x,y,z,")
     for most, deviations in ((2, 3), (1, 1)):  # the strongest receiver's, and those of few receivers
         monkeypatch.setattr(picture, "MOST_DEVIATIONS", most)
-        drawn = map_figure(radio_map(run, step_m=1.0), run)
-        assert sum("standard deviation" in axes.get_title() for axes in drawn.axes) == deviations
+        figure = map_figure(radio_map(run, step_m=1.0), run)
+        assert sum("standard deviation" in axes.get_title() for axes in figure.axes) == deviations

@@ -52,7 +52,7 @@ def strengths() -> Record:
     )
     observed = np.stack([free_space_db(positions, receiver) + TRANSMIT_DBM for receiver in receivers])
     rows = np.arange(60)
-    known = {"frequencies_hz": np.array([HZ]), "official": (rows[:45], rows[45:])}
+    known: dict[str, Any] = {"frequencies_hz": np.array([HZ]), "official": (rows[:45], rows[45:])}
     return Record("open", "rssi", positions, receivers, observed.astype(np.float32), **known)
 
 
@@ -121,7 +121,7 @@ def test_table_has_a_row_for_each_receiver_and_position(mapped: xr.Dataset, tmp_
 def test_chunks_and_choices_of_receivers_do_not_change_values(
     law: Run, mapped: xr.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given = {"step_m": 0.5, "transmit_dbm": TRANSMIT_DBM, "threshold_dbm": -32.0}
+    given: dict[str, Any] = {"step_m": 0.5, "transmit_dbm": TRANSMIT_DBM, "threshold_dbm": -32.0}
     kitchen = radio_map(law, receivers=["kitchen"], **given)
     np.testing.assert_array_equal(kitchen["power_dbm"][0], mapped["power_dbm"][1])
     monkeypatch.setattr(api, "CHUNK_SIZE", 7)
@@ -163,15 +163,15 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
     positions = rng.uniform([0.5, 0.5, 1.3], [2.5, 4.5, 1.3], (30, 3))
     receiver = wrf_mi.Receiver("rx", np.array([5.0, 4.0, 2.0]), np.array([0.0, 0, 0, 1]))
     observed = (free_space_db(positions, receiver) + 3)[None].astype(np.float32)
-    known = {"frequencies_hz": np.array([HZ]), "official": (np.arange(22), np.arange(22, 30))}
+    known: dict[str, Any] = {"frequencies_hz": np.array([HZ]), "official": (np.arange(22), np.arange(22, 30))}
     return write_xml(folder, parts), Record("room", "rssi", positions, (receiver,), observed, **known)
 
 
 @pytest.fixture(scope="module")
 def traced(room: tuple[Path, Record], tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Lines of sight in the room."""
-    out, known = tmp_path_factory.mktemp("runs") / "traced", {"scene": room[0], "settings": ["depth=0"]}
-    return wrf_mi.train(room[1], "ray-tracing", out=out, **known)
+    out = tmp_path_factory.mktemp("runs") / "traced"
+    return wrf_mi.train(room[1], "ray-tracing", out=out, scene=room[0], settings=["depth=0"])
 
 
 def test_traced_paths_have_statistics_and_solids_are_left_out(traced: Run) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,7 +97,8 @@ def test_intervals_of_few_rows_are_not_too_narrow():
 
 def test_intervals_hold_values_of_groups_that_they_do_not_know():
     """Images of 6 rows in 3 groups: errors of each group have a size of their own, which differs by a factor e."""
-    rng, inside = np.random.default_rng(3), {False: [], True: []}
+    rng = np.random.default_rng(3)
+    inside: dict[bool, list[Any]] = {False: [], True: []}
 
     def draw(groups: int) -> tuple[np.ndarray, np.ndarray]:
         scale = np.repeat(np.exp(rng.normal(0, 1, groups)), 2)[:, None]
@@ -218,7 +220,7 @@ def field(seed: int = 0) -> Record:
     distance = np.linalg.norm(at_m - places[:, None], axis=2)
     observed = -40 - 25 * np.log10(distance) + smooth + rng.normal(0, 2, (2, ROWS))
     receivers = tuple(wrf_mi.Receiver(f"rx{k}", place, np.array([0.0, 0, 0, 1])) for k, place in enumerate(places))
-    known = {"frequencies_hz": np.array([2.4e9]), "official": (np.arange(240), np.arange(240, ROWS))}
+    known: dict[str, Any] = {"frequencies_hz": np.array([2.4e9]), "official": (np.arange(240), np.arange(240, ROWS))}
     return Record("field", "rssi", at_m, receivers, observed.astype(np.float32), **known)
 
 
@@ -232,7 +234,8 @@ def weak_missing(record: Record) -> Record:
 def test_reception_is_calibrated_better_than_both_references_and_changes_no_strength(
     model: str, intervals: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    record, options = weak_missing(field()), {"split": "blocked", "intervals": intervals}
+    record = weak_missing(field())
+    options: dict[str, Any] = {"split": "blocked", "intervals": intervals}
     run = wrf_mi.train(record, model, out=tmp_path / "run", **options)
     block = run.metrics["reception"]
     for reference in block["reference"].values():
@@ -247,9 +250,9 @@ def test_reception_is_calibrated_better_than_both_references_and_changes_no_stre
     assert plain.metrics["abs_error_db"] == run.metrics["abs_error_db"]
 
 
-def without_pairs(of: object) -> object:
+def without_pairs(of: Callable[..., HeldOut]) -> Callable[..., HeldOut]:
     """`HeldOut.of` that states no pairs for the reception."""
-    return lambda kind, *arguments: replace(of(*arguments), every=np.zeros((0, 2), np.int64))  # type: ignore[operator]
+    return lambda kind, *arguments: replace(of(*arguments), every=np.zeros((0, 2), np.int64))
 
 
 def test_reception_is_in_files_and_maps_and_coverage_is_received_and_strong(tmp_path: Path) -> None:

@@ -76,14 +76,14 @@ def fitted_arrays(name: str, record: Record, split: Split, folder: Path) -> Arra
 @pytest.mark.parametrize("name", MODELS)
 def test_test_rows_do_not_reach_the_fit(name: str, one_gateway: Record, flat_folder: Path, tmp_path: Path) -> None:
     init("llvm", threads=1)
-    records = {"spectrum": one_gateway, "rssi": load(flat_folder), "csi": channels()}
-    record = records[TASK.get(name) or (MODELS[name].tasks or ("rssi",))[0]]
+    of_task = {"spectrum": one_gateway, "rssi": load(flat_folder), "csi": channels()}
+    record = of_task[TASK.get(name) or (MODELS[name].tasks or ("rssi",))[0]]
     train, test = record.official
     split, folders = Split("official", 0, train[:-3], train[-3:], test), [tmp_path / "clean", tmp_path / "broken"]
     for folder in folders:
         folder.mkdir()
     records = record, broken(record, test)
-    clean, other = (fitted_arrays(name, *of, split, folder) for *of, folder in zip(records, folders, strict=True))
+    clean, other = (fitted_arrays(name, of, split, folder) for of, folder in zip(records, folders, strict=True))
     assert clean.keys() == other.keys()
     for key in clean.keys() - {"trace_seconds"}:
-        np.testing.assert_array_equal(*map(without_seconds, (clean[key], other[key])), err_msg=key)
+        np.testing.assert_array_equal(without_seconds(clean[key]), without_seconds(other[key]), err_msg=key)

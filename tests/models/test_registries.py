@@ -28,7 +28,7 @@ from wrf_mi.stages.further import FURTHER_STAGES
 from wrf_mi.tasks import LOSSES
 
 pytestmark = pytest.mark.usefixtures("undrawn")
-SETTINGS = ("steps=60", "batch=8", "validate_every=20", "checkpoint_every=20", "initial.gaussians=6")
+SETTINGS: tuple[str, ...] = ("steps=60", "batch=8", "validate_every=20", "checkpoint_every=20", "initial.gaussians=6")
 SETTINGS += ("network.layers=2", "network.width=8", "view.height=4", "view.columns=8", "deterministic=true")
 FIELD_DB = 50.0  # field strength at one metre
 SERVED = {"trees": "rssi", "wrf-gs": "spectrum, rssi and csi", "factorised": "spectrum, rssi and csi"}
@@ -63,7 +63,7 @@ def test_registered_model_is_trained_resumed_evaluated_and_compared(nearest, fla
         train(flat_folder, "nearest", out=out, settings=("neighbours=2",), stop=lambda: True)
     command.refused(["evaluate", out], r"model\.npz: missing, the fit was stopped; finish it with train --resume")
     reported: list[tuple[str, float]] = []
-    run = resume(out, on_progress=lambda stage, share, _: reported.append((stage, share)))
+    run = resume(out, on_progress=lambda stage, share, *_: reported.append((stage, share)))
     assert reported == [("nearest rows", 0.0)]
     assert (run.metrics["model"], run.metrics["rows"]) == ("nearest", 24)
     assert 0 < run.metrics["inside_90"] <= 1
@@ -93,7 +93,7 @@ def test_registered_receiver_is_trained_resumed_evaluated_and_compared(attenuate
     field = open_run(out).field
     field.form = replace(field.form, receiver="power")
     np.testing.assert_allclose(field.predictor(positions, 0), predicted + CABLE_DB, atol=1e-3)
-    assert compare([out], tmp_path / "page")
+    assert compare([out], tmp_path / "page").is_file()
 
 
 @pytest.fixture
@@ -131,11 +131,11 @@ def test_stage_of_another_package_is_trained_resumed_evaluated_and_compared(step
     predicted = open_run(out).predict([[2.0, 3.0, 1.0], [9.0, 5.0, 1.0]], 0)
     np.testing.assert_array_equal(predicted.mean % 4, 0)
     assert predicted.std is not None
-    assert compare([out, without.folder], tmp_path / "page")
+    assert compare([out, without.folder], tmp_path / "page").is_file()
 
 
 @pytest.fixture
-def noted_loss() -> Iterator[list[int]]:
+def noted_loss() -> Iterator[list[tuple[int, ...]]]:
     """A loss of the name ``noted``, the squared error, which notes the shapes that it is called with."""
     shapes = list[tuple[int, ...]]()
 
@@ -149,7 +149,7 @@ def noted_loss() -> Iterator[list[int]]:
 
 
 def test_loss_of_a_name_is_trained_resumed_stored_and_compared(noted_loss, flat_folder: Path, tmp_path: Path) -> None:
-    asked = {"settings": SETTINGS, "loss": "noted"}
+    asked: dict[str, Any] = {"settings": SETTINGS, "loss": "noted"}
     with pytest.raises(Interrupted):
         train(flat_folder, "wrf-gs+", out=tmp_path / "run", **asked, stop=stop_after(2))
     assert noted_loss
@@ -163,7 +163,7 @@ def test_loss_of_a_name_is_trained_resumed_stored_and_compared(noted_loss, flat_
     squared = train(flat_folder, "wrf-gs+", out=tmp_path / "squared", settings=SETTINGS, loss="squared-error")
     assert squared.metrics["abs_error_db"] == whole.metrics["abs_error_db"]
     assert np.isfinite(open_run(run.folder).predict([[1.0, 2.0, 1.3]], 0).mean).all()
-    assert compare([run.folder, other.folder], tmp_path / "page")
+    assert compare([run.folder, other.folder], tmp_path / "page").is_file()
 
 
 def test_unknown_losses_and_models_without_one_are_refused(flat_folder: Path, folder: Path, tmp_path: Path) -> None:

@@ -98,7 +98,8 @@ def test_parallel_prediction_of_a_field_equals_serial(
 def test_parallel_trace_and_its_prediction_equal_serial(flat: Path, room: Path, two: Scheduler, tmp_path: Path) -> None:
     """The number of rays is chosen by the search, which uses all positions."""
     known: dict[str, Any] = {"scene": room, "settings": TraceOptions(depth=1, rays="auto")}
-    serial, lossy = train(flat, "ray-tracing", out=tmp_path / "serial", **known).folder, Lossy(two, tmp_path)
+    serial = train(flat, "ray-tracing", out=tmp_path / "serial", **known).folder
+    lossy: Any = Lossy(two, tmp_path)
     parallel = train(flat, "ray-tracing", out=tmp_path / "parallel", scheduler=lossy, **known).folder
     lossy.assert_one_was_lost()
     for file in ("paths.npz", "predictions.npz", "split.npz"):

@@ -47,8 +47,8 @@ print(json.dumps({
 
 def run(*command: str, cwd: Path, **environment: str) -> str:
     """Runs a command outside the checkout and returns what it printed; a failure shows what it said."""
-    pipes = {"capture_output": True, "text": True, "timeout": SECONDS_PER_CHILD}
-    done = subprocess.run(command, cwd=cwd, env=os.environ | environment, **pipes)
+    environment = os.environ | environment
+    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=SECONDS_PER_CHILD)
     assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 

@@ -1,5 +1,6 @@
 """The emitter: what the shape holds follows the field, gradients flow, and stock integrators see powers."""
 
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -45,9 +46,9 @@ def expected_parameters(model: str, tx: tuple = TX, **changed: np.ndarray) -> di
 
 
 def assert_shape_holds(scene: Any, expected: dict[str, np.ndarray]) -> None:
-    tolerance, params = {"rtol": FLOAT32_TOLERANCE, "atol": FLOAT32_TOLERANCE}, mi.traverse(scene)
+    close, params = partial(np.testing.assert_allclose, rtol=FLOAT32_TOLERANCE), mi.traverse(scene)
     for name, values in expected.items():
-        np.testing.assert_allclose(plain(params[f"gaussians.{name}"]), values, **tolerance)
+        close(plain(params[f"gaussians.{name}"]), values, atol=FLOAT32_TOLERANCE)
 
 
 def ray_through(origin: np.ndarray, direction: np.ndarray) -> Any:
@@ -193,7 +194,7 @@ def test_light_on_a_wall_is_found_without_sampling_the_emitter():
     assert dr.all(weight[0][0][0] == 0)
     count, sampler = 200_000, mi.load_dict(INDEPENDENT)
     sampler.seed(0, count)
-    towards = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(0, 0, -2.9), dr.repeat(mi.Vector3f(0, 0, -1), count)))
+    towards: Any = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(0, 0, -2.9), dr.repeat(mi.Vector3f(0, 0, -1), count)))
     towards.maxt = 1.0
     radiance = plain(scene.integrator().sample(scene, sampler, towards)[0][0][0][0])
     # Reflectance 0.5 of a Lambertian wall: 0.5 / pi times the irradiance.

@@ -80,7 +80,12 @@ def test_perspective_camera():
 def test_traced_hits_are_cached(monkeypatch):
     """New signals trace nothing; new geometry or a new pose does, and the image is as that of a new scene."""
     calls, traced_lists = [], integrator_module.traced_lists
-    monkeypatch.setattr(integrator_module, "traced_lists", lambda *a: calls.append(1) or traced_lists(*a))
+
+    def counted(*arguments):
+        calls.append(1)
+        return traced_lists(*arguments)
+
+    monkeypatch.setattr(integrator_module, "traced_lists", counted)
     scene = scene_of(gaussians_of(any_field(30), "alpha", mi.Float))
     params, first = mi.traverse(scene), mi.render(scene).numpy()
     other = gaussians_of(any_field(30, seed=1), "alpha", mi.Float)

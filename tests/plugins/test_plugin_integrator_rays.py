@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from made_fields import Float64, off_edges
+from made_fields import off_edges
 from traced_fields import RECEIVER, any_field, blended, brute, bundles_of, gaussians_of, pose_of, seen
 from wrf_mi_plugins.acceleration import traced_lists
 from wrf_mi_plugins.blend_rays import Walls, blend_rays
@@ -14,7 +14,7 @@ from wrf_mi_plugins.ray_response import hulls, ray_footprints
 from wrf_mi_plugins.sensor import equirectangular_sphere
 
 from wrf_mi.backend.device import on_device
-from wrf_mi.backend.vectors import Pose
+from wrf_mi.backend.vectors import Float64, Pose
 from wrf_mi.core import pixel_directions, rotation_matrix
 from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.blend import splat
@@ -193,7 +193,7 @@ def test_walls_attenuate_gaussians_behind_them(blending):
     traced = image(brute(gaussians_of(field, blending), pose_of(), bundles_of(directions), walls))
     order, responses, peaks = seen(field, directions.reshape(-1, 3))
     signal, delta = (field[name][order] @ [1, 1j] for name in ("signal", "attenuation"))
-    expected, passed = 0, np.ones(rays, complex)
+    expected, passed = np.zeros(rays, complex), np.ones(rays, complex)
     for i, (g, w) in enumerate(zip(responses, np.where(peaks > distance, factor, 1), strict=True)):
         alpha, product = field["opacity"][order[i], 0] * g, blending == "product"
         expected = expected + (g if product else alpha) * signal[i] * w * passed

@@ -25,7 +25,7 @@ SIONNA_TOLERANCE = 2e-5
 FREQUENCY_HZ = 2.4e9
 PAINT = {"type": "diffuse", "id": "paint"}
 CARRIER = {"type": "wrf_traced", "frequency_hz": FREQUENCY_HZ}
-BRICK = {"type": "twosided", "id": "mat-itu_brick", "bsdf": {"type": "diffuse"}}
+BRICK: dict[str, Any] = {"type": "twosided", "id": "mat-itu_brick", "bsdf": {"type": "diffuse"}}
 ROWS, COLUMNS = np.array([85, 60, 45, 70]), np.array([0, 30, 300, 180])
 UPRIGHT = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """Boresight +x, array's y axis up."""
@@ -61,7 +61,7 @@ def sionna_wall(folder: Path) -> Any:
 
 def scene_at_wall(turn_deg: int = 0, **more: Any) -> Any:
     """Four Gaussians before a sensor, which is turned about its normal; the Gaussians are not."""
-    geometry = {
+    geometry: dict[str, Any] = {
         "scale": np.full((3, 4), 0.05),
         "rotation": np.eye(4)[:, 3:].repeat(4, axis=1),
         "opacity": np.full(4, 0.9),
@@ -167,7 +167,7 @@ def sheet(where: list[float], size: float, name: str) -> dict[str, Any]:
 
 # Mitsuba makes one of two materials that look alike, whatever their ids.
 GREY = {"type": "diffuse", "reflectance": {"type": "spectrum", "value": 0.3}}
-METAL = {"type": "twosided", "id": "mat-itu_metal", "bsdf": GREY}
+METAL: dict[str, Any] = {"type": "twosided", "id": "mat-itu_metal", "bsdf": GREY}
 SHEETS = {
     "brick": BRICK,
     "metal": METAL,
@@ -208,9 +208,9 @@ def test_gaussians_before_walls_are_kept():
     """A sheet behind all Gaussians hides none, and of a scene without walls nothing is left out."""
     field = gaussians_of(any_field(COUNT, 0, 0.1), "alpha")
     for walls in ({}, {"metal": METAL, "far": sheet([60.0, 0, 0], 100.0, METAL["id"])}):
-        images = [rendered(field, power, walls)[0] for power in (0.0, 0.5)]
-        np.testing.assert_array_equal(*images)
-        assert np.abs(images[0]).max() > 0.1
+        exact, bounded = (rendered(field, power, walls)[0] for power in (0.0, 0.5))
+        np.testing.assert_array_equal(exact, bounded)
+        assert np.abs(exact).max() > 0.1
 
 
 @pytest.mark.parametrize("power", [-0.1, 1.0])

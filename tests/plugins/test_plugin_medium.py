@@ -192,7 +192,7 @@ def test_medium_follows_its_emitter(model):
     np.testing.assert_allclose(before, direct((0.4, -0.7, 1.1), weights_of(model)), atol=FLOAT32_TOLERANCE)
     params["transmitter.tx_position"] = mi.Point3f(-2.0, 0.0, 1.0)
     moved = weights_of(model)
-    moved["position"] = moved["position"] + np.float32([[0.5], [0.0], [3.0]])
+    moved["position"] = moved["position"] + np.array([[0.5], [0.0], [3.0]], np.float32)
     params.update({"transmitter.position": to_tensor(moved["position"])})
     after = plain(air.optical_depth(ray))
     np.testing.assert_allclose(after, direct((-2.0, 0.0, 1.0), moved), atol=FLOAT32_TOLERANCE)
@@ -219,7 +219,7 @@ def test_scale_multiplies_depth_and_phase_has_no_effect():
 
 def test_invalid_arrays_are_refused():
     values, column = arrays(), np.arange(COUNT)[:, None]
-    wrong = {
+    wrong: dict[str, dict[str, Any]] = {
         "0 sources": {},
         "2 sources": {**values, "run": "somewhere"},
         "give centers, scales": {"opacity": values["opacity"]},

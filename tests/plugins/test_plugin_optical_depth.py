@@ -7,13 +7,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from made_fields import Float64, device_gaussians
+from made_fields import device_gaussians
 from scipy.integrate import quad
 from scipy.optimize import minimize
 from wrf_mi_plugins.extinction_cells import MARGIN, TIGHT, largest_extinction, make_cells, to_device
 from wrf_mi_plugins.optical_depth import CENTRE_LINE, LEAST_PASSED, attenuators, extinction, on_host, optical_depth
 
 from wrf_mi.backend.device import on_device
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import rotation_matrix
 from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.footprint import CUTOFF
@@ -32,7 +33,7 @@ def random_values(n: int, rng: np.random.Generator, scale_m: tuple[float, float]
     """Gaussians as NumPy arrays, within two metres of the origin."""
     return {
         "position": rng.uniform(-2, 2, (3, n)),
-        "scale": np.exp(rng.uniform(*np.log(scale_m), (3, n))),
+        "scale": np.exp(rng.uniform(np.log(scale_m[0]), np.log(scale_m[1]), (3, n))),
         "rotation": rng.standard_normal((4, n)),
         "opacity": rng.uniform(0.05, 0.95, n),
     }

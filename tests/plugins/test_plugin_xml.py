@@ -200,7 +200,7 @@ def names(one_gateway: Record, tmp_path_factory: pytest.TempPathFactory) -> dict
     (xml,) = blocks(PAGE, "xml")
     (folder / "scene.xml").write_text(xml)
     left: dict[str, Any] = {"scenes": []}
-    logger = mi.logger()
+    logger: Any = mi.logger()  # type: ignore[operator]
     error_level = logger.error_level()
     logger.set_error_level(mi.LogLevel.Warn)
     try:

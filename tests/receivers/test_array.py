@@ -114,5 +114,5 @@ def test_spectrum_scales_with_signals_of_any_size_and_number():
 
 
 def test_mirror_order_of_a_line():
-    assert mirror_order([[0], [1], [2.0]]).tolist() == [2, 1, 0]
-    assert mirror_order([[0], [1], [2.1]]) is None
+    assert mirror_order([[0.0], [1.0], [2.0]]).tolist() == [2, 1, 0]
+    assert mirror_order([[0.0], [1.0], [2.1]]) is None

@@ -1,6 +1,7 @@
 """Coherent and incoherent sums over paths against plain loops."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,7 +71,7 @@ def test_signal_strength_and_power_over_a_wide_band_are_sums_of_powers():
     # Two equal waves in opposite phase cancel at one frequency; over a wide band they are independent.
     wavelength = 0.5
     frequency = speed_of_light / wavelength
-    lengths = {"gain": np.ones(2, complex), "length_m": np.array([10.0, 10.0 + wavelength / 2])}
+    lengths: dict[str, Any] = {"gain": np.ones(2, complex), "length_m": np.array([10.0, 10.0 + wavelength / 2])}
     paths = replace(random_paths(2, n_tx=2, n_rx=1), tx=np.zeros(2, int), **lengths)
     assert received_power(paths)[0, 0] == pytest.approx(2)
     assert np.abs(csi(paths, frequency)[0, 0, 0]) ** 2 == pytest.approx(0, abs=EXACT)

@@ -1,6 +1,7 @@
 """Spectra of paths with uncertain phases: against plain Monte Carlo, in its limits, and row by row."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +40,8 @@ def made_paths(seed: int, n_tx: int = 5, each: int = 6) -> Paths:
 def test_spectra_are_the_mean_over_random_phases(phase_error: float) -> None:
     """Phases are independent and normal, of variance phase_error^2 for each reflection; transmissions add none."""
     paths, copies, rounds = made_paths(seed=1), 512, 2
-    many = replace(paths, **{name: np.concatenate([getattr(paths, name)] * copies) for name in ARRAYS})
+    repeated: dict[str, Any] = {name: np.concatenate([getattr(paths, name)] * copies) for name in ARRAYS}
+    many = replace(paths, **repeated)
     first_tx = np.repeat(paths.n_tx * np.arange(copies), len(paths))
     many = replace(many, tx=many.tx + first_tx, n_tx=copies * paths.n_tx)
     deviation = phase_error * np.sqrt((many.interactions == 1).sum(axis=1))

@@ -9,6 +9,7 @@ from random_paths import paths_of
 from scipy.constants import speed_of_light
 
 from wrf_mi.backend.device import on_device
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.graph.evaluations import learned_field
 from wrf_mi.receivers.device_paths import TracedPaths
 from wrf_mi.receivers.receiver_models import ArrayReceiver, CsiReceiver, PixelReceiver, PowerReceiver
@@ -28,8 +29,6 @@ from wrf_mi.receivers.array import array_response, bartlett_spectrum
 from wrf_mi.receivers.device_paths import Ports, path_sum
 from wrf_mi.receivers.receiver_models import magnitude, power
 from wrf_mi.receivers.reports import minmax_scale
-
-Float64 = dr.float64_array_t(mi.Float)
 
 DOUBLE = 1e-11  # float64, sums of a thousand terms, phases of a hundred radians
 SINGLE = 2e-5  # the same in float32
@@ -114,7 +113,7 @@ def test_slopes_of_reports_are_finite_differences(name: str) -> None:
     """Of the second row alone, in two parts; the reports of spectra are of single precision."""
     model, signal, step = INSTRUMENTS[name], summed(name, paths()[1]), 1e-3
     rng = np.random.default_rng(7)
-    change = rng.normal(size=(1, signal.shape[1])) + 1j * rng.normal(size=(1, signal.shape[1]))
+    change: Any = rng.normal(size=(1, signal.shape[1])) + 1j * rng.normal(size=(1, signal.shape[1]))
     if name == "strength":
         change = change.real.astype(complex)
     above, below = (model.signal_report(signal[1:] + side * step * change) for side in (1, -1))
@@ -194,7 +193,7 @@ def test_power_receiver(how: Any) -> None:
     traced, arrays = paths()
     count = 2 * 45 * 60
     field = dr.full(Float64, 0.3, 2 * count), dr.full(Float64, -0.1, 2 * count)
-    h = [signals(arrays, ORIGIN)[:, 0], 4 * np.pi * (0.3 - 0.1j)]
+    h = signals(arrays, ORIGIN)[:, 0], 4 * np.pi * (0.3 - 0.1j)
     total = np.abs(h[0] + h[1]) ** 2 if how == "coherent" else np.abs(h[0]) ** 2 + np.abs(h[1]) ** 2
     quadrature = 1e-3  # trapezoidal rule over elevations 2 degrees apart: (0.035 rad)^2 / 12 of the integral, in dB
     np.testing.assert_allclose(model(traced, field).numpy(), 10 * np.log10(total), atol=10 * quadrature)

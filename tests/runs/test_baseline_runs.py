@@ -67,7 +67,7 @@ def test_command_trains_as_the_function_does(flat_folder: Path, run: Path, tmp_p
 
 def test_progress_names_the_fold_and_a_stop_in_a_part_the_run_to_resume() -> None:
     stages = list[str]()
-    session = Session(Path("run"), Path("run"), lambda stage, share, _: stages.append(stage), lambda: True)
+    session = Session(Path("run"), Path("run"), lambda stage, *_: stages.append(stage), lambda: True)
     folders = [Path("run/fold0"), Path("run/fold1"), Path("run")]
     for folder in folders:
         with pytest.raises(Interrupted, match=r"--resume run$"):
@@ -95,7 +95,7 @@ def test_resumed_network_is_bit_identical(name: str, two_gateways: Record, tmp_p
     whole = train(record, name, out=tmp_path / "whole", **ends).folder
     told: list[tuple[str, int]] = []
 
-    def on_progress(stage: str, share: float, progress: Progress | None) -> None:
+    def on_progress(stage: str, share: float, progress: Progress | None = None) -> None:
         if progress is not None:
             told.append((stage, progress.step))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from wrf_mi.core import InputError, Split
+from wrf_mi.core.array_files import write_arrays
 from wrf_mi.core.files import write_figure
 from wrf_mi.datasets import save_split
 from wrf_mi.runs import figures
@@ -36,12 +38,12 @@ def make_run(
     truth = np.stack([np.random.default_rng(r).random((*lead, *SHAPE)) for r in rows], axis=len(lead))
     truth = truth.astype(np.float32)
     prediction, blend = (np.clip(truth + s * rng.standard_normal(truth.shape), 0, 1) for s in (noise, 0.3))
-    np.savez(
-        path / "predictions.npz",
+    arrays = {
         **{"row": np.array(rows), "tx_pos": np.zeros((len(rows), 3)), "truth": truth},
         **{"prediction": prediction.astype(np.float32), "reference_idw": blend.astype(np.float32)},
-        receiver_name=[f"gateway{r}" for r in range(receivers or 1)],
-    )
+        "receiver_name": [f"gateway{r}" for r in range(receivers or 1)],
+    }
+    write_arrays(path / "predictions.npz", arrays)
     score, reference = (summary(ssim(values, truth)) for values in (prediction, blend))
     metrics = {
         **{"task": "spectrum", "dataset": "made/room", "model": model, "split": split, "seed": seed},
@@ -49,7 +51,8 @@ def make_run(
         **{"ms_per_sample": 3.25, "train_seconds": 61.5 if trained else 0.0, "peak_memory_mb": 512.0},
     }
     (path / "metrics.json").write_text(json.dumps(metrics))
-    save_split(path / "split.npz", Split(split, seed, *(np.array(part, int) for part in ([1000], [], rows))))
+    train, validation, test = (np.array(part, int) for part in ([1000], [], rows))
+    save_split(path / "split.npz", Split(split, seed, train, validation, test))
     if trained:
         write_log(path)
     return path
@@ -187,9 +190,9 @@ def edit_metrics(**changes):
 
 def edit_arrays(change):
     def edit(run):
-        arrays = arrays_in(run / "predictions.npz")
+        arrays: dict[str, Any] = arrays_in(run / "predictions.npz")
         change(arrays)
-        np.savez(run / "predictions.npz", **arrays)
+        write_arrays(run / "predictions.npz", arrays)
 
     return edit
 

@@ -23,7 +23,7 @@ from test_compare import captured, edit_metrics, make_run
 
 from wrf_mi.apps.commands.main import build_parser
 from wrf_mi.apps.commands.train import training_request
-from wrf_mi.core import Record, Split
+from wrf_mi.core import AntennaOptions, Record, Split
 from wrf_mi.models import Session
 from wrf_mi.runs import figures
 from wrf_mi.runs.api import plan_run, train
@@ -40,7 +40,7 @@ from wrf_mi.runs.compare_tables import (
     first_differences,
     method_rows,
 )
-from wrf_mi.runs.folder import AntennaOptions, RunRequest, read_config, start_run
+from wrf_mi.runs.folder import RunRequest, read_config, start_run
 from wrf_mi.runs.results import Results
 from wrf_mi.runs.run import open_run
 
@@ -68,7 +68,7 @@ def strengths(
     positions_m = np.zeros((len(rows), 3)) if positions_m is None else positions_m
     stated = (Path(path) / name, name, "rssi", "flat", metrics, seed, names)
     split = Split("official", seed, np.array(train, np.int64), np.zeros(0, np.int64), rows)
-    idw = {"idw": truth + idw_db}
+    idw: dict[str, Any] = {"idw": truth + idw_db}
     return Results(*stated, rows, positions_m, prediction, truth, idw, None, None, {}, splits=[split])
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +49,7 @@ GAIN = {"gain", "gain_error", "beaten"}
 
 def record(task: str, receivers: int, subcarriers: int = 3) -> Record:
     rng = np.random.default_rng(5)
-    shape = (receivers, ROWS)
+    shape: tuple[int, ...] = (receivers, ROWS)
     if task == "rssi":
         observation = rng.uniform(-90, -40, shape).astype(np.float32)
         observation[0, [1, 8, 39]] = np.nan
@@ -56,7 +58,7 @@ def record(task: str, receivers: int, subcarriers: int = 3) -> Record:
         shape = (*shape, subcarriers)
         observation = (rng.normal(size=shape) + 1j * rng.normal(size=shape)).astype(np.complex64)
     receiver = [Receiver(f"anchor{r}", rng.normal(size=3), np.array([0.0, 0, 0, 1])) for r in range(receivers)]
-    known = {"official": (np.arange(30), np.arange(30, ROWS)), "folds": np.arange(ROWS) % 4}
+    known: dict[str, Any] = {"official": (np.arange(30), np.arange(30, ROWS)), "folds": np.arange(ROWS) % 4}
     return Record("made-up", task, rng.normal(size=(ROWS, 3)), tuple(receiver), observation, **known)
 
 
@@ -245,7 +247,11 @@ def test_channels_are_predicted_by_zero() -> None:
     np.testing.assert_array_equal(constant_scores(record, split, record.scored[:, split.test])[SCORES], 0)
 
 
-TASK_RECORDS = {"rssi": building, "csi": channels, "spectrum": lambda: spectra(rows=24)[0]}
+TASK_RECORDS: dict[str, Callable[[], Record]] = {
+    "rssi": building,
+    "csi": channels,
+    "spectrum": lambda: spectra(rows=24)[0],
+}
 
 
 @pytest.mark.parametrize("task", TASK_RECORDS)
@@ -339,9 +345,10 @@ def test_verdicts_are_against_the_constant_that_is_best_for_each_score() -> None
 
 def test_the_best_reference_is_compared_with() -> None:
     truth = np.zeros((1, 4), np.float32)
-    references = {"idw": truth + 3, "law": truth + 2}
-    stated = (Path(), "name", "rssi", "data", {}, 0, ("anchor0",), np.arange(4), np.zeros((4, 3)), truth, truth)
-    results = Results(*stated, references, None, None, {})
+    references: dict[str, Any] = {"idw": truth + 3, "law": truth + 2}
+    no_metrics: dict[str, Any] = {}
+    stated = (Path(), "name", "rssi", "data", no_metrics, 0, ("anchor0",), np.arange(4), np.zeros((4, 3)))
+    results = Results(*stated, truth, truth, references, None, None, no_metrics)
     assert results.best_reference == "law"
     np.testing.assert_array_equal(results.reference, references["law"])
     assert results.reference_name == "one path-loss law of all receivers"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from made_fields import Float64
 from matplotlib.figure import Figure
 from wrf_mi_bench import field_oracle
 
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import Receiver, unit_vectors
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.gaussians import Gaussians
@@ -28,9 +28,10 @@ def placed(azimuth_deg: float, elevation_deg: float, distance_m: float) -> Float
 
 def footprints(position_m: FloatArray, scale_m: FloatArray) -> Footprints:
     nothing = [Float64(np.zeros(len(position_m)))]
-    parts = [[Float64(column.copy()) for column in part.T] for part in (position_m, scale_m)]
+    position, scale = ([Float64(column.copy()) for column in part.T] for part in (position_m, scale_m))
+    signal, rotation = nothing * 2, [*nothing * 3, nothing[0] + 1]
     return project(
-        Gaussians(*parts, [*nothing * 3, nothing[0] + 1], nothing * 2, opacity=nothing[0], attenuation=None, batch=1),
+        Gaussians(position, scale, rotation, signal, opacity=nothing[0], attenuation=None, batch=1),
         device_pose(RECEIVER, Float64),
     )
 

@@ -43,7 +43,7 @@ def law() -> Record:
     receivers = tuple(Receiver(f"anchor{k}", place, np.array([0.0, 0, 0, 1])) for k, place in enumerate(places))
     distance = np.linalg.norm(positions_m - places[:, None], axis=2)
     observation = LAW_DBM - 10 * EXPONENT * np.log10(distance) + np.array([-3.0, 1, 2, 9])[:, None]
-    known = {"frequencies_hz": np.array([2.44e9]), "official": (np.arange(40), np.arange(40, 60))}
+    known: dict[str, Any] = {"frequencies_hz": np.array([2.44e9]), "official": (np.arange(40), np.arange(40, 60))}
     return Record("law", "rssi", positions_m, receivers, observation.astype(np.float32), **known)
 
 
@@ -90,7 +90,7 @@ def test_what_new_receivers_observed_changes_no_fit_but_in_rows_left(
     arrays, found = (arrays_in(run.folder / "model.npz") for run in (expected, broken))
     for key in arrays:
         if not key.startswith("run/") and key != CHECKSUM:
-            np.testing.assert_array_equal(*map(without_seconds, (found[key], arrays[key])), err_msg=key)
+            np.testing.assert_array_equal(without_seconds(found[key]), without_seconds(arrays[key]), err_msg=key)
     np.testing.assert_array_equal(read_run(broken.folder).prediction, read_run(expected.folder).prediction)
     assert broken.metrics["reference"] == expected.metrics["reference"]
 
@@ -214,7 +214,7 @@ def test_gaussians_are_seen_from_the_pose_of_a_new_receiver(name: str, law: Reco
 
 def test_offsets_of_receivers_that_heard_nothing() -> None:
     traced = np.array([[-50.0, -60], [-50, -60], [-50, np.nan]])
-    found = fit_offsets(traced, [[-53.0, -63], [np.nan, np.nan], [-59, -80]])
+    found = fit_offsets(traced, [[-53.0, -63], [np.nan, np.nan], [-59.0, -80]])
     np.testing.assert_allclose(found.offset_db, [-3, -6, -9])
     np.testing.assert_allclose(found.floor_dbm, [-63, -80, -80])
     with pytest.raises(InputError, match="receiver 0: no training row is both received and reached"):

@@ -57,7 +57,7 @@ FAULTS: Mapping[str, tuple[tuple[int, ...], Callable[[int], object]]] = {
     "killed": ((), lambda after: failing(Killed(), after)),
     "full disk": ((2,), lambda after: failing(OSError(errno.ENOSPC, "No space left on device", "a.npz"), after)),
     "no permission": ((2,), lambda after: failing(OSError(errno.EACCES, "Permission denied", "a.npz"), after)),
-    "Ctrl-C twice": ((0, 130), lambda after: after in (0, 1) and signal.raise_signal(signal.SIGINT)),
+    "Ctrl-C twice": ((0, 130), lambda after: signal.raise_signal(signal.SIGINT) if after in (0, 1) else None),
 }
 """Exit statuses of faults, and what happens at a change, by its number after the first one with the fault."""
 

@@ -32,7 +32,7 @@ def faded(rows: int = 600, apart_m: float = 0.03) -> Record:
     x_m, rng = np.arange(rows) * apart_m, np.random.default_rng(0)
     place_m = np.stack([x_m, np.zeros(rows), np.ones(rows)], axis=1)
     receivers = tuple(
-        Receiver(name, np.array([x, 30.0, 2.0]), UPRIGHT) for name, x in (("anchor1", 0.0), ("anchor2", 9.0))
+        Receiver(name, np.array([x, 30.0, 2.0]), np.array(UPRIGHT)) for name, x in (("anchor1", 0.0), ("anchor2", 9.0))
     )
     distance_m = np.stack([np.linalg.norm(place_m - receiver.position_m, axis=1) for receiver in receivers])
     power_dbm = -40 - 20 * np.log10(distance_m) + 10 * np.log10(rng.exponential(size=distance_m.shape))
@@ -93,7 +93,9 @@ def test_rows_without_another_one_in_the_window_are_said_in_a_line(tmp_path: Pat
     run = run_of(building(), tmp_path)
     line = "local mean power over 0.1 wavelengths (0.012 m): no test row has another one in its window"
     assert line in command.done(["evaluate", run, "--local-mean", "0.1"])
-    assert local_mean_scores(run, 0.1) == LocalMean(0.1, pytest.approx((0.0123, 0.0123), abs=1e-4))
+    scores = local_mean_scores(run, 0.1)
+    assert scores == LocalMean(0.1, scores.diameter_m)
+    assert scores.diameter_m == pytest.approx((0.0123, 0.0123), abs=1e-4)
 
 
 def test_command_shows_windows_in_turn(tmp_path: Path, command: Command) -> None:

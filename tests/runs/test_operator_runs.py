@@ -173,7 +173,7 @@ def test_changed_geometry_rebuilds_the_operator(what: str, tmp_path: Path) -> No
     after = Operator(field, params, [receiver], size, tmp_path)
     assert after.reports.key(0) != before.reports.key(0)
     expected = predictor(field, params, [receiver], size)(TX)
-    np.testing.assert_allclose(after(0, np.float32(TX)), expected, atol=GREYS)
+    np.testing.assert_allclose(after(0, np.asarray(TX, np.float32)), expected, atol=GREYS)
     # Stored in place of the one before.
     count = params["position"].shape[1]
     assert read_weights(tmp_path / "operator0.npz", after.reports.key(0), (size[0] * size[1], count)) is not None

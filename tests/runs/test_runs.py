@@ -67,7 +67,7 @@ def checkpoint_of(run: Path) -> dict[str, np.ndarray]:
 def whole(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with rounds of density control that nothing interrupts."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    known = {"settings": DETERMINISTIC, "on_progress": lambda *told: keep_checkpoint(out, told[2])}
+    known: dict[str, Any] = {"settings": DETERMINISTIC, "on_progress": lambda *told: keep_checkpoint(out, told[2])}
     return train(folder, "wrf-gs+", out=out, **known).folder
 
 
@@ -85,7 +85,7 @@ def stopped_and_resumed(folder: Path, out: Path, config: TrainConfig, at: int) -
     assert [entry["step"] for entry in log_of(out)] == [s for s in range(5, 41, 5) if s <= at]
     heard: list[int] = []
 
-    def on_progress(stage: str, share: float, progress: Progress) -> None:
+    def on_progress(stage: str, share: float, progress: Progress | None = None) -> None:
         heard.append(progress.step)
         keep_checkpoint(out, progress)
 
@@ -178,7 +178,7 @@ def test_run_stopped_before_its_first_checkpoint_starts_anew(folder: Path, tmp_p
 
 
 def test_run_folder_is_complete(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
-    known = {"settings": settings("steps=10", "seed=3"), "split": "random", "n_train": 0.5}
+    known: dict[str, Any] = {"settings": settings("steps=10", "seed=3"), "split": "random", "n_train": 0.5}
     run = train(folder, "wrf-gs+", out=tmp_path / "run", **known)
     files = {"config.yaml", "log.jsonl", "metrics.json", "model.npz", "predictions.npz", "split.npz"}
     assert contents(run.folder) == files
@@ -299,7 +299,7 @@ def test_rows_beyond_the_record_are_refused(finished: Path, tmp_path: Path, one_
     assert not (tmp_path / "run").exists()
     # A data set that has become shorter since.
     run = copied(finished, tmp_path / "copy")
-    arrays = {"tx_pos_m": one_gateway.tx_pos_m[:20], "observation": one_gateway.observation[:, :20]}
+    arrays: dict[str, Any] = {"tx_pos_m": one_gateway.tx_pos_m[:20], "observation": one_gateway.observation[:, :20]}
     data = write_spectrum_folder(tmp_path / "short", replace(one_gateway, **arrays, official=None, folds=None))
     config = yaml.safe_load((run / "config.yaml").read_text()) | {"dataset": str(data)}
     (run / "config.yaml").write_text(yaml.safe_dump(config))

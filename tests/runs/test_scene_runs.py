@@ -165,7 +165,7 @@ def test_receivers_poses_are_trained_where_a_rate_is_given(fit: Fit, tmp_path: P
 
 def test_run_that_validated_no_step_opens_with_an_infinite_reach(fit: Fit, tmp_path: Path) -> None:
     run = fit(tmp_path / "run", "steps=20", "validate_every=1000", "patience=0", "optimiser.warm_up=5")
-    assert np.isinf(run.fitted.reach.length_m)
+    assert np.isinf(run.field.reach.length_m)
     position = np.array([[1.9, 2.9, 1.5]])
     assert np.isfinite(run.predict(position).mean).all()
     arrays, seconds = read_fitted(run.folder, MODELS["wrf-gs+"].serving("spectrum", True))
@@ -282,7 +282,8 @@ def test_fitted_materials_move_with_their_surfaces(scene: Path, tmp_path: Path) 
     opened = open_scene(scene, CARRIER_HZ[0])
     params = TracedField(opened, TX, UPRIGHT_ARRAY, TracedOptions(materials="surface")).parameters()
     rng = np.random.default_rng(0)
-    params = {k: v + rng.normal(0, 0.5, v.shape) for k, v in params.items() if k.startswith("material")}
+    drawn = {k: v + rng.normal(0, 0.5, v.shape) for k, v in params.items() if k.startswith("material")}
+    params = {name: values.astype(np.float32) for name, values in drawn.items()}
     corrected = write_corrected_scene(tmp_path / "corrected", opened, params, grouping="surface")
     cabinet = Move(("cabinet*",), MOVES[0].shift_m, MOVES[0].turn_deg)
     want = channels(edit_scene(corrected, tmp_path / "want", (cabinet,), remove=("board*",)))

@@ -25,7 +25,7 @@ from wrf_mi.apps.commands.train import TRACING, training_names, training_request
 from wrf_mi.core import InputError
 from wrf_mi.core.digest import content_digest
 from wrf_mi.runs import sweep as module
-from wrf_mi.runs.folder import RunRequest
+from wrf_mi.runs.folder import RunRequest, package_versions
 from wrf_mi.runs.results import read_run
 from wrf_mi.runs.sweep import FLAGS, OPTIONS, Sweep, check_failures, plan_sweep, run_sweep, scene_files, sweep_table
 
@@ -94,9 +94,10 @@ def option_value(action: argparse.Action) -> list[str]:
     return [known.get(action.dest) or (str(list(action.choices)[-1]) if action.choices else "9")]
 
 
+SWEEP: Any = dict(vars(build_parser()._subparsers._group_actions[0])["choices"])["sweep"]
 ACTIONS = [
     action
-    for action in build_parser()._subparsers._group_actions[0].choices["sweep"]._actions  # type: ignore[union-attr]
+    for action in SWEEP._actions
     if action.option_strings and action.dest not in ("help", "json", "vary", "out", "scheduler")
 ]
 """Options of sweep that each run has."""
@@ -195,7 +196,7 @@ def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
     folder: Path, swept: Path, tmp_path: Path, command: Command
 ) -> None:
     """The command on two workers, one of which is killed while it trains."""
-    out, killed = tmp_path / "sweep", []
+    out, killed = tmp_path / "sweep", list[int]()
 
     def kill_one() -> None:
         until = time.monotonic() + SECONDS
@@ -267,7 +268,7 @@ def test_sweep_refuses_other_data_and_versions(folder: Path, tmp_path: Path, mon
     with pytest.raises(InputError, match=rf"holds a sweep with other content of {data}; choose another --out"):
         again()
     (data / "gateway_info.yml").write_bytes(original)
-    versions = module.package_versions()
+    versions = package_versions()
     monkeypatch.setattr(module, "package_versions", lambda: versions | {"drjit": "0.1"})
     with pytest.raises(InputError, match="holds a sweep by other versions of drjit; choose another --out"):
         again()

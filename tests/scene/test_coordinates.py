@@ -110,8 +110,8 @@ def test_files_that_look_y_up_make_no_scene_until_it_is_stated(tmp_path, capsys,
 def test_a_room_whose_floor_would_be_missing_is_refused(tmp_path):
     """Two upright sides and nothing across them, until y is up: its size tells nothing."""
     room = box((6.0, 4.0, 5.0), (1.0, 1.0, 0.5))
-    open_side = room.submesh([np.abs(room.face_normals[:, 1]) < 0.5], append=True)
-    y_up(open_side).export(tmp_path / "room.ply")
+    room.update_faces(np.abs(room.face_normals[:, 1]) < 0.5)
+    y_up(room).export(tmp_path / "room.ply")
     with pytest.raises(InputError, match=r"has no floor with z up, and one with y up; .*--up y, or --up z"):
         make_scene(tmp_path / "room.ply", tmp_path / "scene")
     made = make_scene(tmp_path / "room.ply", tmp_path / "scene", up="y")
@@ -210,7 +210,7 @@ def test_a_plan_in_a_national_grid_is_moved_with_its_positions(tmp_path):
     places += GRID[:2] - LOCAL[:2]
     for name, xy in (("right.csv", places), ("mirrored.csv", places * (1, -1) + (0, 2 * 15.72))):
         (tmp_path / name).write_text("x,y\n" + "\n".join(f"{x:.2f},{y:.2f}" for x, y in xy) + "\n")
-    options = {"height_m": 2.5, "origin_m": LOCAL, "floor_m": LOCAL[2]}
+    options: dict[str, Any] = {"height_m": 2.5, "origin_m": LOCAL, "floor_m": LOCAL[2]}
     made = make_scene(tmp_path / "layout.csv", tmp_path / "scene", positions=tmp_path / "right.csv", **options)
     low = np.append(GRID[:2] - LOCAL[:2], 0)
     np.testing.assert_allclose(extent(made.folder), [low, low + np.array([6, 4, 2.5])], atol=ROUNDING_M)

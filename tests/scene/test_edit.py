@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,10 +87,10 @@ def test_other_parts_and_all_materials_stay(scene, tmp_path):
     # About their common middle: half a turn leaves the box of two parts where it was, and their distance.
     names = ("piece_02", "piece_12")
     edited = edit_scene(scene, tmp_path / "turned", [Move(names, turn_deg=180)])
-    before, after = ([one for one in read_surfaces(f)[0] if one.name in names] for f in (scene, edited))
-    np.testing.assert_allclose(box_of(after), box_of(before), atol=SINGLE_M)
-    centres = [np.stack([box_of([one]).mean(axis=0) for one in found]) for found in (before, after)]
-    turned_m = 2 * box_of(before).mean(axis=0) - centres[0]
+    still, turned = ([one for one in read_surfaces(f)[0] if one.name in names] for f in (scene, edited))
+    np.testing.assert_allclose(box_of(turned), box_of(still), atol=SINGLE_M)
+    centres = [np.stack([box_of([one]).mean(axis=0) for one in found]) for found in (still, turned)]
+    turned_m = 2 * box_of(still).mean(axis=0) - centres[0]
     np.testing.assert_allclose(centres[1][:, :2], turned_m[:, :2], atol=SINGLE_M)
     low, high = random_room(103).parts[CABINET][1].bounds
     assert parts_within(scene, low - 1e-3, high + 1e-3) == (CABINET,)
@@ -122,6 +123,7 @@ def test_command_lists_moves_and_needs_a_folder(scene, tmp_path, capsys):
     moved = ["edit", scene, "--move", f"{CABINET},piece_06:-0.1,0,0,5", "--out", tmp_path / "e"]
     assert call(moved, capsys)[0] == 0
     assert (tmp_path / "e" / "preview.png").exists()
+    shift: Any
     for shift in ((0.0, 0.0), (np.inf, 0.0, 0.0)):
         with pytest.raises(InputError, match="three finite numbers"):
             replace(Move((CABINET,)), shift_m=shift)
@@ -192,7 +194,7 @@ def box_faces(size: tuple[float, float, float], turn: float, base: tuple[float, 
     return [*sides, high]
 
 
-def surface(name: str, corners: np.ndarray, kind: str = "other") -> Surface:
+def surface(name: str, corners: np.ndarray, kind: Kind = "other") -> Surface:
     return Surface(name, kind, corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 

@@ -169,7 +169,7 @@ def test_a_scan_becomes_a_folder_in_a_registered_frame(tmp_path):
     assert made.materials.of("wall_01", "wall") == "itu_brick"
     assert made.materials.thickness_m["itu_brick"] == 0.12
     scene = open_scene(made.folder, FREQUENCY_HZ).mi_scene
-    np.testing.assert_allclose(bounds(scene), [[6, 20, 1], [10, 25, 3.8]], atol=0.01)
+    np.testing.assert_allclose(bounds(scene), [[6.0, 20, 1], [10, 25, 3.8]], atol=0.01)
     read_materials(made.folder)  # a folder stands for its file
 
 
@@ -182,7 +182,7 @@ def test_a_mesh_and_a_layout_become_folders(tmp_path):
     layout = make_scene(tmp_path / "layout.csv", tmp_path / "layout", height_m=2.5, floor_m=1.0)
     assert mesh.counts == layout.counts == {"surfaces": 6, "faces": 12}
     scene = open_scene(layout.folder, FREQUENCY_HZ).mi_scene
-    np.testing.assert_allclose(bounds(scene), [[0, 0, 1], [5, 4, 3.5]], atol=1e-6)
+    np.testing.assert_allclose(bounds(scene), [[0.0, 0, 1], [5, 4, 3.5]], atol=1e-6)
     assert number_names(["wall", "floor", "wall"]) == ["wall_01", "floor", "wall_02"]
 
 
@@ -246,9 +246,9 @@ def cloud(n=5):
 
 
 def one_path():
-    end = {"tx": np.array([0]), "rx": np.array([0]), "n_tx": 1, "n_rx": 1}
-    way = dict.fromkeys(("departure", "arrival"), np.array([[1.0, 0, 0]]))
-    met = {"interactions": np.array([[1, 0]], np.uint8), "objects": np.array([[0, -1]], np.int32)}
+    end: dict[str, Any] = {"tx": np.array([0]), "rx": np.array([0]), "n_tx": 1, "n_rx": 1}
+    way: dict[str, Any] = dict.fromkeys(("departure", "arrival"), np.array([[1.0, 0, 0]]))
+    met: dict[str, Any] = {"interactions": np.array([[1, 0]], np.uint8), "objects": np.array([[0, -1]], np.int32)}
     vertices_m = np.array([[[3.0, 0.0, 1.0], [np.nan] * 3]])
     gain, length_m = np.array([1e-3 + 0j]), np.array([5.0])
     return Paths(gain=gain, length_m=length_m, vertices_m=vertices_m, object_names=("wall",), **end, **way, **met)

@@ -11,6 +11,7 @@ from changed_folders import DATA, needs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_plans import L_ROOM_M, TWO_ROOMS_M, box, grid_of, turn
+from made_rooms import joined
 from scipy.spatial.transform import Rotation
 
 from wrf_mi.core import InputError
@@ -91,9 +92,9 @@ def test_layouts_that_are_mirrored_or_in_another_frame_are_refused(axis, about, 
     positions = write_positions(tmp_path / "places.csv", walk(ROUTE_M[3:]))
     make_scene(layout, tmp_path / "scene", height_m=2.5, positions=positions)
     elsewhere = write_positions(tmp_path / "elsewhere.csv", walk(ROUTE_M) + 50.0)
-    mirrored = OFFICE_M.copy()
-    mirrored[:, axis] = 2 * about - mirrored[:, axis]
-    mirrored = write_positions(tmp_path / "mirrored.csv", mirrored)
+    mirrored_m = OFFICE_M.copy()
+    mirrored_m[:, axis] = 2 * about - mirrored_m[:, axis]
+    mirrored = write_positions(tmp_path / "mirrored.csv", mirrored_m)
     for plan, places, message in (
         (mirrored, positions, rf"mirrored it is 0 and 0: {remedy}$"),
         (layout, elsewhere, "check the registration and the frame of the positions"),
@@ -105,8 +106,8 @@ def test_layouts_that_are_mirrored_or_in_another_frame_are_refused(axis, about, 
 def test_a_door_lets_pass_at_its_height_and_the_wall_above_it_does_not():
     """A wall of three dimensions across a walk, open below 2 m between y = 1 and y = 2."""
     door = ((0, 0), (1, 2.5)), ((2, 0), (4, 2.5)), ((1, 2), (2, 2.5))
-    parts = [trimesh.creation.box(bounds=[[3, *low], [3.1, *high]]) for low, high in door]
-    mesh = trimesh.util.concatenate(parts)
+    parts = [trimesh.creation.box(bounds=[[3.0, *low], [3.1, *high]]) for low, high in door]
+    mesh = joined(parts)
     wall = Surface("wall", "wall", np.asarray(mesh.vertices), np.asarray(mesh.faces))
     x = np.arange(0.2, 6, 0.25)
     for y, z, expected in ((1.5, np.nan, 0), (1.5, 1.2, 0), (1.5, 2.2, 1), (3.0, np.nan, 1)):

@@ -65,7 +65,7 @@ class Shift(Stage):
     name = "shift"
 
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
-        return [Option(f"{by:g} dB", lambda state, split, session, by=by: replace(state, mean=by)) for by in (5.0, 0.0)]
+        return [Option(f"{by:g} dB", lambda state, *_, by=by: replace(state, mean=by)) for by in (5.0, 0.0)]
 
 
 def record_of(rows: int) -> Record:

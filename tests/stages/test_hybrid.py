@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,7 +69,8 @@ def test_hybrid_mixes_models_from_positions_and_from_the_uplink(tmp_path: Path, 
 
 def test_held_out_observations_are_limited_by_their_size(one_gateway: Record):
     rows = np.arange(1000)
-    many = Record("many", "spectrum", np.random.default_rng(0).random((1000, 3)), one_gateway.receivers, np.zeros(0))
+    places, nothing = np.random.default_rng(0).random((1000, 3)), np.zeros(0, np.float32)
+    many = Record("many", "spectrum", places, one_gateway.receivers, nothing)
     fold = Split("fold", 0, rows[500:], rows[:0], rows[:500])
     for shape, most in (((), 500), ((20, 20), 200), ((50,), 400)):
         record = replace(many, observation=np.zeros((1, 1000, *shape), np.float32))
@@ -107,6 +109,6 @@ def test_a_carrier_between_others_is_predicted_with_intervals(bands: Record, tmp
     run = wrf_mi.train(bands, out=tmp_path / "run", split="frequency-known:2")
     assert run.metrics["abs_error_db"]["median"] < 0.5  # positions are known at the other carriers
     assert 0.5 < run.metrics["inside_90"] <= 1
-    asked = {"tx_pos_m": bands.tx_pos_m[:3], "receiver": 0, "carriers_hz": np.full(3, 2.4e9)}
+    asked: dict[str, Any] = {"tx_pos_m": bands.tx_pos_m[:3], "receiver": 0, "carriers_hz": np.full(3, 2.4e9)}
     again = wrf_mi.open_run(run.folder, bands)
     assert again.predict(**asked).mean == pytest.approx(run.predict(**asked).mean)

@@ -72,6 +72,10 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {"true": write_xml(folder / "true", SHOEBOX), "thought": write_xml(folder / "thought", thought)}
 
 
+def parts_of(run: Any) -> Any:
+    return run.fitted.parts
+
+
 def measured(scenes: dict[str, Path], task: str, train: int = 30) -> tuple[Record, Split]:
     """Observations traced by Sionna RT in the true room, and a split with test rows on one side."""
     near, far = ([1.7, 2.6, 1.4], [2.1, 3.0, 1.5]) if task == "csi" else ([1.2, 2.0, 1.2], [4.5, 3.8, 1.9])
@@ -79,8 +83,8 @@ def measured(scenes: dict[str, Path], task: str, train: int = 30) -> tuple[Recor
     tx = tx[np.argsort(tx[:, 0])]
     array = planar_array(4, 4, 0.16) if task == "spectrum" else None
     receiver = Receiver("rx0", np.array([5.2, 2.4, 1.1]), np.asarray(UPRIGHT), array_m=array)
-    unknown = np.zeros((1, len(tx), *SHAPES[task]), np.complex64 if task == "csi" else np.float32)
-    hz = HZ + 1e6 * np.arange(6) if task == "csi" else np.array([HZ])
+    unknown: Any = np.zeros((1, len(tx), *SHAPES[task]), np.complex64 if task == "csi" else np.float32)
+    hz = HZ + 1e6 * np.arange(6.0) if task == "csi" else np.array([HZ])
     record = Record("room", task, tx, (receiver,), unknown, frequencies_hz=hz)
     paths = trace_paths(open_scene(scenes["true"], HZ), tx, (receiver,), TRACE).paths
     record = replace(record, observation=instrument_of(record).observe(paths).astype(unknown.dtype))
@@ -133,7 +137,7 @@ def test_fit_in_a_scene_is_restored_with_its_sides(spectra: tuple[wrf_mi.Run, Re
     scene = run.folder / "parts" / "paths" / "scene"
     assert (scene / "correction.md").exists()
     # Training alone could find the materials in the stated scene, too.
-    assert all(opened.fitted.parts["paths"].problem.scene == str(scene) for opened in (run, again))
+    assert all(parts_of(opened)["paths"].problem.scene == str(scene) for opened in (run, again))
 
 
 @pytest.mark.parametrize(
@@ -158,17 +162,18 @@ def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(
     record, split = measured(scenes, task, 16 if task == "spectrum" else 48)
     record = replace(record, official=(split.train, split.test))
     data, out = str(write(tmp_path / "room", record)), tmp_path / "stopped"
-    how = {"scene": scenes["thought"], "settings": settings, "deterministic": True}
+    how: dict[str, Any] = {"scene": scenes["thought"], "settings": settings, "deterministic": True}
     uninterrupted = wrf_mi.train(data, out=tmp_path / "whole", **how)
     sitting = partial(wrf_mi.train, data, out=out, **how)
     for begin, end in stopped_in:
-        reports = [("", 0.0)]
+        stages = [""]
+
+        def stop(stages: list[str] = stages, begin: str = begin, end: str = end) -> bool:
+            return stages[-1].startswith(begin) and stages[-1].endswith(end)
+
         with pytest.raises(Interrupted):
-            sitting(
-                on_progress=lambda *report, reports=reports: reports.append(report[:2]),
-                stop=lambda reports=reports: reports[-1][0].startswith(begin) and reports[-1][0].endswith(end),  # noqa: B023
-            )
-        assert reports[-1][0].startswith(begin)
+            sitting(on_progress=lambda stage, *_, stages=stages: stages.append(stage), stop=stop)
+        assert stages[-1].startswith(begin)
         sitting = partial(wrf_mi.resume, out)
     position = record.tx_pos_m[:6]
     np.testing.assert_array_equal(sitting().predict(position).mean, uninterrupted.predict(position).mean)
@@ -217,7 +222,7 @@ def test_first_stage_of_a_training_that_went_further_is_continued_with_all_rows(
 def test_reports_of_held_out_rows_are_those_of_a_fit_without_them() -> None:
     rows, report = np.array([7, 3, 5]), np.arange(3.0)
     reports = HeldOutReports(np.array([0, 0, 1]), rows, report)
-    graph = SimpleNamespace(receivers=None, uses_heading=None, carriers_hz=None, held_out=reports)
+    graph: Any = SimpleNamespace(receivers=None, uses_heading=None, carriers_hz=None, held_out=reports)
     side = paths.FittedPaths(graph, None)
     assert side.predict_rows(np.array([3, 7]), 0) is None, "a fit to all rows has other predictions"
     side.reports = reports
@@ -285,7 +290,7 @@ def test_rows_that_are_too_few_to_judge_train_all_the_same(scenes, tmp_path, mon
     settings = ("stages=mean,calibration", "steps=20")
     run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=settings)
     assert taken(run)[-1] == ("paths", "paths", "trained")
-    assert run.fitted.parts["paths"].fitted.params
+    assert parts_of(run)["paths"].fitted.params
 
 
 def test_regions_alone_judge_a_scene_that_rows_near_by_correct(scenes, tmp_path, monkeypatch) -> None:
@@ -322,7 +327,7 @@ def test_scene_as_stated_is_kept_where_a_training_in_it_is_better(scenes, tmp_pa
     run = wrf_mi.train(record, out=tmp_path / "run", scene=stated, split=split, settings=settings)
     again = assert_restored(run, record)
     assert taken(run) == [("paths", "scene", "calibrated"), ("paths", "paths", best[1])]
-    assert all(opened.fitted.parts["paths"].problem.scene == stated for opened in (run, again))
+    assert all(parts_of(opened)["paths"].problem.scene == stated for opened in (run, again))
     assert not (run.folder / "parts" / "paths" / "scene").exists()
     reports = {report["stage"]: report for report in run.metrics["stages"]}
     assert list(reports) == ["mean", "calibration", "correction", "surfaces"]

@@ -52,7 +52,7 @@ def made(kind: str, seed: int = 0, headings: bool = False, noise_db: float = NOI
 
 def fit(record: Record, folder: Path, *settings: str) -> Strengths:
     entry = MODELS["kriging"].serving("rssi", False)
-    stated = {text.partition("=")[0] for text in settings}
+    stated = frozenset(text.partition("=")[0] for text in settings)
     problem = Problem(record, default_settings(entry, settings, {}), stated=stated)
     split = Split("official", 0, record.official[0], np.zeros(0, np.int64), record.official[1])
     with threadpool_limits(1, "blas"):  # as in runs
@@ -127,9 +127,9 @@ def test_receivers_without_rows_have_the_mean_terms_alone(tmp_path: Path) -> Non
 
 def test_trees_stand_about_the_power_of_an_edited_scene(tmp_path: Path) -> None:
     record = made("walls")
-    axes = [np.array([-1.0, 17.0])] * 2 + [np.array([0.0, 3.0])]
+    x, z = np.array([-1.0, 17.0]), np.array([0.0, 3.0])
     settings = default_settings(MODELS["kriging"].serving("rssi", False), ("shadowing=trees",), {})
-    power = PowerMap(*axes, np.full((3, 2, 2, 2), -60.0))
+    power = PowerMap(x, x, z, np.full((3, 2, 2, 2), -60.0))
     fitted = fit_strengths(record, record.official[0], power, settings)
     field = copy(fitted.field)
     # A screen at the first receiver: its power is 7 dB lower, by the fitted factor of traced decibels.

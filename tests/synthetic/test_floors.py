@@ -1,13 +1,14 @@
 """Receivers and walking users on synthetic floors: stored once, right at each antenna and carrier, noisy as stated."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from changed_folders import refusal
+from made_rooms import joined
 from scipy.constants import speed_of_light
 from scipy.spatial import cKDTree
 from spectrum_records import assert_same
@@ -189,12 +190,13 @@ def test_record_has_the_stated_shapes_and_splits(walked: Record) -> None:
         assert {len(split.all_train) for split in make_splits(walked, rule, n_train=5)} == {5}
 
 
+def rows_of(reported: Any) -> Callable[[Any, int], Any]:
+    return lambda rows, receiver: reported[receiver, rows]
+
+
 def test_scores_compare_with_the_channel_without_noise(walked: Record) -> None:
     (split,) = make_splits(walked, "official")
-    exact, noisy = (
-        evaluate(walked, split, lambda rows, receiver, reported=reported: reported[receiver, rows])[0]
-        for reported in (walked.truth, walked.observation)
-    )
+    exact, noisy = (evaluate(walked, split, rows_of(reported))[0] for reported in (walked.truth, walked.observation))
     assert exact["cea_db"]["median"] > 100
     # At one antenna, which may receive less than the mean over them.
     assert WALK.snr_db - 6 < noisy["cea_db"]["median"] < WALK.snr_db + 3
@@ -270,7 +272,9 @@ def crossed(scene: Any, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     import mitsuba as mi
 
     origin, way = mi.Point3f(start.T.astype(np.float32)), mi.Vector3f((end - start).T.astype(np.float32))
-    return np.array(scene.mi_scene.ray_test(mi.Ray3f(origin, way, 1.0, 0.0, [])))
+    ray: Any = mi.Ray3f(origin, way)
+    ray.maxt = 1.0
+    return np.array(scene.mi_scene.ray_test(ray))
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -278,7 +282,7 @@ def test_users_walk_in_the_open_and_through_doors(place: str, tmp_path: Path) ->
     plan, walk, rng = PLACES[place](), Walk(), np.random.default_rng(0)
     write_scene(tmp_path, plan.parts, "test")
     scene = open_scene(tmp_path, WALK_HZ)
-    mesh = trimesh.util.concatenate([mesh for _, mesh in plan.parts.values()])
+    mesh = joined([mesh for _, mesh in plan.parts.values()])
     tree = cKDTree(sample_surface(mesh, int(mesh.area / 1e-3), seed=1)[0])
     for route in plan.routes:
         way = users_way(route, walk, rng)

@@ -86,7 +86,7 @@ def test_scattered_waves_come_from_their_last_point(bare: Any) -> None:
     assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()  # vertices are float32
 
 
-SIZE = {"carriers_hz": (0.9e9, 5.8e9), "rows": 2, "columns": 3, "height": 9, "width": 36}
+SIZE: dict[str, Any] = {"carriers_hz": (0.9e9, 5.8e9), "rows": 2, "columns": 3, "height": 9, "width": 36}
 SMALL_BANDS = furnished.RoomBands(**SIZE, train=4, test=2, rays=1 << 10, scattered_rays=1 << 8, depth=2, reflections=1)
 POSITIONS = np.array([[2.0, 3.0, 1.2], [4.5, 1.0, 1.7], [3.0, 5.2, 1.0], [7.6, 6.0, 1.3]])
 SINGLE = 1e-4

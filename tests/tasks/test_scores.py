@@ -43,8 +43,8 @@ def test_idw_equals_values_by_hand():
     assert twice == pytest.approx([3, 2, 3, 4], rel=EXACT)
     # Distances from the first position: 0, 1, 3 and far away; one metre is added to each.
     weights = np.array([1, 1 / 2, 1 / 4]) ** 2
-    expected = [weights @ [1, 2, 3] / weights.sum()]
-    assert blend(SQUARE, [1.0, 2, 3, 4], SQUARE[:1], 3, softening_m=1) == pytest.approx(expected, rel=EXACT)
+    expected = weights @ [1, 2, 3] / weights.sum()
+    assert blend(SQUARE, [1.0, 2, 3, 4], SQUARE[:1], 3, softening_m=1) == pytest.approx([expected], rel=EXACT)
     # Distances far below one do not overflow.
     tiny = blend(SQUARE * 1e-100, [1.0, 2, 3, 4], [[0.5e-100, 0, 0]], 2, power=4)
     assert tiny == pytest.approx([1.5], rel=EXACT)
@@ -181,7 +181,7 @@ def test_level_of_a_spectrum_is_the_mean_power_over_the_solid_angle() -> None:
 @needs("rfid-lab")
 def test_published_figures_of_the_authors_split_and_the_blocked_split():
     record = load(DATA / "rfid-lab")
-    scores = {}
+    scores: dict[str, list[np.ndarray]] = {}
     for name in ("official", "blocked"):
         for split in make_splits(record, name):
             known, rows, spectra = split.all_train, split.test, record.observation[0]

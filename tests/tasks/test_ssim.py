@@ -11,12 +11,11 @@ from PIL import Image
 from skimage.metrics import structural_similarity
 
 from wrf_mi.backend.device import on_device, to_float
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import InputError
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.losses import spectrum_loss, ssim
 from wrf_mi.tasks.spectrum import SCORED_TOGETHER
-
-Float64 = dr.float64_array_t(mi.Float)
 
 LARGEST = 1e15  # largest pixel whose fourth power does not overflow float32
 SINGLE = 1e-5  # required of the float32 form on every image
@@ -99,7 +98,8 @@ def test_equals_scikit_image_on_real_spectra():
 
 
 def loss_of(prediction, truth, eta=0.2):
-    loss, _ = spectrum_loss(Float64(prediction.ravel()), Float64(truth.ravel()), *prediction.shape, eta)
+    batch, height, width = prediction.shape
+    loss, _ = spectrum_loss(Float64(prediction.ravel()), Float64(truth.ravel()), batch, height, width, eta)
     return loss[0]
 
 
@@ -111,7 +111,7 @@ def test_gradient_equals_finite_differences(shape, eta):
     prediction, truth = rng.random(shape), rng.random(shape)
     variable = Float64(prediction.ravel())
     dr.enable_grad(variable)
-    loss, _ = spectrum_loss(variable, Float64(truth.ravel()), *shape, eta)
+    loss, _ = spectrum_loss(variable, Float64(truth.ravel()), *(*shape, eta))
     dr.backward(loss)
     expected = np.zeros(shape)
     for index in np.ndindex(shape):

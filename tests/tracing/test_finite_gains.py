@@ -7,17 +7,20 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from double_precision import Tensor64
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from traced_rooms import FREQUENCY_HZ, HEIGHT, LENGTH, PARTITION, SHOEBOX, THICKNESS_M, WIDTH, receiver, write_xml
 
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import InputError
 from wrf_mi.core.antenna import ANTENNA
 from wrf_mi.scene.materials import SINGLE_MAX
@@ -33,8 +36,6 @@ from wrf_mi.tracing.sionna.materials import CONSTANTS, itu_constants
 from wrf_mi.tracing.sionna.path_solver import SHORT, Devices, apart
 from wrf_mi.tracing.slabs import slab
 
-Float64 = dr.float64_array_t(mi.Float)
-Tensor64 = dr.tensor_t(Float64)
 ROUNDING = {mi.Float: 1e-5, Float64: 1e-12}  # of a power: some ten operations on numbers of about 1
 SINGLE = 2e-4  # of coefficients in single precision: the phase across up to three wavelengths
 
@@ -110,7 +111,7 @@ def building(tmp_path_factory):
     """The shoebox with a partition and a solid block; its floor has a triangle whose corners are in a line."""
     block = trimesh.creation.box((1, 1, 1))
     block.apply_translation((1.5, 3.5, 0.5))
-    corners = [[0, 0, 0], [LENGTH, 0, 0], [LENGTH, WIDTH, 0], [0, WIDTH, 0], [LENGTH / 2, WIDTH / 2, 0]]
+    corners = [[0.0, 0, 0], [LENGTH, 0, 0], [LENGTH, WIDTH, 0], [0, WIDTH, 0], [LENGTH / 2, WIDTH / 2, 0]]
     # As a triangulation of an outline with a corner in line: the sliver lies on the diagonal of the floor.
     floor = trimesh.Trimesh(corners, [[0, 1, 2], [0, 4, 3], [4, 2, 3], [0, 2, 4]], process=False)
     parts = {**SHOEBOX, **PARTITION, "block": ("itu_concrete", block), "floor": ("itu_concrete", floor)}
@@ -187,9 +188,9 @@ def test_short_legs_become_longer_and_keep_all_directions(building, gaps_m, seed
     direction = (target - source) / np.linalg.norm(target - source)
     vertices = source + np.cumsum([rng.uniform(0, 4e-3), *gaps_m])[:, None] * direction
     types = np.full((1, len(vertices)), TRANSMISSION, np.uint8)
-    met = types, np.zeros(types.shape, np.int64), vertices[None], np.ones(types.shape, np.float32), {}
-    ends = tuple(Devices(end[None], (ANTENNA.mounted(),)) for end in (source, target))
-    moved = apart(PathInteractions(np.zeros(1, int), np.zeros(1, int), *met), surfaces, ends)
+    met: Any = types, np.zeros(types.shape, np.int64), vertices[None], np.ones(types.shape, np.float32), {}
+    begin, end = (Devices(place[None], (ANTENNA.mounted(),)) for place in (source, target))
+    moved = apart(PathInteractions(np.zeros(1, int), np.zeros(1, int), *met), surfaces, (begin, end))
     legs = np.diff(np.concatenate([source[None], moved.vertices_m[0], target[None]]).astype(np.float32), axis=0)
     length = np.linalg.norm(legs, axis=1)
     assert length.min() > 0.99 * SHORT * surfaces.scale_m
@@ -273,7 +274,7 @@ FEW_RAYS = {
     "scattering": TraceOptions(depth=2, scattering=True, scattering_coefficient=0.4, rays=1 << 5),
 }
 MATERIALS, TRANSMITTERS, RECEIVERS = 4, 4, 40
-BRIEF = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+BRIEF: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 
 
 @st.composite
@@ -315,7 +316,7 @@ def buildings(draw):
     materials = draw(st.permutations(names))[:MATERIALS]
     chosen = [*materials, *(draw(st.sampled_from(materials)) for _ in range(len(meshes) - MATERIALS))]
     # One part of each material: kernels are compiled anew for another number of parts or of materials.
-    of_material = {name: [] for name in materials}
+    of_material: dict[str, list[trimesh.Trimesh]] = {name: [] for name in materials}
     for mesh, name in zip(meshes, chosen, strict=True):
         of_material[name].append(mesh)
     parts = {f"of_{name}": (name, trimesh.util.concatenate(same)) for name, same in of_material.items()}

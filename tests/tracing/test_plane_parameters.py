@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from box_room import CEILING, FREQUENCY_HZ, HEIGHT, LENGTH, PARTITION, WALLS, WIDTH, receiver, room, transmitters
+from double_precision import Tensor64
 from small_fits import stop_after
 from wrf_mi_scenes.build_laboratory import sheet
 
@@ -22,9 +22,6 @@ from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.training.config import calibration_config
 from wrf_mi.training.trainer import Trainer
-
-Float64 = dr.float64_array_t(mi.Float)
-Tensor64 = dr.tensor_t(Float64)
 
 OPTIONS = TraceOptions(depth=2, transmission=True, rays=4096)
 FILE_M = 1e-6  # Corners of mesh files are float32: 5e-7 m at 6 m, and as much again after a reflection

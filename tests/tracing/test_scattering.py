@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ SCATTERED = replace(REFLECTED, scattering=True)
 DENSE = replace(SCATTERED, rays=1 << 17)
 METAL = {"relative_permittivity": 1.0, "conductivity": 1e7}
 CONCRETE = {"relative_permittivity": 5.24, "conductivity": 0.1, "thickness": 0.2}
-PATTERNS = {
+PATTERNS: dict[str, Any] = {
     "lambertian": {"scattering_pattern": "lambertian"},
     "directive": {"scattering_pattern": "directive", "alpha_r": 5},
     "backscattering": {"scattering_pattern": "backscattering", "alpha_r": 4, "alpha_i": 9, "lambda_": 0.6},

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ SLOW = settings(max_examples=10, deadline=None)  # A trace of some twenty positi
 
 def rooms(material, turned_rad=0.0, pieces=8):
     """Two closed rooms of sheets that only touch: the wall between them, in pieces, stands on the floor of both."""
-    size, sheets = (LONG, WIDE, HIGH), {}
+    size, sheets = (LONG, WIDE, HIGH), dict[str, trimesh.Trimesh]()
     for axis, (low, high) in enumerate((("west", "east"), ("south", "north"), ("floor", "ceiling"))):
         extents = [(0.0, size[k]) for k in range(3) if k != axis]
         sheets |= {low: sheet(axis, 0.0, *extents), high: sheet(axis, size[axis], *extents)}
@@ -107,7 +108,11 @@ def test_wave_is_blocked_by_a_seam_and_by_a_free_edge(tmp_path):
 
     assert not passes(room(tmp_path / "both", both), [0.5, 2.65, 1.25], [3.5, 1.35, 1.25])
     board = room(tmp_path / "one", wall)
-    edges = ([2, 1, 2.5], [0, 0, 2e-3]), ([2, 2, 1], [0, 2e-3, 0]), ([2, 2, 2.5], [0, 2e-3, 0])
+    edges: tuple[tuple[Any, Any], ...] = (
+        ([2, 1, 2.5], [0, 0, 2e-3]),
+        ([2, 2, 1], [0, 2e-3, 0]),
+        ([2, 2, 2.5], [0, 2e-3, 0]),
+    )
     for (at, beyond), away in product(edges, ([1.5, 0.0, 0.0], [1.5, 0.5, 0.25], [1.5, -0.3, 0.7])):
         source, target = np.subtract(at, away), np.add(at, away)
         assert not passes(board, source, target), (at, away)
@@ -245,8 +250,8 @@ def test_paths_at_junctions_are_those_of_the_other_direction(tmp_path, name):
     assert len(there) == len(back) >= least
     for unit in (there.departure, there.arrival):
         np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1, atol=EXACT_M)
-    passed = [np.sort((paths.interactions == TRANSMISSION).sum(axis=1)) for paths in (there, back)]
-    np.testing.assert_array_equal(*passed)
+    passed, passed_back = (np.sort((paths.interactions == TRANSMISSION).sum(axis=1)) for paths in (there, back))
+    np.testing.assert_array_equal(passed, passed_back)
     if "cross" in name:
         assert passed[0].tolist() == [2]
     assert power_db(there) == pytest.approx(power_db(back), abs=SLOPE_DB)

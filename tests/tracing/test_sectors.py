@@ -4,10 +4,10 @@ from dataclasses import replace
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from box_room import FREQUENCY_HZ, THICKNESS_M, receiver, transmitters
+from double_precision import Tensor64
 from wrf_mi_bench.sionna_reference import sionna_paths
 
 from wrf_mi.backend.device import Recorded
@@ -54,7 +54,7 @@ def test_power_of_sectors_is_that_of_sionna_rt(shoebox_xml, record):
     power_db, expected = RayTracer(shoebox_xml, instrument_of(record), OPTIONS)(record.tx_pos_m[:4]), []
     for sector, (azimuth, downtilt, hz) in zip(record.receivers, SECTORS.values(), strict=True):
         scene, turn_rad = open_scene(shoebox_xml, hz), np.radians([azimuth, downtilt, 0])
-        to = sector.position_m, OPTIONS, "V", "tr38901", turn_rad
+        to: Any = sector.position_m, OPTIONS, "V", "tr38901", turn_rad
         row, gain, *_ = sionna_paths(scene, record.tx_pos_m[:4], *to)
         expected.append(10 * np.log10(np.bincount(row, np.square(np.abs(gain)))))
     np.testing.assert_allclose(power_db, expected, atol=POWER_DB)
@@ -113,7 +113,6 @@ def test_carriers_of_receivers_are_checked(shoebox_xml, record):
         MODEL.check(Problem(low, TracingSettings(), 0, str(shoebox_xml)), [])
 
 
-Tensor64 = dr.tensor_t(dr.float64_array_t(mi.Float))
 LOW_HZ, MIDDLE_HZ, HIGH_HZ = CARRIERS_HZ = 1.2e9, 2.4e9, 5.8e9
 FIELD_OPTIONS = TraceOptions(depth=2, transmission=True, rays=4096)
 FIELD = TracedOptions(FIELD_OPTIONS)
@@ -210,7 +209,6 @@ AGREE = 1e-4  # of the strongest path: Sionna RT in single precision, angles of 
 SLOPE = 1e-5  # Relative: central differences in float64
 OF_PATTERNS = TraceOptions(depth=2, rays=4096)
 TURN_DEG = (30, 50, -70)
-Tensor: Any = dr.tensor_t(Float64)
 
 
 @pytest.fixture(scope="module")
@@ -263,7 +261,7 @@ def test_gains_are_those_of_sionna_rts_solver(box, patterns):
     pose = replace(receiver(), orientation_xyzw=boresight_orientation(0.7, 0.2), antenna=patterns[0])
     options, [tx_m] = replace(OF_PATTERNS, rays=30_000, transmission=False), transmitters(1)
     paths = trace_paths(box, tx_m, pose, options).paths
-    turned = {"pattern": "measured", "turn_rad": (0.7, 0.2, 0)}
+    turned: dict[str, Any] = {"pattern": "measured", "turn_rad": (0.7, 0.2, 0)}
     _, expected, length_m, _ = sionna_paths(box, tx_m, pose.position_m, options, **turned)
     of_length, of_expected = np.argsort(paths.length_m), np.argsort(length_m)
     np.testing.assert_allclose(paths.gain[of_length], expected[of_expected], atol=AGREE * np.abs(expected).max())
@@ -294,9 +292,9 @@ def test_gains_follow_turns_of_the_receiver(box, patterns):
         re, im = field({"receiver.array.turn": turn}).gain
         return dr.sum(weights * (re + 2 * im))
 
-    turn = Tensor([0.01, -0.02, 0.03])
+    turn = Tensor64([0.01, -0.02, 0.03])
     dr.enable_grad(turn)
     dr.backward(total(turn))
     for axis in range(3):
-        up, down = (float(total(Tensor(turn.numpy() + sign * 1e-5 * np.eye(3)[axis]))[0]) for sign in (1, -1))
+        up, down = (float(total(Tensor64(turn.numpy() + sign * 1e-5 * np.eye(3)[axis]))[0]) for sign in (1, -1))
         assert turn.grad.numpy()[axis] == pytest.approx((up - down) / 2e-5, rel=SLOPE)

@@ -5,10 +5,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from box_room import CEILING, FREQUENCY_HZ, HEIGHT, LENGTH, WALLS, WIDTH, receiver, room, transmitters
+from double_precision import Tensor64
 from traced_rooms import write_xml
 from wrf_mi_scenes.build_laboratory import sheet
 
 import wrf_mi
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import Receiver, Record
 from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.tracing import RayTracer, TraceOptions
@@ -16,7 +18,6 @@ from wrf_mi.tracing.options import DISC, FACTOR
 from wrf_mi.tracing.paths.surface_gaussians import NEAREST, SIZE, Interactions, SurfaceGaussians
 from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 
-Tensor64 = dr.tensor_t(dr.float64_array_t(mi.Float))
 SPACING_M = 0.5
 UP, EAST = np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
 FLOAT32 = 1e-6  # Relative; centres are stored in single precision
@@ -112,7 +113,7 @@ def test_zero_factors_leave_paths_unchanged_and_batches_agree(scene):
 def test_derivatives_agree_with_finite_differences(scene):
     side, rng = traced(scene), np.random.default_rng(2)
     start, direction = rng.normal(0, 0.3, (2, 2, len(covered(side))))
-    weights = [dr.float64_array_t(mi.Float)(rng.normal(0, 1e6, len(gain(side, {})))) for _ in range(2)]
+    weights = [Float64(rng.normal(0, 1e6, len(gain(side, {})))) for _ in range(2)]
 
     def value(factor):
         re, im = side({FACTOR: factor}).gain

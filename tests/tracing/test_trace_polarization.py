@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def array(turn_deg, antenna):
 
 
 def record(receiver, tx, spectra):
-    ends = {"official": np.split(np.arange(len(tx)), 2), "frequencies_hz": np.array([HZ])}
+    ends: dict[str, Any] = {"official": np.split(np.arange(len(tx)), 2), "frequencies_hz": np.array([HZ])}
     return Record("turned", "spectrum", tx, (receiver,), spectra[None], **ends).with_array(ARRAY_M)
 
 

@@ -60,7 +60,7 @@ def test_array_of_an_earlier_version_is_not_read(traced, tmp_path):
 def test_settings_of_every_model_with_a_scene_state_the_same_search():
     """One name and one meaning of depth, reflections, transmission and rays."""
     for kind, transmission in product((TracedConfig, CorrectionOptions, PathSettings, TracingSettings), (True, False)):
-        stated = {"depth": 2, "reflections": 1, "transmission": transmission, "rays": 64}
+        stated: dict[str, Any] = {"depth": 2, "reflections": 1, "transmission": transmission, "rays": 64}
         assert kind(**stated).options == TraceOptions(**stated), kind
 
 

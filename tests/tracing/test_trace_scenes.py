@@ -23,7 +23,7 @@ from wrf_mi.scene.coordinates import Y_UP
 from wrf_mi.scene.edit import Move, edit_scene
 from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import read_materials
-from wrf_mi.scene.mesh.surfaces import Surface
+from wrf_mi.scene.mesh.surfaces import Kind, Surface
 from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tracing import RayTracer, TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.search.devices import before_surfaces, check_devices, clear_m
@@ -44,7 +44,8 @@ def test_name_opens_an_embedded_scene():
 
 
 def test_scene_folder_has_the_materials_of_its_file(tmp_path):
-    kinds, meshes = {"floor": "floor", "west": "wall"}, {name: mesh for name, (_, mesh) in SHOEBOX.items()}
+    kinds: dict[str, Kind] = {"floor": "floor", "west": "wall"}
+    meshes = {name: mesh for name, (_, mesh) in SHOEBOX.items()}
     parts = [Surface(n, k, np.asarray(meshes[n].vertices), np.asarray(meshes[n].faces)) for n, k in kinds.items()]
     folder = write_scene(tmp_path / "scene", parts, frame="a room", source="made here")
     assert open_scene(folder, FREQUENCY_HZ).objects["west"].radio_material.name == "itu_plasterboard"

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -191,7 +192,12 @@ def test_kinds_that_are_off_are_not_searched(shoebox, empty, monkeypatch):
 def test_rays_are_shot_once_for_a_geometry(shoebox, divided, monkeypatch):
     """Another trace of equal surfaces shoots none; another receiver, seed or geometry does; memory is bounded."""
     shots, shoot = [], search_module._shoot
-    monkeypatch.setattr(search_module, "_shoot", lambda *given: shots.append(given) or shoot(*given))
+
+    def counted(*arguments):
+        shots.append(arguments)
+        return shoot(*arguments)
+
+    monkeypatch.setattr(search_module, "_shoot", counted)
     tx, rx = inside(3), receiver([1.3, 0.8, 1.2])
 
     def shot(scene, at=rx, seed=11):
@@ -265,7 +271,12 @@ def test_wrong_arguments_are_refused(empty):
     for tx, rx in (([[0.0, 0, 1]], []), (np.zeros((0, 3)), [receiver([0, 0, 0])])):
         with pytest.raises(InputError, match="give one at least"):
             trace_paths(empty, tx, rx)
-    wrong_values = {"depth": (-1, 99), "reflections": (-1,), "rays": (0, "many"), "seed": (-1,)}
+    wrong_values: dict[str, tuple[Any, ...]] = {
+        "depth": (-1, 99),
+        "reflections": (-1,),
+        "rays": (0, "many"),
+        "seed": (-1,),
+    }
     for name, values in (wrong_values | {"scattering_coefficient": (-0.1, 1.1)}).items():
         for value in values:
             with pytest.raises(InputError, match=name):

@@ -219,7 +219,7 @@ def test_mitsuba_and_sionna_rt_open_the_laboratory():
     import mitsuba as mi
 
     info = scenes()["laboratory"]
-    meshes = {path.stem: trimesh.load(path) for path in (info.folder / "meshes").glob("*.ply")}
+    meshes = {path.stem: trimesh.load_mesh(path) for path in (info.folder / "meshes").glob("*.ply")}
     plain = mi.load_file(str(info.xml), optimize=False)  # else it merges shapes
     sionna = open_scene(info.xml, FREQUENCY_HZ, info.thickness_m)
     assert {shape.id().removeprefix("mesh-") for shape in plain.shapes()} == set(meshes) == set(sionna.objects)

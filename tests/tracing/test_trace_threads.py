@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Barrier, Event, local
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,7 +75,8 @@ def test_correction_ends_with_its_block_in_every_thread():
 
     def passed(_):
         """TE through a sheet at grazing incidence, where the differences of Sionna RT's coefficients vanish."""
-        sheet = mi.Float(1e-7), mi.Complex2f(6.31, -0.0026), mi.Float(1e-9), mi.Float(0.125)
+        complex_type: Any = mi.Complex2f
+        sheet = mi.Float(1e-7), complex_type(6.31, -0.0026), mi.Float(1e-9), mi.Float(0.125)
         return float(abs(radio_material.itu_coefficients_single_layer_slab(*sheet)[2])[0])
 
     def both(_):

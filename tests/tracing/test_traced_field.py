@@ -1,12 +1,14 @@
 """Traced fields against Sionna RT: gains, lengths, derivatives, moved receivers, repeated searches."""
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from box_room import CEILING, FREQUENCY_HZ, THICKNESS_M, receiver, room, transmitters
+from double_precision import Tensor64
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.constants import epsilon_0, speed_of_light
@@ -14,6 +16,7 @@ from scipy.special import sph_harm_y
 from sionna.rt.utils import itu_coefficients_single_layer_slab
 
 from wrf_mi.backend.device import to_uint
+from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import Antenna, InputError
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.paths.instrument_parameters import pattern_factor, receiver_pose
@@ -22,9 +25,6 @@ from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.search.surfaces import scene_surfaces
 from wrf_mi.tracing.sionna.path_solver import field_of, to_buffer
 from wrf_mi.tracing.slabs import slab
-
-Float64 = dr.float64_array_t(mi.Float)
-Tensor64 = dr.tensor_t(Float64)
 
 SINGLE = 2e-6  # Of the strongest path: Sionna RT's gains in single precision, four interactions deep
 DOUBLE = 1e-12
@@ -115,8 +115,9 @@ def coefficients(slab):
 def test_slab_is_that_of_sionna_rt(cosine):
     """Of single precision, and its phase over a slab of two wavelengths."""
     permittivity, conductivity, thickness_m = [3.0, 6.0, 1.001], [1e-6, 0.3, 1e7], [0.02, 0.4, 0.1]
-    ours = slab(*map(Float64, (cosine, permittivity, conductivity, thickness_m)), FREQUENCY_HZ)
-    eta = mi.Complex2f(mi.Float(permittivity), -mi.Float(conductivity) / (2 * np.pi * FREQUENCY_HZ * epsilon_0))
+    ours = slab(*(*map(Float64, (cosine, permittivity, conductivity, thickness_m)), FREQUENCY_HZ))
+    complex_type: Any = mi.Complex2f
+    eta = complex_type(mi.Float(permittivity), -mi.Float(conductivity) / (2 * np.pi * FREQUENCY_HZ * epsilon_0))
     wavelength = mi.Float(speed_of_light / FREQUENCY_HZ)
     theirs = itu_coefficients_single_layer_slab(mi.Float(cosine), eta, mi.Float(thickness_m), wavelength)
     for coefficient, expected in zip(coefficients(ours), theirs, strict=True):
@@ -129,8 +130,10 @@ def test_slab_of_single_precision_is_that_of_double_down_to_grazing_incidence():
     low, high = [0.01, 1.001, -6, 0.005], [1, 9, 1, 0.3]
     cosine, permittivity, log_conductivity, thickness_m = rng.uniform(low, high, (9999, 4)).T.astype(np.float32)
     values = cosine, permittivity, 10**log_conductivity, thickness_m
-    slabs = (slab(*map(kind, values), kind(2.4e9)) for kind in (mi.Float, Float64))
-    np.testing.assert_allclose(*([np.array(c) for c in coefficients(each)] for each in slabs), atol=2e-4, rtol=0)
+    types: tuple[Any, ...] = mi.Float, Float64
+    slabs = (slab(*map(kind, (*values, 2.4e9))) for kind in types)
+    single, double = ([np.array(c) for c in coefficients(each)] for each in slabs)
+    np.testing.assert_allclose(single, double, atol=2e-4, rtol=0)
 
 
 @pytest.mark.gradcheck

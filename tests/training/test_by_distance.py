@@ -157,7 +157,7 @@ def test_reach_of_zero_and_infinity_give_weights_zero_and_one():
 def test_held_out_groups_keep_training_rows(train, validation, seed):
     rng = np.random.default_rng(seed)
     parts = np.split(rng.permutation(train + validation + 5), [train, train + validation])
-    split = Split("own", seed, *(np.sort(part) for part in parts))
+    split = Split("own", seed, np.sort(parts[0]), np.sort(parts[1]), np.sort(parts[2]))
     position = rng.normal(size=(train + validation + 5, 3))
     held, again = hold_out_groups(split, position), hold_out_groups(split, position)
     assert len(held.train) >= max(1, train / 2)
@@ -194,7 +194,7 @@ def test_reach_whose_gain_is_within_its_standard_error_is_not_chosen():
     for gain, chosen in ((0, 0), (1, np.inf)):
         score = partial(lambda gain, r, weight: (noise + gain) * weight, gain)
         assert choose_reach(Reach(ORIGIN, np.inf), [0.0, np.inf], held, score, True)[0] == chosen
-    reach, scores = choose_reach(Reach(ORIGIN, 2.0), [0.0, 1.0], [np.zeros((0, 3))], lambda r, w: w, True)
+    reach, scores = choose_reach(Reach(ORIGIN, 2.0), [0.0, 1.0], [np.zeros((0, 3))], lambda r, w: w.astype(float), True)
     assert (reach, len(scores)) == (2.0, 0)  # without held-out rows it is kept
 
 
@@ -206,7 +206,8 @@ def channels(channel, position):
 def of_gaussians(record, *settings):
     """A short fit without paths to the first 45 of 60 rows."""
     config = with_settings(default_config("csi"), [*SMALL, *settings])
-    trainer = Trainer(record, Split("own", 0, *np.split(np.arange(60), [40, 45])), config)
+    train, validation, test = np.split(np.arange(60), [40, 45])
+    trainer = Trainer(record, Split("own", 0, train, validation, test), config)
     trainer.run()
     return trainer
 
@@ -223,9 +224,10 @@ def test_channels_of_random_phase_are_predicted_as_zero():
 
 def beside_paths(folder, record, *ends):
     """A short fit of Gaussians beside the paths of a room; its training, validation and test rows end there."""
-    scene, parts = open_scene(write_xml(folder, SHOEBOX), 9e8), np.split(np.arange(len(record)), ends)
+    scene = open_scene(write_xml(folder, SHOEBOX), 9e8)
+    train, validation, test = np.split(np.arange(len(record)), ends)
     config = with_settings(default_config("csi", True), [*SMALL, "steps=20", "traced.depth=1", "traced.rays=4096"])
-    trainer = Trainer(record, Split("own", 0, *parts), config, scene=scene)
+    trainer = Trainer(record, Split("own", 0, train, validation, test), config, scene=scene)
     trainer.run()
     return trainer
 

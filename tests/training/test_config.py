@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import asdict
 from operator import attrgetter
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from wrf_mi.training.fields import make_field
 
 
 def leaves(values, prefix=""):
-    flat = {}
+    flat: dict[str, Any] = {}
     for key, value in values.items():
         flat |= leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat

@@ -1,6 +1,7 @@
 """WRF-GS, WRF-GS+ and factorised fields for signal strengths and channels: against the operator, round trips."""
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +14,8 @@ from wrf_mi.core.angles import solid_angles
 from wrf_mi.core.settings import with_settings
 from wrf_mi.estimators.model import inputs_of
 from wrf_mi.estimators.networks import nerf2
-from wrf_mi.estimators.networks.nerf2 import Nerf2Settings, Networks
+from wrf_mi.estimators.networks.nerf2 import Nerf2Settings
+from wrf_mi.estimators.networks.nerf2_march import Networks
 from wrf_mi.gaussians import FIELDS
 from wrf_mi.gaussians.parameters import by_component
 from wrf_mi.gaussians.tiles import perception_plane
@@ -246,7 +248,8 @@ STOPPING = ("steps=160", "validate_every=10", "patience=2", "deterministic=true"
 def test_early_stopping_resumes_from_the_best_state(holdout_steps_fraction):
     """Scores are given: the third of eight is the best, and after two worse ones no more are waited for."""
     record, fraction = strengths(), f"holdout_steps_fraction={holdout_steps_fraction}"
-    scores, steps, kept = iter([5.0, 4.0, 3.0, 6.0, 6.0, 2.0, 2.0, 2.0]), {True: [], False: []}, {}
+    scores, kept = iter([5.0, 4.0, 3.0, 6.0, 6.0, 2.0, 2.0, 2.0]), dict[str, Any]()
+    steps: dict[bool, list[int]] = {True: [], False: []}
     trainer = Trainer(record, halves(record), config(record, *STOPPING, fraction))
     trainer.validate = lambda: next(scores)  # type: ignore[method-assign]
     trainer.validation_facts = dict  # type: ignore[method-assign]  # those of scores that are not made

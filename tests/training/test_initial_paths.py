@@ -45,7 +45,8 @@ def test_gaussians_start_at_sources_of_paths(traced):
 
 
 def test_field_starts_with_signals_of_paths(traced):
-    start = start_from(*traced, 20)
+    paths, tx = traced
+    start = start_from(paths, tx, 20)
     weights = WrfGsPlus(layers=2, width=8, skip=1).init(start, np.random.default_rng(0))
     assert weights["opacity"].shape == (1, 20)
     assert np.array_equal(weights["signal"][0] + 1j * weights["signal"][1], start.signals.astype(np.complex64))
@@ -72,7 +73,7 @@ def test_gaussians_on_a_mesh_are_distributed_by_area(tmp_path):
 
 def test_gaussians_start_from_the_source_in_the_settings(tmp_path):
     scene, tx, hz = str(write_xml(tmp_path, SHOEBOX)), inside(40), np.array([FREQUENCY_HZ])
-    record = Record("room", "spectrum", tx, (STATION,), np.zeros((1, 40, 2, 4)), frequencies_hz=hz)
+    record = Record("room", "spectrum", tx, (STATION,), np.zeros((1, 40, 2, 4), np.float32), frequencies_hz=hz)
     rows = np.flatnonzero(tx[:, 0] < LENGTH / 2)
 
     def start(record=record, count=40, **source):

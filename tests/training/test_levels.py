@@ -45,7 +45,7 @@ def strengths(kind: str) -> Record:
 
 def channels(kind: str) -> Record:
     """Channels of a direct wave over a region of half a wavelength; the last fifth of 60 rows is the test set."""
-    hz, rng = 300e6 + 1e6 * np.arange(2), np.random.default_rng(0)
+    hz, rng = 300e6 + 1e6 * np.arange(2.0), np.random.default_rng(0)
     tx_m = rng.uniform([-0.25, -0.25, 1.5], [0.25, 0.25, 2.0], (60, 3))
     length = np.linalg.norm(tx_m, axis=1)[:, None]
     observed = CHANNELS[kind] * np.exp(-2j * np.pi * hz / speed_of_light * length) / length

@@ -35,7 +35,7 @@ OF_FIELD = (
     *("batch=4", "initial.gaussians=60", "density.every=0", "network.width=64", "validate_every=1000"),
     *("optimiser.network=3e-3", "optimiser.warm_up=20", "optimiser.ema_decay=0.95"),
 )
-OF_NERF2 = (
+OF_NERF2: tuple[str, ...] = (
     "steps=400",
     "batch=8",
     "rays=324",

@@ -1,6 +1,7 @@
 """Rows of several carriers in one graph: ports of a receiver, each at its carrier."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from traced_rooms import write_xml
 import wrf_mi
 from wrf_mi.core import Record, Split
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.settings import with_settings
 from wrf_mi.graph.graph import Graph
 from wrf_mi.graph.settings import TracedConfig
 from wrf_mi.receivers.instruments import Instrument
@@ -18,7 +20,7 @@ from wrf_mi.receivers.registry import ObservationSpec
 from wrf_mi.tasks.conditions import scene_carrier
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.tracer import RayTracer
-from wrf_mi.training.config import calibration_config, with_settings
+from wrf_mi.training.config import calibration_config
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.trainer import Trainer
 
@@ -60,7 +62,7 @@ def graph_of(xml, form, field=None, receivers=None, **config):
     return Graph(field, receivers or (array(),), form, scene, replace(CONFIG, **config))
 
 
-MIDDLE = ObservationSpec("array", SIZE, [CARRIERS_HZ[1]])
+MIDDLE = ObservationSpec("array", SIZE, np.array([CARRIERS_HZ[1]]))
 PORTS = ObservationSpec("array", SIZE, carriers_hz=np.array(CARRIERS_HZ))
 
 
@@ -72,7 +74,7 @@ def test_ports_report_what_a_graph_of_each_carrier_reports(model, tolerance, xml
     predict = Predictor(graph_of(xml, form, receivers=receivers), {})
     found = [predict(transmitters(12), number, carriers_hz=rows) for number in range(2)]
     for hz in np.unique(rows):
-        single = replace(form, frequencies_hz=[hz], carriers_hz=None)
+        single = replace(form, frequencies_hz=np.array([hz]), carriers_hz=None)
         alone = Predictor(graph_of(xml, single, receivers=receivers), {})
         for number in range(2):
             expected = alone(transmitters(12)[rows == hz], number)
@@ -95,8 +97,8 @@ def test_gaussians_count_in_each_draw_of_the_paths_phases(xml):
     field, params = true_field("wrf-gs+")
     graph = graph_of(xml, MIDDLE, field)
     for count in (1, 5):
-        reports = [Predictor(graph, params, phase_error=sd)(transmitters(count), 0) for sd in (0.0, 1e-9)]
-        np.testing.assert_allclose(*reports, rtol=0, atol=10 * SINGLE)
+        certain, drawn = (Predictor(graph, params, phase_error=sd)(transmitters(count), 0) for sd in (0.0, 1e-9))
+        np.testing.assert_allclose(certain, drawn, rtol=0, atol=10 * SINGLE)
 
 
 def test_reports_from_one_search_are_those_of_a_search_for_each_carrier(xml):
@@ -145,7 +147,7 @@ def test_strengths_at_ports_are_those_of_the_tracer(xml):
 def test_a_field_of_several_carriers_is_trained_and_restored(scene, xml, tmp_path):
     """With and without paths; a carrier without training rows is predicted, and predictions depend on the carrier."""
     record, settings = spectra(xml), (*QUICK, "steps=16", *("traced.rays=4096", "traced.depth=2") * scene)
-    how = {"scene": str(xml) if scene else None, "split": "frequency-known:1", "settings": settings}
+    how: dict[str, Any] = {"scene": str(xml) if scene else None, "split": "frequency-known:1", "settings": settings}
     run = wrf_mi.train(record, "wrf-gs+", out=tmp_path / "run", **how)
     again, positions = wrf_mi.open_run(run.folder, record), np.tile(record.tx_pos_m[:2], (2, 1))
     at = np.repeat([CARRIERS_HZ[0], CARRIERS_HZ[1]], 2)
@@ -174,7 +176,7 @@ def test_paths_are_calibrated_at_several_carriers(xml, tmp_path):
     stated = write_xml(tmp_path / "stated", {name: ("itu_wood", mesh) for name, (_, mesh) in parts.items()})
 
     def trained(name, *settings):
-        how = {"scene": str(stated), "split": "frequency:1"}
+        how: dict[str, Any] = {"scene": str(stated), "split": "frequency:1"}
         common = ("depth=2", "rays=4096", "transmission=true", *settings)
         return wrf_mi.train(record, "ray-tracing", out=tmp_path / name, settings=common, **how)
 
@@ -191,7 +193,8 @@ def test_single_predictions_are_those_of_a_batch(model, tolerance, xml):
     alone = np.concatenate([predict(tx[k : k + 1], 0) for k in range(12)])
     assert np.abs(alone - paths_alone(tx, 0)).max() > 0.01  # the Gaussians tell
     np.testing.assert_allclose(alone, predict(tx, 0), rtol=0, atol=tolerance)
-    recordings = predict.evaluate.recordings.items()
+    evaluate: Any = predict.evaluate
+    recordings = evaluate.recordings.items()
     assert any(name[0] == "both" and each.frozen.n_recordings for (name, _), each in recordings)
 
 
@@ -203,7 +206,8 @@ def test_phases_are_uncertain_where_walls_are_off(off_m, certain, xml, tmp_path)
     at_high = {"tx_pos_m": record.tx_pos_m[rows], "observation": record.observation[:, rows], "carriers_hz": None}
     record = replace(record, frequencies_hz=np.array([CARRIERS_HZ[2]]), **at_high)
     moved = {n: (kind, mesh.copy().apply_translation([off_m, -off_m, off_m])) for n, (kind, mesh) in parts.items()}
-    split = Split("own", 0, *np.split(np.arange(60), [50, 55]))
+    train, validation, test = np.split(np.arange(60), [50, 55])
+    split = Split("own", 0, train, validation, test)
     settings = "traced.rays=4096", "traced.depth=2", "traced.reflections=2", "steps=40", "validate_every=10"
     config = with_settings(calibration_config(["gain", "surface"], record.task.settings_of_paths), settings)
     trainer = Trainer(record, split, config, scene=open_scene(write_xml(tmp_path, moved), CARRIERS_HZ[2]))

@@ -3,6 +3,7 @@
 import gc
 import re
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import hypothesis
@@ -34,7 +35,7 @@ FLOAT32_TOLERANCE = 1e-4
 
 @pytest.mark.parametrize("model", FIELDS)
 def test_loss_falls_and_similarity_rises(model, one_gateway):
-    received = []
+    received = list[Any]()
     split, own = official(one_gateway), ("steps=120", "holdout_steps_fraction=0.5", "validate_every=40")
     trainer = Trainer(one_gateway, split, settings(*own, model=model))
     assert trainer.run(received.append)
@@ -62,7 +63,7 @@ def rounds(every, stop, growth, *own):
 
 
 def test_density_rounds_within_a_run(one_gateway):
-    received = []
+    received = list[Any]()
     trainer = trainer_of(one_gateway, "steps=100", *rounds(10, 0.4, 0.5, "density.max_gaussians=20"))
     trainer.run(received.append)
     # 8, 12, 18, then no more than 20; unseen Gaussians may have been removed meanwhile.
@@ -193,7 +194,8 @@ def test_device_arrays_do_not_share_memory_with_numpy():
 
 def test_field_initial_values_and_loss_can_be_replaced(one_gateway):
     """A model, starting values and a loss of one's own."""
-    start, calls, received = random_gaussians(RECEIVERS[:1], 8, np.random.default_rng(0), size_deg=20.0), [], []
+    start = random_gaussians(RECEIVERS[:1], 8, np.random.default_rng(0), size_deg=20.0)
+    calls, received = [], list[Any]()
 
     def squares(prediction, truth, batch, height, width):
         calls.append((batch, height, width))
@@ -211,7 +213,7 @@ def test_field_initial_values_and_loss_can_be_replaced(one_gateway):
 
 def test_loss_of_a_step_is_that_of_its_batch(two_gateways):
     """On the batch's rows at the batch's receiver, before the step; with 8, 12 and 18 Gaussians too."""
-    growth, received, expected = rounds(3, 0.7, 0.5, "density.max_gaussians=18"), [], []
+    growth, received, expected = rounds(3, 0.7, 0.5, "density.max_gaussians=18"), list[Any](), []
     trainer = trainer_of(two_gateways, "steps=10", "batch=3", "log_every=1", *growth)
     for rows, r in zip(trainer.schedule.rows, trainer.schedule.receiver.tolist(), strict=True):
         predict = Predictor.of_field(trainer.field, trainer.state.params(), two_gateways.receivers, *SIZE)
@@ -350,7 +352,8 @@ def test_predictions_are_recorded_once(one_gateway):
     assert trainer.predictor() is predictor
     after = predictor(one_gateway.tx_pos_m[:3])
     assert np.abs(after - before).max() > 0
-    recorded = predictor.evaluate.recordings.values()
+    evaluate: Any = predictor.evaluate
+    recorded = evaluate.recordings.values()
     assert 1 <= sum(one.frozen.n_recordings for one in recorded) <= 2  # new ones for other memory layouts are no harm
 
 

@@ -77,11 +77,11 @@ def test_scenes_by_name_folder_file_and_object_show_every_triangle(room, tmp_pat
         assert ceilings
         assert all(mesh.corners_m[..., 2] == pytest.approx(2.7) for mesh in ceilings)
     trimesh.creation.box((2, 3, 4)).export(tmp_path / "box.stl")
-    for options, name in (({}, "no material"), ({"material": "concrete"}, "concrete")):
-        shown = view(tmp_path / "box.stl", **options)
-        assert shown.counts == {"triangles": 12}
-        assert {mesh.material for mesh in shown.content.scene.meshes} == {name}
-        assert len(shown.content.scene.edges_m) == 12  # those of a box, without diagonals
+    for material, name in ((None, "no material"), ("concrete", "concrete")):
+        page = view(tmp_path / "box.stl", material=material)
+        assert page.counts == {"triangles": 12}
+        assert {mesh.material for mesh in page.content.scene.meshes} == {name}
+        assert len(page.content.scene.edges_m) == 12  # those of a box, without diagonals
 
 
 def test_the_largest_triangles_are_kept(room):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar, dataclass_transform
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,10 @@ from .angles import IntArray as IntArray
 from .angles import rotation_matrix
 from .antenna import ANTENNA, Antenna, AntennaOptions
 from .task import CONVERSIONS, Task, task_named
+
+T = TypeVar("T")
+Observations = NDArray[np.float32 | np.complex64]
+"""Grey values, powers in dBm or channel coefficients (`Record.observation`)."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,14 @@ class Receiver:
         return rotation_matrix(self.orientation_xyzw)
 
 
-class _TaskName:
+# Type checkers heed what an attribute of a data class may be set to, a task or its name, only where the decorator is
+# declared so.
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def _frozen(kind: type[T]) -> type[T]:
+    return dataclass(frozen=True)(kind)
+
+
+class TaskOrName:
     """Attribute of a record that is set to a task or its name and read as the task."""
 
     # The record keeps the name: a pickled record is read in a process where packages register their tasks anew.
@@ -95,7 +106,7 @@ class _TaskName:
         vars(record)["task"] = task if isinstance(task, str) else task.name
 
 
-@dataclass(frozen=True)
+@_frozen
 class Record:
     """A set of measurements: transmitter positions, receivers and what each receiver observed.
 
@@ -140,10 +151,10 @@ class Record:
     """
 
     name: str
-    task: Task
+    task: TaskOrName
     tx_pos_m: FloatArray
     receivers: tuple[Receiver, ...]
-    observation: NDArray[np.float32] | NDArray[np.complex64]
+    observation: Observations
     official: tuple[IntArray, IntArray] | None = None
     folds: IntArray | None = None
     frequencies_hz: FloatArray | None = None
@@ -151,7 +162,7 @@ class Record:
     tx_antenna: Antenna = ANTENNA
     uplink: NDArray[np.complex64] | None = None
     uplink_hz: FloatArray | None = None
-    truth: NDArray[np.float32] | NDArray[np.complex64] | None = None
+    truth: Observations | None = None
     n_readings: IntArray | None = None
     std: FloatArray | None = None
     carriers_hz: FloatArray | None = None
@@ -167,7 +178,7 @@ class Record:
         return Inputs(self.tx_pos_m, self.tx_heading_rad, self.uplink, 0, self.carriers_hz, self.runs).rows(rows)
 
     @property
-    def scored(self) -> NDArray[np.float32] | NDArray[np.complex64]:
+    def scored(self) -> Observations:
         """Values that predictions are scored against: the truth where it is known, else the observation."""
         return self.observation if self.truth is None else self.truth
 
@@ -266,7 +277,7 @@ class Record:
 
 
 # After the class, as a value in its body would be a default of the argument.
-Record.task = _TaskName()  # type: ignore[assignment]
+Record.task = TaskOrName()
 
 
 @dataclass(frozen=True)

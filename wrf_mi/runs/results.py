@@ -18,13 +18,11 @@ from ..core.array_files import stored_arrays
 from ..core.files import readable
 from ..core.task import IDW, NEIGHBOURS
 from ..core.types import IntArray
+from ..core.types import Observations as Observations
 from ..datasets import load_split
 from ..tasks import TASKS, Task
 from ..training.checkpoint import LOG
 from .folder import METRICS, PREDICTIONS, SPLIT, check_format, run_parts
-
-Observations = NDArray[np.float32] | NDArray[np.complex64]
-"""Grey values, powers in dBm or channel coefficients (`wrf_mi.core.Record`)."""
 
 REMEDY = "run evaluate to write it anew"
 PREDICTED = "predictions"  # key in ``metrics.json`` of the file of another program

@@ -257,7 +257,7 @@ def test_pitch_heading_carrier_run_and_storeys(tmp_path: Path) -> None:
     assert set(record.runs) == {"monday"}
 
 
-REFUSED = {
+REFUSED: dict[str, tuple[Any, dict[str, Any], str]] = {
     "no x": (lambda f: f.assign(x=[np.nan, *f.x[1:]]), {}, r"table\.csv: row 1: x is empty or infinite; give a number"),
     "no position": (lambda f: f.drop(columns="x"), {}, "no columns of positions among .*--positions FILE"),
     "cell": (

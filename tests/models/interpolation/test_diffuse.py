@@ -1,6 +1,7 @@
 """Kriging of channels: line of sight and diffuse field, or generic."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +11,9 @@ from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.estimators.interpolation.by_receiver import ByReceiver
 from wrf_mi.estimators.interpolation.diffuse import LEAST_ROWS, KrigedChannels, direct_wave, fit_diffuse
 from wrf_mi.estimators.interpolation.kriging import Kriged, KrigingSettings, UncertainKriged
-from wrf_mi.estimators.model import Inputs
+from wrf_mi.estimators.model import Inputs, Session
 from wrf_mi.models import MODELS, Problem
 from wrf_mi.tasks.scores import cea_db, inside_interval
-from wrf_mi.training.session import FitSession
 
 FREQUENCY_HZ = 2.4e9
 K = 2 * np.pi * FREQUENCY_HZ / speed_of_light
@@ -27,12 +27,14 @@ GAIN = 3 * np.exp(2j)
 def record(positions: np.ndarray, channel: np.ndarray) -> Record:
     """Channels [n_rx, n, subcarriers] of receivers at one place."""
     receivers = tuple(replace(ACCESS_POINT, name=f"r{number}") for number in range(len(channel)))
-    frequencies_hz = FREQUENCY_HZ + 1e6 * np.arange(channel.shape[2])
+    frequencies_hz = FREQUENCY_HZ + 1e6 * np.arange(float(channel.shape[2]))
     return Record("made", "csi", positions, receivers, channel.astype(np.complex64), frequencies_hz=frequencies_hz)
 
 
 def fit(data: Record, rows: np.ndarray, settings: KrigingSettings = DEFAULTS) -> ByReceiver:
-    return KRIGING.fit(Problem(data, settings), Split("rows", 0, rows, rows[:0], rows), FitSession())
+    session = Session(None, None)
+    fitted: Any = KRIGING.fit(Problem(data, settings), Split("rows", 0, rows, rows[:0], rows), session)
+    return fitted
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +57,7 @@ def fitted(dense: Record) -> ByReceiver:
 
 def test_line_of_sight_and_diffuse_field_are_kriged_near_measurements(dense: Record, fitted: ByReceiver) -> None:
     test = np.arange(240, 300)
-    channels = fitted.models[0]
+    channels: Any = fitted.models[0]
     estimate, truth = fitted.predict(Inputs(dense.tx_pos_m[test]), 0), dense.observation[0, test]
     direct = channels.gain * direct_wave(dense.tx_pos_m[test], ACCESS_POINT.position_m, channels.k)
     generic = fit(dense, np.arange(240), GENERIC).predict_mean(Inputs(dense.tx_pos_m[test]), 0)

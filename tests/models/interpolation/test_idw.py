@@ -18,7 +18,7 @@ from wrf_mi.estimators.interpolation.idw import COUNTS, MODEL, best_count
 from wrf_mi.estimators.model import Problem, default_settings
 from wrf_mi.runs.api import open_run, train
 
-RECEIVERS = tuple(Receiver(name, np.zeros(3), UPRIGHT) for name in ("anchor1", "anchor2"))
+RECEIVERS = tuple(Receiver(name, np.zeros(3), np.array(UPRIGHT)) for name in ("anchor1", "anchor2"))
 
 
 def chosen(record: Record, split: Split) -> int:

@@ -20,7 +20,8 @@ from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.settings import describe, settings_from, with_settings
 from wrf_mi.core.stored import from_arrays, to_arrays
 from wrf_mi.datasets import load, make_splits, write_nerf2_csi, write_spectrum_folder
-from wrf_mi.estimators.interpolation.kriging import Kriging, Trend
+from wrf_mi.estimators.interpolation.kriging import Kriging
+from wrf_mi.estimators.interpolation.path_loss import Trend
 from wrf_mi.estimators.interpolation.strength_settings import SHADOWINGS, StrengthSettings
 from wrf_mi.estimators.interpolation.strengths import Strengths, fit_strengths
 from wrf_mi.estimators.interpolation.trees import GrownTrees, Trees

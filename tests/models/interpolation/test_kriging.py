@@ -1,5 +1,7 @@
 """Kriging and trees against dense linear algebra, random fields and published figures."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from changed_folders import DATA, needs
@@ -7,8 +9,9 @@ from changed_folders import DATA, needs
 from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.estimators.interpolation import kriging_equations
-from wrf_mi.estimators.interpolation.kriging import Kriged, Kriging, Trend
+from wrf_mi.estimators.interpolation.kriging import Kriged, Kriging
 from wrf_mi.estimators.interpolation.kriging_equations import KrigingSystem, component_root
+from wrf_mi.estimators.interpolation.path_loss import Trend
 from wrf_mi.estimators.interpolation.trees import Trees
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import summary
@@ -129,7 +132,13 @@ def test_likelihood_recovers_the_covariance_of_random_fields():
 def test_bad_arguments_are_refused():
     positions, heading, rng = sampled(6)
     values = rng.normal(size=6)
-    wrong = {"length_m": 0.0, "noise": -0.1, "heading_length": np.nan, "kernel": "cubic", "likelihood_rows": 1}
+    wrong: dict[str, Any] = {
+        "length_m": 0.0,
+        "noise": -0.1,
+        "heading_length": np.nan,
+        "kernel": "cubic",
+        "likelihood_rows": 1,
+    }
     for name, value in wrong.items():
         with pytest.raises(InputError, match=f"setting {name}: "):
             Kriging(**{name: value})

@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 from scipy.stats import rice
 
 from wrf_mi.core.angles import fibonacci_sphere
+from wrf_mi.core.array_files import write_arrays
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.stored import from_arrays, to_arrays
 from wrf_mi.estimators.interpolation import signals as module
@@ -23,9 +24,8 @@ from wrf_mi.estimators.interpolation.signals import (
     fit_signals,
 )
 from wrf_mi.estimators.interpolation.spectra import ExpectedSpectrum, rician
-from wrf_mi.receivers.array import bartlett_spectrum
+from wrf_mi.receivers.array import bartlett_spectrum, mirror_order
 from wrf_mi.receivers.reports import minmax_scale
-from wrf_mi.receivers.retrieve import mirror_order
 
 TOWARDS = np.array([3.0, 1.0, -0.5]) / np.linalg.norm([3.0, 1.0, -0.5])
 DICTIONARY = Covariances(np.array([4.0, 1.0, 0.3]) * WAVELENGTH_M, departures(TOWARDS, WAVENUMBER, CONE_DEG, count=60))
@@ -154,7 +154,9 @@ def test_more_elements_than_rows_and_their_components_of_rounding() -> None:
     """Components of fewer rows than elements: their likelihood says nothing, and is the same for all of them."""
     rows = RowCovariances(DICTIONARY, positions(6))
     rng = np.random.default_rng(0)
-    costs = [fit_shares(1e-17 * scale * rng.normal(size=6).astype(complex), rows, 10, 1e-6)[2] for scale in (1, 30)]
+    costs = [
+        fit_shares((1e-17 * scale * rng.normal(size=6)).astype(np.complex128), rows, 10, 1e-6)[2] for scale in (1, 30)
+    ]
     assert costs[0] == pytest.approx(costs[1], abs=1e-6)
     assert np.isfinite(fit_shares(np.zeros(6, complex), rows, 10)[2])
     where = positions(8)
@@ -176,7 +178,7 @@ def test_prediction_is_that_of_a_gaussian_process_and_restored(tmp_path: Path) -
         left = covariance[0, 0] - np.diagonal(cross @ np.linalg.solve(known, cross.conj().T)) + process.noise[c]
         np.testing.assert_allclose(posterior.mean @ process.basis.conj()[:, c], mean, atol=1e-8)
         np.testing.assert_allclose(posterior.variance[:, c], left.real, atol=1e-8)
-    np.savez(tmp_path / "process.npz", **to_arrays(process))
+    write_arrays(tmp_path / "process.npz", to_arrays(process))
     with np.load(tmp_path / "process.npz") as stored:
         again = from_arrays(SignalProcess, dict(stored)).predict(where)
     np.testing.assert_array_equal(again.mean, posterior.mean)

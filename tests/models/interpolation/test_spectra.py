@@ -27,10 +27,11 @@ from wrf_mi.estimators.interpolation.spectra import (
     SpectrumKrigingSettings,
     signal_weight,
 )
-from wrf_mi.estimators.model import Inputs
+from wrf_mi.estimators.model import Inputs, Session
 from wrf_mi.models import MODELS, Problem
+from wrf_mi.receivers import retrieve
 from wrf_mi.tasks.scores import inside_interval, ssim
-from wrf_mi.training.session import FitSession, OnProgress, quiet
+from wrf_mi.training.session import OnProgress, quiet
 
 RECEIVER_M = np.array([3.0, 1.0, -0.5])
 UP_M = np.array([0.0, 0.0, 4.0])
@@ -46,7 +47,8 @@ def fit(
 ) -> ByReceiver:
     """The model ``kriging`` of some rows."""
     split = Split("rows", 0, rows, rows[:0], rows)
-    return KRIGING.fit(Problem(record, settings), split, FitSession(on_progress=on_progress))
+    fitted: Any = KRIGING.fit(Problem(record, settings), split, Session(None, None, on_progress))
+    return fitted
 
 
 def coherent(model: ByReceiver, receiver: int = 0) -> KrigedSpectra:
@@ -114,7 +116,7 @@ def test_held_out_is_kriging_without_those_rows_or_the_mean_without_any(radius_m
         kept = np.flatnonzero(cdist(process.tx_pos_m[[row]], process.tx_pos_m)[0] > radius_m)
         assert len(kept) < 25
         assert (len(kept) == 0) == (radius_m == 100.0)
-        weights, variance = np.full((1, 25), 1 / 25), [1 + NOISE]
+        weights, variance = np.full((1, 25), 1 / 25), np.array([1 + NOISE])
         if len(kept):
             weights, variance = kriged(process, kept, process.tx_pos_m[[row]])
         known = process.observed[kept] if len(kept) else process.observed
@@ -284,7 +286,7 @@ def test_weights_keep_their_defaults_without_gaps(record: Record) -> None:
 
 def test_spectra_are_read_in_chunks(record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many at once as memory bears: the parts are joined in order."""
-    sizes, unscale, rows = [], spectra.unscale, record.official[0][:20]
+    sizes, unscale, rows = [], retrieve.unscale, record.official[0][:20]
 
     def counted(grey: np.ndarray, lags: Any) -> Any:
         sizes.append(len(grey))
@@ -325,6 +327,6 @@ def test_unknown_instruments_and_stated_covariances_are_kriged_generically(setti
 @pytest.mark.parametrize(
     ("setting", "value"), [("cone_deg", 0.0), ("cone_deg", 181.0), ("directions", 0), ("lengths", 0)]
 )
-def test_settings_that_cannot_be_fitted_are_refused(setting: str, value: float) -> None:
+def test_settings_that_cannot_be_fitted_are_refused(setting: str, value: Any) -> None:
     with pytest.raises(InputError, match=f"setting {setting}: {value} is out of range, choose"):
         SpectrumKrigingSettings(**{setting: value})

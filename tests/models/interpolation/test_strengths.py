@@ -293,7 +293,7 @@ def test_invalid_arguments_are_refused() -> None:
             predict(Inputs(np.array([[0.0, np.nan, 0.0]])), 0)
 
 
-def test_mesh_alone_predicts_the_shadow_of_a_wall(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_mesh_alone_predicts_the_shadow_of_a_wall(tmp_path) -> None:
     """A room with a metal wall across it: without measurements less power is predicted behind it."""
     wall = trimesh.creation.box((0.1, 6.0, 3.0), trimesh.transformations.translation_matrix((3.0, 3.0, 1.5)))
     floor = trimesh.creation.box((8.0, 8.0, 0.1), trimesh.transformations.translation_matrix((3.0, 3.0, -0.05)))

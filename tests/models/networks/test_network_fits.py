@@ -18,7 +18,7 @@ from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import settings_from
 from wrf_mi.datasets import load, make_splits
-from wrf_mi.estimators.model import inputs_of
+from wrf_mi.estimators.model import Session, inputs_of
 from wrf_mi.estimators.networks import dcgan, nerf2, vae
 from wrf_mi.estimators.networks.dcgan import DcganSettings
 from wrf_mi.estimators.networks.nerf2 import Nerf2Settings
@@ -28,7 +28,6 @@ from wrf_mi.models import Model, Problem
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
 from wrf_mi.receivers.reports import minmax_scale
 from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim
-from wrf_mi.training.session import FitSession
 
 FITTED = 0.9  # structural similarity to which 8 spectra must be fitted
 MEAN_SPECTRUM = 0.673  # median of the mean training spectrum on the authors' held-out rows of rfid-lab
@@ -36,7 +35,13 @@ MRI_DB = 4.17  # median absolute error of a log-distance fit on flat-ble
 SAME = 1e-5  # sums in float32 whose order may differ
 
 
-NERF2 = {"networks": Networks(3, 48, 0, 2, 2), "rays": 128, "sphere_rays": 24, "samples": 2, "tx_octaves": 2}
+NERF2: dict[str, Any] = {
+    "networks": Networks(3, 48, 0, 2, 2),
+    "rays": 128,
+    "sphere_rays": 24,
+    "samples": 2,
+    "tx_octaves": 2,
+}
 SMALL: dict[str, tuple[Model, Any]] = {
     "vae": (vae.MODEL, network_settings(VaeSettings, 250, 8, 3e-3, latent=4, width=32, last=16, octaves=2)),
     "dcgan": (dcgan.MODEL, network_settings(DcganSettings, 150, 8, 3e-3, noise=2, hidden=24, channels=16, octaves=2)),
@@ -70,7 +75,7 @@ def fit(name: str, record: Record, split: Split | int, settings: Any = None) -> 
     """The fitted network; ``split``: as many first rows train."""
     rows = np.arange(split if isinstance(split, int) else 0)
     chosen = Split("few", 0, rows, rows[:0], rows) if isinstance(split, int) else split
-    return SMALL[name][0].fit(Problem(record, settings or SMALL[name][1], 0), chosen, FitSession())
+    return SMALL[name][0].fit(Problem(record, settings or SMALL[name][1], 0), chosen, Session(None, None))
 
 
 @NETWORKS
@@ -160,8 +165,8 @@ def test_signal_strengths_of_two_receivers_beat_their_means():
     assert np.nanmedian(errors) < 0.7 * np.nanmedian(of_means)
 
 
-UPLINK_HZ = 2.4e9 + 1e6 * np.arange(6)
-DOWNLINK_HZ = 2.4e9 + 1e6 * np.arange(6, 12)
+UPLINK_HZ = 2.4e9 + 1e6 * np.arange(6.0)
+DOWNLINK_HZ = 2.4e9 + 1e6 * np.arange(6.0, 12)
 
 
 def sparse_paths(rows: int = 300, antennas: int = 2, seed: int = 0) -> Record:
@@ -179,9 +184,8 @@ def sparse_paths(rows: int = 300, antennas: int = 2, seed: int = 0) -> Record:
         phase = 2 * np.pi * frequencies * length[..., None] / speed_of_light
         return (gain[..., None] * np.exp(-1j * phase)).sum(axis=2).astype(np.complex64)
 
-    observation, uplink = channel(DOWNLINK_HZ)[None], {"uplink": channel(UPLINK_HZ), "uplink_hz": UPLINK_HZ}
-    record = Record("made", "csi", tx, (RECEIVER,), observation, frequencies_hz=DOWNLINK_HZ, **uplink)
-    return record.with_array(elements)
+    record = Record("made", "csi", tx, (RECEIVER,), channel(DOWNLINK_HZ)[None], frequencies_hz=DOWNLINK_HZ)
+    return replace(record, uplink=channel(UPLINK_HZ), uplink_hz=UPLINK_HZ).with_array(elements)
 
 
 def test_downlink_from_uplink_beats_the_uplink():

@@ -71,14 +71,15 @@ def test_convolution_equals_its_sum_over_neighbours_and_has_its_gradient(side: i
     """Outside are zeros above and below, and the columns of the other side at each."""
     rng = np.random.default_rng(0)
     c, out, b, h, w = 3, 2, 2, 4, 5
-    images, kernel, bias = rng.standard_normal((c, b, h, w)), rng.standard_normal((out, side, side, c)), [[0.5], [-1]]
+    images, kernel = rng.standard_normal((c, b, h, w)), rng.standard_normal((out, side, side, c))
+    bias = np.array([[0.5], [-1]])
     wide = np.concatenate([images[..., -1:], images, images[..., :1]], axis=-1)
     wide, expected = np.pad(wide, [(0, 0), (0, 0), (1, 1), (0, 0)]), np.zeros((out, b, h, w))
     for down in range(side):
         for right in range(side):
             part = wide[:, :, down : down + h, right : right + w]
             expected += np.einsum("oc,cbhw->obhw", kernel[:, down, right], part)
-    state = {"hidden": doubles(kernel.reshape(out, -1)), "bias": doubles(np.array(bias))}
+    state = {"hidden": doubles(kernel.reshape(out, -1)), "bias": doubles(bias)}
     grid, flat = BatchShape(b, h, w), images.reshape(c, -1)
     result = Convolution(c, side, out, rng).with_state(state)(doubles(flat), grid)
     np.testing.assert_allclose(result.numpy(), expected.reshape(out, -1) + bias, atol=EXACT)
@@ -149,7 +150,8 @@ def small_march(seed: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]
         if name.endswith("bias"):
             weights[name] += rng.standard_normal(weights[name].shape) * 0.3
     directions = rng.standard_normal((3, 4))
-    rays = constant_parts(2.0, 0.0, FAR_M, SAMPLES, FREQUENCIES_HZ) | {"origin": np.array([[0.2], [-0.2], [0.1]])}
+    constants = constant_parts(2.0, 0.0, FAR_M, SAMPLES, FREQUENCIES_HZ)
+    rays = {**constants, "origin": np.array([[0.2], [-0.2], [0.1]])}
     rays["direction"] = directions / np.linalg.norm(directions, axis=0)
     return weights, rays, rng.standard_normal((2, 2))
 

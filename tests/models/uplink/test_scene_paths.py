@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from wrf_mi.tasks.scores import cea_db
 from wrf_mi.tracing import open_scene
 from wrf_mi.tracing.options import TraceOptions
 
-HZ = 2.437e9 + 312.5e3 * np.arange(-16, 16)
+HZ = 2.437e9 + 312.5e3 * np.arange(-16.0, 16)
 HALF = 16
 SNR_DB = 25.0
 GAIN_DB = 8.0  # least gain by lengths that are known to centimetres: half of the one in these draws
@@ -40,7 +41,7 @@ def room() -> Record:
     options = TraceOptions(transmission=True, depth=2)
     h = trace_channels(open_scene("laboratory", 2.437e9), receiver, positions, HZ, [options])
     measured = noisy(h, np.random.default_rng(0)).astype(np.complex64)
-    hz = {"frequencies_hz": HZ[HALF:], "uplink_hz": HZ[:HALF]}
+    hz: dict[str, Any] = {"frequencies_hz": HZ[HALF:], "uplink_hz": HZ[:HALF]}
     truth, official = h[None, :, :, HALF:].astype(np.complex64), (np.arange(8), np.arange(8, 16))
     uplink, downlink = measured[:, :, :HALF], measured[None, :, :, HALF:]
     return Record("room", "csi", positions, (receiver,), downlink, official, uplink=uplink, truth=truth, **hz)
@@ -81,7 +82,7 @@ def test_scene_raises_the_accuracy_of_the_downlink(room: Record, tmp_path: Path)
     assert with_scene > without + SCENE_GAIN_DB
     assert with_scene > SNR_DB
     opened = wrf_mi.open_run(tmp_path / "laboratory", room)
-    asked = {"tx_pos_m": room.tx_pos_m[8:10], "uplink": room.uplink[8:10]}
+    asked: dict[str, Any] = {"tx_pos_m": room.tx_pos_m[8:10], "uplink": room.uplink[8:10]}
     assert np.array_equal(opened.predict(**asked).mean, run["laboratory"].predict(**asked).mean)
     with pytest.raises(InputError, match="position"):
         opened.predict(tx_pos_m=np.full((1, 3), np.nan), uplink=room.uplink[:1])

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from small_fits import network_settings
 
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
-from wrf_mi.estimators.model import Inputs, inputs_of
+from wrf_mi.estimators.model import Inputs, Session, inputs_of
 from wrf_mi.estimators.networks import nerf2
 from wrf_mi.estimators.networks.nerf2 import Nerf2Settings
 from wrf_mi.estimators.networks.nerf2_march import Networks
@@ -25,7 +26,7 @@ from wrf_mi.estimators.uplink.uplink_waves import Bands, bands_of, relative_erro
 from wrf_mi.models import Problem
 from wrf_mi.tasks.conditions import normalised_uplink
 from wrf_mi.tasks.scores import cea_db
-from wrf_mi.training.session import FitSession
+from wrf_mi.training.session import quiet
 
 CARRIER_HZ, SPACING_HZ, HALF = 2.4e9, 312.5e3, 26
 OFFSETS = np.concatenate([np.arange(-HALF, 0), np.arange(1, HALF + 1)]) * SPACING_HZ
@@ -36,8 +37,8 @@ EXACT_DB = 60.0
 some; a wrong path, or one of them missing, gives less than 30."""
 METHODS = {"linear": linear.MODEL, "fire": fire.MODEL, "r2f2": r2f2.MODEL, "optml": optml.MODEL, "nerf2": nerf2.MODEL}
 UPLINK_ALONE = ("linear", "fire", "r2f2", "optml")
-PLANE = {"steps": 5, "batch": 4, "wavefront": "plane"}
-SMALL = {
+PLANE: dict[str, Any] = {"steps": 5, "batch": 4, "wavefront": "plane"}
+SMALL: dict[str, Any] = {
     "linear": LinearSettings(),
     "fire": FireSettings(steps=50, batch=32, validate_every=20, sample="antenna", width=16, latent=4),
     "r2f2": PathSettings(max_paths=3, choice_rows=2),
@@ -60,7 +61,7 @@ def record_of(h, elements=None, known=True):
     """A record of coefficients [n, antennas, 52]."""
     receiver, nowhere = Receiver("bs", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])), np.full((len(h), 3), np.nan)
     uplink, downlink = (part.astype(np.complex64) for part in np.split(h, 2, axis=-1))
-    hz = {"frequencies_hz": HZ[HALF:], "uplink_hz": HZ[:HALF]} if known else {}
+    hz: dict[str, Any] = {"frequencies_hz": HZ[HALF:], "uplink_hz": HZ[:HALF]} if known else {}
     return Record("made", "csi", nowhere, (receiver,), downlink[None], uplink=uplink, **hz).with_array(elements)
 
 
@@ -117,9 +118,12 @@ def walk(elements):
 @pytest.mark.parametrize("wavefront", ["plane", "spherical"])
 def test_r2f2_is_exact_on_noise_free_sparse_paths(elements, wavefront):
     rng = np.random.default_rng(1)
-    h = channels(*sparse(5, 4, rng, 1.5 if wavefront == "spherical" else 10), elements, wavefront == "spherical")
+    gains, theta = sparse(5, 4, rng, 1.5 if wavefront == "spherical" else 10)
+    h = channels(gains, theta, elements, wavefront == "spherical")
     record = record_of(h, elements)
-    fitted = r2f2.MODEL.fit(Problem(record, PathSettings(max_paths=5, choice_rows=2), 0), split_of(5), FitSession())
+    fitted = r2f2.MODEL.fit(
+        Problem(record, PathSettings(max_paths=5, choice_rows=2), 0), split_of(5), Session(None, None)
+    )
     assert fitted.kind == wavefront, "the kind of wave is found on validation rows"
     assert accuracy_db(fitted, record, np.arange(5), h).min() > EXACT_DB
     silent = inputs_of(record, np.arange(2))
@@ -137,7 +141,7 @@ def test_r2f2_without_elements_is_exact_where_delays_are_apart_and_finds_the_gap
     waves = np.exp(-2j * np.pi / speed_of_light * delays[..., None] * OFFSETS)
     h = np.einsum("nka,nkf->naf", gains, np.broadcast_to(waves, (6, 2, len(OFFSETS))))
     record = record_of(h, known=known)
-    fitted = r2f2.MODEL.fit(Problem(record, PathSettings(), 0), split_of(6), FitSession())
+    fitted = r2f2.MODEL.fit(Problem(record, PathSettings(), 0), split_of(6), Session(None, None))
     if known:
         assert fitted.kind == "free"
         assert accuracy_db(fitted, record, np.arange(6), h).min() > EXACT_DB
@@ -147,7 +151,8 @@ def test_r2f2_without_elements_is_exact_where_delays_are_apart_and_finds_the_gap
 
 def test_search_finds_as_many_paths_as_there_are_in_noise(elements):
     rng = np.random.default_rng(4)
-    h = channels(*sparse(8, 3, rng), elements, spherical=False)
+    gains, theta = sparse(8, 3, rng)
+    h = channels(gains, theta, elements, spherical=False)
     record = record_of(noisy(h, 25, rng), elements)
     bands = bands_of(record, SPACING_HZ)
     waves = waves_of("plane", bands, 100.0)
@@ -182,7 +187,8 @@ def test_gradient_of_the_projected_residual_equals_finite_differences(kind, elem
 def test_no_row_has_no_atoms(kind, elements):
     """As where no row to predict has an uplink."""
     bands = Bands(HZ[:HALF], HZ[HALF:], len(elements), True, elements[:, :2])
-    atoms = waves_of(kind, bands, 100.0).atoms(np.zeros((0, 3, 3)), bands.downlink_hz)
+    waves: Any = waves_of(kind, bands, 100.0)
+    atoms = waves.atoms(np.zeros((0, 3, 3)), bands.downlink_hz)
     assert atoms.shape == (0, 3, len(elements), HALF)
 
 
@@ -198,7 +204,7 @@ def test_no_row_has_no_atoms(kind, elements):
 def test_methods_beat_copying_the_uplink(walk, name, settings, least_db):
     truth, record = walk
     split = split_of(80, 16)
-    fitted = METHODS[name].fit(Problem(record, settings, 0), split, FitSession())
+    fitted = METHODS[name].fit(Problem(record, settings, 0), split, Session(None, None))
     assert gain_db(fitted, record, split.test, truth) > least_db
 
 
@@ -208,7 +214,7 @@ def test_fire_ignores_rows_without_downlink(walk):
     observation = record.observation.copy()
     observation[0, :2] = 0
     every, fewer = (
-        gain_db(fire.MODEL.fit(Problem(data, settings, 0), split, FitSession()), record, split.test, truth)
+        gain_db(fire.MODEL.fit(Problem(data, settings, 0), split, Session(None, None)), record, split.test, truth)
         for data in (record, replace(record, observation=observation))
     )
     assert fewer > every - 0.5, "2 of 80 rows are silent; a weight of their own makes all rows so"
@@ -229,7 +235,7 @@ def test_captures_without_a_pose_are_fitted_and_predicted(name, known, walk):
     record = replace(record_of(truth[:30, :6], known=False), receivers=(Receiver("base-station", place, turned),))
     settings = replace(SMALL[name], wavefront="auto") if name == "optml" else SMALL[name]
     method, split = METHODS[name], split_of(30, 5)
-    fitted = method.fit(Problem(record, settings, 0), split, FitSession())
+    fitted = method.fit(Problem(record, settings, 0), split, Session(None, None))
     inputs = inputs_of(record, split.test)
     predicted = fitted.predict(inputs, 0).mean
     assert (predicted.shape, predicted.dtype) == ((5, 6, HALF), np.complex64)
@@ -244,12 +250,13 @@ def test_captures_without_a_pose_are_fitted_and_predicted(name, known, walk):
 
 def test_optml_finds_all_paths_with_few_steps(elements):
     rng = np.random.default_rng(6)
-    h = channels(*sparse(20, 3, rng), elements, spherical=False)
+    gains, theta = sparse(20, 3, rng)
+    h = channels(gains, theta, elements, spherical=False)
     record, split = record_of(noisy(h, 25, rng), elements), split_of(20, 8)
-    training = PLANE | {"steps": 125, "batch": 8, "optimiser": network_adam(5e-3)}
+    training: dict[str, Any] = PLANE | {"steps": 125, "batch": 8, "optimiser": network_adam(5e-3)}
     simulation = Simulation(channels=150, paths=4)
     settings = OptMLSettings(simulation=simulation, width=16, rounds=2, max_distance_m=60.0, **training)
-    fitted = optml.MODEL.fit(Problem(record, settings, 0), split, FitSession())
+    fitted = optml.MODEL.fit(Problem(record, settings, 0), split, Session(None, None))
     cea = accuracy_db(fitted, record, split.test, h[split.test])
     assert np.median(cea) > 25, "as good as the uplink was measured: all paths were seen"
 
@@ -268,10 +275,11 @@ def test_single_rows_and_records_of_two_receivers_or_of_another_array_are_refuse
         if data is fewer and name == "linear":  # which does not use the array
             continue
         with pytest.raises(InputError, match=message):
-            METHODS[name].fit(Problem(data, SMALL[name]), split, FitSession())
+            METHODS[name].fit(Problem(data, SMALL[name]), split, Session(None, None))
 
 
 def test_unknown_words_are_refused_by_the_settings_themselves() -> None:
+    kind: Any
     for kind, wrong in ((PathSettings, {"wavefront": "cylinder"}), (FireSettings, {"sample": "x"})):
         with pytest.raises(InputError, match="choose from"):
             kind(**wrong)
@@ -307,7 +315,7 @@ def split_made(train: int = 24, validation: int = 6) -> Split:
 
 
 def fit_linear(record: Record, split: Split, **settings: float) -> LinearMap:
-    return MODEL.fit(Problem(record, LinearSettings(**settings), 0), split, FitSession())
+    return MODEL.fit(Problem(record, LinearSettings(**settings), 0), split, Session(None, None))
 
 
 def test_exact_on_a_noise_free_linear_relation_and_zero_for_zeros() -> None:
@@ -332,7 +340,7 @@ def test_penalty_is_chosen_on_validation_rows_and_fitted_to_all_training_rows() 
     record, _ = linear_record(noise=1.5)
     split = split_made(8, 12)
     shares: list[float] = []
-    session = FitSession(on_progress=lambda stage, share, progress: shares.append(share))
+    session = Session(None, None, lambda stage, share, *_: shares.append(share))
     fitted = MODEL.fit(Problem(record, LinearSettings(), 0), split, session)
     assert shares[-1] == 1
     assert shares == sorted(shares)
@@ -379,7 +387,7 @@ def test_without_validation_rows_every_fifth_training_row_chooses() -> None:
     record, _ = linear_record(noise=1.5)
     rows = np.arange(20)
     split = Split("made", 0, rows, rows[:0], np.arange(20, ROWS))
-    expected = choose(record, np.setdiff1d(rows, rows[::5]), rows[::5], lambda what, share: None)
+    expected = choose(record, np.setdiff1d(rows, rows[::5]), rows[::5], quiet)
     assert fit_linear(record, split).penalty == expected
     two = fit_linear(record, replace(split, train=rows[:2]))
     assert np.isfinite(two.matrix).all()

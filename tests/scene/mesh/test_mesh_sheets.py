@@ -1,6 +1,7 @@
 """Panels and doubled faces as single sheets, and rooms whose unit is asked for."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ def quads(box: trimesh.Trimesh) -> np.ndarray:
 
 def two_faced(corners: np.ndarray, second_diagonal: bool) -> trimesh.Trimesh:
     """Each side twice with vertices of its own, the second copy turned over, perhaps cut along the other diagonal."""
-    vertices, faces = [], []
+    vertices, faces = list[np.ndarray](), list[np.ndarray]()
     for side in corners:
         for copy, diagonal in enumerate((DIAGONALS[0], DIAGONALS[second_diagonal])):
             triangles = np.array(diagonal) + 4 * len(vertices)
@@ -42,7 +43,7 @@ def two_faced(corners: np.ndarray, second_diagonal: bool) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
 
 
-def area_m2(file: Path, **options: str) -> float:
+def area_m2(file: Path, **options: Any) -> float:
     return float(sum(surface.mesh.area for surface in read_mesh(file, **options)))
 
 
@@ -112,7 +113,7 @@ def test_formats_that_are_not_read_are_refused_with_their_conversion(name, tmp_p
 
 def test_furniture_on_a_floor_stays_closed(tmp_path):
     """The lower side of a cupboard lies on the floor and looks the other way."""
-    room = trimesh.creation.box(bounds=[[0, 0, 0], [4, 3, 2.5]])
+    room = trimesh.creation.box(bounds=[[0.0, 0, 0], [4, 3, 2.5]])
     room.invert()
     trimesh.util.concatenate([room, panel((1, 0.5, 2), (2, 1, 1))]).export(tmp_path / "room.obj")
     surfaces = by_kind(planes_of_mesh(read_mesh(tmp_path / "room.obj")))

@@ -255,7 +255,7 @@ def ply(form, faces, types=TYPES, name="vertex_indices", order="vertex face", en
     return end.join([*lines, "end_header", ""]).encode() + body
 
 
-WAYS = (
+WAYS: tuple[dict[str, Any], ...] = (
     {},
     {"types": ("double", "uint", "ushort"), "name": "vertex_index"},
     {"types": ("float", "char", "uint"), "quality": True},
@@ -331,7 +331,7 @@ def changed_glb(file: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     return file
 
 
-INSTANCES = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {}}}}
+INSTANCES: dict[str, Any] = {"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {}}}}
 GLB_FAULTS = {
     "instances": (lambda f: f["nodes"][-1].update(INSTANCES), "needs the extension EXT_mesh_gpu_instancing"),
     "required": (lambda f: f.update(extensionsRequired=["ACME_shape"]), "needs the extension ACME_shape"),

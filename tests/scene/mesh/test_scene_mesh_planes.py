@@ -10,7 +10,7 @@ import shapely
 import trimesh
 from calling import call
 from collada.source import FloatSource, InputList
-from made_rooms import Mesh, attic, by_kind, l_shape
+from made_rooms import Mesh, attic, by_kind, joined, l_shape
 from pxr import Gf, Usd, UsdGeom
 
 from wrf_mi.core import InputError
@@ -32,7 +32,7 @@ def solid(low: tuple[float, ...], high: tuple[float, ...], inward: bool = False)
 
 def split(*parts: Mesh) -> tuple[dict[str, int], list[Surface]]:
     """How many surfaces of each kind, and the surfaces; no triangle is lost or added."""
-    mesh = trimesh.util.concatenate(list(parts))
+    mesh = joined(parts)
     surfaces = planes_of_mesh([Surface("mesh", "other", np.asarray(mesh.vertices), np.asarray(mesh.faces))])
     before = sorted(mesh.triangles.reshape(len(mesh.faces), 9).tolist())
     after = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
@@ -131,7 +131,7 @@ Polygons = list[tuple[int, ...]]
 
 def building() -> tuple[np.ndarray, Polygons]:
     """Vertices, metres, and polygons: an L-shaped floor and ceiling and six walls in each storey."""
-    vertices, polygons, count = [], [], len(OUTLINE)
+    vertices, polygons, count = list[tuple[float, ...]](), Polygons(), len(OUTLINE)
     for low, high in STOREYS:
         floor = tuple(len(vertices) + k for k in range(count))
         vertices += [(x, y, z) for z in (low, high) for x, y in OUTLINE]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from made_plans import box, distance
+from made_plans import box, distance, read_grid
 from PIL import Image
 
 from wrf_mi.core import InputError
@@ -47,15 +47,15 @@ def test_a_wall_is_one_sheet_at_its_inner_face_in_both_directions_and_an_entranc
 
 
 def test_thin_lines_are_not_walls_unless_all_walls_are_lines(tmp_path, caplog):
-    walls = find_walls(read_plan(drawing(tmp_path / "plan.png", [*OUTER, *INNER, LEAF]), CELL_M))
+    walls = find_walls(read_grid(drawing(tmp_path / "plan.png", [*OUTER, *INNER, LEAF]), CELL_M))
     assert "lines thinner than 0.05 m" in caplog.text
     assert distance([2, 3.5], walls) > 0.4
     thick = [(*LEAF[:2], LEAF[0] + 0.05, LEAF[3])]
-    walls = find_walls(read_plan(drawing(tmp_path / "plan.png", OUTER + INNER + thick), CELL_M))
+    walls = find_walls(read_grid(drawing(tmp_path / "plan.png", OUTER + INNER + thick), CELL_M))
     assert distance([2, 3.5], walls) < 2 * CELL_M
     thin = [(x0, y0, x1 - 0.5 + CELL_M, y1 - 0.5 + CELL_M) for x0, y0, x1, y1 in OUTER]
     caplog.clear()
-    walls = find_walls(read_plan(drawing(tmp_path / "plan.png", thin), CELL_M))
+    walls = find_walls(read_grid(drawing(tmp_path / "plan.png", thin), CELL_M))
     assert "every line is a wall" in caplog.text
     assert len(walls) == 4
 

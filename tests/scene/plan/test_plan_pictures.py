@@ -1,9 +1,12 @@
 """Pictures of plans: kinds of pixels, the YAML of ROS maps, and the floor that their cells and measured places show."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import shapely
 from calling import refused
+from made_plans import read_grid
 from PIL import Image
 
 from wrf_mi.core import InputError
@@ -83,14 +86,14 @@ def test_what_furniture_hides_is_floor():
 
 
 def test_map_without_free_cells_within_its_walls_is_refused(tmp_path):
-    grid = read_plan(write_map(tmp_path, robot_map(mapped=(YARD,))))
+    grid = read_grid(write_map(tmp_path, robot_map(mapped=(YARD,))))
     with pytest.raises(InputError, match="no cell within its walls is known to be free"):
         mapped_part(shapely.box(*CLOSED), grid, "map")
 
 
 def test_floor_contains_places_in_free_cells_that_no_wall_encloses(tmp_path):
     sheet, places = write_map(tmp_path, robot_map()), np.concatenate([IN_HALL, IN_YARD])
-    options = {"height_m": 2.7, "replace": True}
+    options: dict[str, Any] = {"height_m": 2.7, "replace": True}
     make_scene(sheet, tmp_path / "scene", **options)
     without = floor_area(tmp_path / "scene")
     assert not shapely.contains_xy(without, IN_YARD).any()
@@ -157,7 +160,7 @@ DARK[8:56, 8:16] = DARK[48:56, 8:88] = True
 def test_kinds_of_pixels_show_the_same_walls(tmp_path, name):
     picture, options = pictures(DARK)[name]
     picture.save(tmp_path / name, **options)
-    grid = read_plan(tmp_path / name, CELL_M)
+    grid = read_grid(tmp_path / name, CELL_M)
     np.testing.assert_array_equal(grid.occupied, DARK[::-1])
     np.testing.assert_array_equal(grid.free, ~DARK[::-1])
 
@@ -166,7 +169,7 @@ def test_ground_of_a_coloured_drawing_is_not_unmapped(tmp_path, caplog):
     colours = np.full((64, 96, 3), (119, 168, 178), np.uint8)
     colours[DARK] = 0
     Image.fromarray(colours).save(tmp_path / "plan.png")
-    assert not read_plan(tmp_path / "plan.png", CELL_M).unmapped.any()
+    assert not read_grid(tmp_path / "plan.png", CELL_M).unmapped.any()
     share = 100 * DARK.mean()
     assert f"{share:.2g} % of its pixels, those darker than grey 89, count as walls" in caplog.text
 
@@ -187,13 +190,13 @@ def test_ground_of_a_coloured_drawing_is_not_unmapped(tmp_path, caplog):
     ],
 )
 def test_thresholds_and_modes_of_a_ros_map_are_those_of_map_server(tmp_path, lines, grey, occupied, free):
-    grid = read_plan(write_map(tmp_path, np.array([grey], np.uint8), YAML + lines))
+    grid = read_grid(write_map(tmp_path, np.array([grey], np.uint8), YAML + lines))
     assert (grid.occupied[0].tolist(), grid.free[0].tolist()) == ([*map(bool, occupied)], [*map(bool, free)])
 
 
 def test_transparent_cells_of_mode_scale_are_unmapped(tmp_path):
     pixels = np.array([[[0, 255], [255, 255], [255, 0]]], np.uint8)
-    grid = read_plan(write_map(tmp_path, pixels, YAML + "mode: scale\n"))
+    grid = read_grid(write_map(tmp_path, pixels, YAML + "mode: scale\n"))
     assert grid.unmapped.tolist() == [[False, False, True]]
 
 

@@ -1,14 +1,29 @@
 """Plans with known walls: what is found in maps, points and layouts, and their files."""
 
+from typing import Any
+
 import numpy as np
 import pytest
-from made_plans import INNER_M, L_ROOM_M, POSES_M, TWO_ROOMS_M, agreement, box, distance, grid_of, scan, scans, turn
+from made_plans import (
+    INNER_M,
+    L_ROOM_M,
+    POSES_M,
+    TWO_ROOMS_M,
+    agreement,
+    box,
+    distance,
+    grid_of,
+    read_grid,
+    scan,
+    scans,
+    turn,
+)
 from PIL import Image
 
 from wrf_mi.core import InputError
+from wrf_mi.core.array_files import write_arrays
 from wrf_mi.scene.plan.lines import dominant_direction
 from wrf_mi.scene.plan.sources import (
-    PlanGrid,
     grid_from_points,
     grid_from_probability,
     read_layout,
@@ -151,18 +166,17 @@ ODDS = np.array([[-3.0, np.nan, 4.0], [-3.0, -3.0, 4.0]])
 def test_grids_of_log_odds_and_probabilities_and_ros_maps_are_read(tmp_path):
     file = tmp_path / "map.npz"
     np.savez(file, log_odds=ODDS, resolution_m=0.5, origin_m=[1.0, 2.0], row_0="top")
-    grid = read_plan(file)
-    assert isinstance(grid, PlanGrid)
-    assert [grid.resolution_m, read_plan(file, 0.1).resolution_m] == [0.5, 0.1]
+    grid = read_grid(file)
+    assert [grid.resolution_m, read_grid(file, 0.1).resolution_m] == [0.5, 0.1]
     assert grid.centres_m(grid.occupied).tolist() == [[2.25, 2.25], [2.25, 2.75]]
     np.savez(file, log_odds=np.array([[0.0, 0.5, 1.0]]), resolution_m=0.1, row_0="top")
-    grid = read_plan(file)
+    grid = read_grid(file)
     assert (grid.occupied.tolist(), grid.free.tolist()) == ([[False, False, True]], [[True, False, False]])
     # 205 is what map_server writes where nothing is known: neither occupied nor free.
     Image.fromarray(np.array([[254, 205, 0]], np.uint8)).save(tmp_path / "flat.pgm")
     (tmp_path / "flat.yaml").write_text("image: flat.pgm\nresolution: 0.05\norigin: [-1.0, 2.0, 0.0]\nnegate: 0\n")
     for name in ("flat.yaml", "flat.pgm"):
-        grid = read_plan(tmp_path / name)
+        grid = read_grid(tmp_path / name)
         assert (grid.occupied.tolist(), grid.free.tolist()) == ([[False, False, True]], [[True, False, False]])
         assert (grid.resolution_m, grid.origin_m.tolist()) == (0.05, [-1, 2])
 
@@ -177,8 +191,9 @@ def test_row_0_of_the_caller_overrides_that_of_the_file_and_is_refused_where_the
         ("bottom", "top", True),
         (None, "bottom", False),
     ):
-        np.savez(file, log_odds=ODDS, resolution_m=0.5, **({} if stated is None else {"row_0": stated}))
-        grid = read_plan(file, row_0=asked)
+        side = {} if stated is None else {"row_0": stated}
+        write_arrays(file, {"log_odds": ODDS, "resolution_m": 0.5, **side})
+        grid = read_grid(file, row_0=asked)
         assert (grid.occupied.tolist(), grid.free.tolist()) == (occupied, free if from_top else free[::-1])
         assert grid.origin_m.tolist() == [0, 0]
     Image.fromarray(np.array([[254, 205, 0]], np.uint8)).save(tmp_path / "flat.png")
@@ -193,12 +208,12 @@ def test_points_become_cells_and_layouts_vertices(tmp_path):
     np.savez(tmp_path / "a.npz", xy_m=np.array([[1.01, 2.02], [3.03, 4.04]]))
     (tmp_path / "b.xyz").write_text("# a scan\n1.01 2.02\n3.03,4.04  # comment\n\n")
     for name in ("a.npz", "b.xyz"):
-        source = read_plan(tmp_path / name, 0.1)
-        assert isinstance(source, PlanGrid)
+        source = read_grid(tmp_path / name, 0.1)
         np.testing.assert_allclose(source.centres_m(source.occupied), [[1.05, 2.05], [3.05, 4.05]])
         assert not source.free.any()
     (tmp_path / "layout.csv").write_text("x,y\n0,0\n2.5,0\n2.5,1\n")
-    for read in (read_layout, read_plan):
+    readers: tuple[Any, ...] = read_layout, read_plan
+    for read in readers:
         assert read(tmp_path / "layout.csv").tolist() == [[0, 0], [2.5, 0], [2.5, 1]]
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from calling import refused
-from made_rooms import Mesh, attic, by_kind, closed_box, l_shape, sampled, sheet
+from made_rooms import Mesh, attic, by_kind, closed_box, joined, l_shape, sampled, sheet
 from wrf_mi_scenes.build_laboratory import box
 
 from wrf_mi.core.yaml_files import read_yaml
@@ -64,7 +64,7 @@ def test_scan_tilted_by_more_than_fifteen_degrees_is_refused(tmp_path, capsys):
 
 def ramp(rise_m):
     """A room whose floor and ceiling slope and whose walls are upright."""
-    room = trimesh.util.concatenate(closed_box())
+    room = joined(closed_box())
     room.vertices[:, 2] += rise_m * room.vertices[:, 0] / 5
     return [room]
 
@@ -83,7 +83,7 @@ def test_registration_of_a_tilted_scan_is_that_of_its_file(tmp_path):
     points = trimesh.transform_points(sampled(closed_box(), COUNT, NOISE_M), tilt(10))
     file = scan_file(tmp_path / "scan.xyz", points)
     surfaces = surfaces_of(file, tmp_path, registration=np.linalg.inv(tilt(10)))
-    np.testing.assert_allclose(box_of(surfaces), [[0, 0, 0], [5, 4, 2.8]], atol=CLOSE_M)
+    np.testing.assert_allclose(box_of(surfaces), [[0.0, 0, 0], [5, 4, 2.8]], atol=CLOSE_M)
 
 
 # --- strays
@@ -96,7 +96,7 @@ def test_strays_far_away_neither_move_nor_change_a_room(tmp_path, caplog, far_m,
     directions = rng.normal(size=(12, 3)) if not together else np.array([1.0, 0.2, 0.1]) + rng.normal(0, 1e-3, (12, 3))
     strays = far_m * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     surfaces = surfaces_of(scan_file(tmp_path / "scan.xyz", np.concatenate([points, strays])), tmp_path)
-    np.testing.assert_allclose(box_of(surfaces), [[0, 0, 0], [5, 4, 2.8]], atol=CLOSE_M)
+    np.testing.assert_allclose(box_of(surfaces), [[0.0, 0, 0], [5, 4, 2.8]], atol=CLOSE_M)
     assert "12 of 40012 points" in caplog.text
     assert read_yaml(tmp_path / "scene" / "scene.yml")["origin_m"] is None
 
@@ -113,7 +113,7 @@ def test_a_far_surface_is_not_a_stray(tmp_path, caplog):
 
 def uneven(parts, noise_m, halvings=5, seed=0):
     """Faces of about 0.1 m whose vertices are off by noise."""
-    mesh = trimesh.util.concatenate(parts)
+    mesh = joined(parts)
     mesh.merge_vertices()
     for _ in range(halvings):
         mesh = mesh.subdivide()

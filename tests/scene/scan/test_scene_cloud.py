@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from made_rooms import Mesh, attic, by_kind, closed_box, l_shape, sampled, scene_file, two_rooms
+from made_rooms import Mesh, attic, by_kind, closed_box, joined, l_shape, sampled, scene_file, two_rooms
 from wrf_mi_scenes.build_laboratory import box, sheet, wall
 
 from wrf_mi.core import InputError
@@ -28,7 +28,7 @@ AREA_SHARE = 0.01
 COUNT = 40_000
 
 
-def rooms(surfaces: list[Surface]) -> tuple[int, int, int, int]:
+def rooms(surfaces: list[Surface]) -> tuple[int, ...]:
     return tuple(len(group) for group in by_kind(surfaces).values())
 
 
@@ -49,7 +49,7 @@ def test_a_box_is_six_rectangles_with_closed_corners(noise_m, count, seed):
     """And its walls have no layers."""
     surfaces = surfaces_from_points(sampled(closed_box(), count, noise_m, seed=seed))
     assert rooms(surfaces) == (1, 1, 4, 0)
-    expected = trimesh.util.concatenate(closed_box()).vertices
+    expected = joined(closed_box()).vertices
     for surface in surfaces:
         assert surface.faces.shape == (2, 3)
         for vertex in surface.vertices_m:
@@ -129,7 +129,7 @@ def test_a_turned_and_moved_room_gives_turned_and_moved_surfaces(yaw_deg, shift)
     surfaces = surfaces_from_points(sampled(closed_box(), 20_000) @ turn.T + shift)
     assert rooms(surfaces) == (1, 1, 4, 0)
     back = np.concatenate([(s.vertices_m - shift) @ turn for s in surfaces])
-    corners = trimesh.util.concatenate(closed_box()).vertices
+    corners = joined(closed_box()).vertices
     assert np.linalg.norm(back[:, None] - corners, axis=-1).min(axis=1).max() < 3 * PLANE_M
 
 
@@ -230,7 +230,7 @@ def test_a_far_wall_of_few_points_is_a_wall(tmp_path):
     boxes = in_room(surfaces)
     assert [len(boxes[kind]) for kind in ("floor", "ceiling", "wall")] == [1, 1, 4]
     far = max(boxes["wall"], key=lambda ends: ends[:, 0].mean())
-    np.testing.assert_allclose(far, [[12, 0, 0], [12, 4, 2.8]], atol=0.1)
+    np.testing.assert_allclose(far, [[12.0, 0, 0], [12, 4, 2.8]], atol=0.1)
     areas = [by_kind(surfaces)[kind][0].mesh.area for kind in ("floor", "ceiling")]
     assert areas == pytest.approx([48.0, 48.0], rel=SEEN_SHARE)
 

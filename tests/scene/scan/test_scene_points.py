@@ -15,6 +15,7 @@ from made_rooms import by_kind, closed_box, sampled, write_las
 
 from wrf_mi.apps.checking import check_scene
 from wrf_mi.core import InputError
+from wrf_mi.core.array_files import write_arrays
 from wrf_mi.scene import coordinates
 from wrf_mi.scene.coordinates import Y_UP, check_extent, extra_package
 from wrf_mi.scene.make import is_plan, make_scene
@@ -84,7 +85,7 @@ def test_coordinates_that_are_not_metres_are_refused():
 
 def test_plans_and_scans_are_distinguished(tmp_path):
     for arrays, plan in (({"xyz_m": POINTS}, False), ({"xy_m": POINTS[:, :2]}, True), ({"log_odds": POINTS}, True)):
-        np.savez(tmp_path / "a.npz", **arrays)
+        write_arrays(tmp_path / "a.npz", arrays)
         assert is_plan(tmp_path / "a.npz") is plan
     assert [is_plan(tmp_path / name) for name in ("a.png", "a.csv", "a.las")] == [True, True, False]
 
@@ -223,7 +224,7 @@ def test_scan_in_feet_is_refused_until_its_unit_is_given_and_one_of_two_units_is
     assert "stated-units" in {finding.kind for finding in check_scene(file).of_level("warning")}
     assert "stated-units" not in {finding.kind for finding in check_scene(file, units="ft").findings}
     made = make_scene(file, tmp_path / "scene", units="ft")
-    vertices_m = [trimesh.load(mesh).vertices for mesh in (made.folder / "meshes").iterdir()]
+    vertices_m = [trimesh.load_mesh(mesh).vertices for mesh in (made.folder / "meshes").iterdir()]
     size = np.ptp(np.concatenate(vertices_m), axis=0)
     np.testing.assert_allclose(size, trimesh.util.concatenate(closed_box()).extents, atol=0.02)
 
@@ -253,7 +254,7 @@ def halves(points: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]
 def write_pcd(file: Path, points: np.ndarray) -> None:
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     kind = file.stem
-    open3d.io.write_point_cloud(str(file), cloud, write_ascii=kind == "ascii", compressed=kind == "compressed")
+    open3d.io.write_point_cloud(file, cloud, write_ascii=kind == "ascii", compressed=kind == "compressed")
 
 
 def write_e57(file: Path, points: np.ndarray) -> None:
