@@ -25,6 +25,7 @@ from ..datasets.labelled import LabelledPrediction, ordered
 from ..estimators.checks import check_inputs
 from ..estimators.gaussian.model import FittedField
 from ..estimators.model import UNUSED_HEADING, UNUSED_UPLINK
+from ..estimators.own_readings import DeviceOffset, ForDevice, OwnReadings, device_offset
 from ..estimators.receiver_places import stored_problem
 from ..models import Fitted, Inputs, Model, Problem
 from ..parallel import PartsProgress, Scheduler, row_parts
@@ -48,6 +49,7 @@ class Run:
         record: data that the model was fitted to; None: the data set that the folder names.
         operator: learned fields predict by operator where they can.
         scene: edited copy of the scene that the model was fitted in, to predict in; None: that scene.
+        own: readings of the device that it predicts for, whose offset they tell; None: any device, of unknown offset.
         owner: object that is kept alive with the run, such as a scene in a temporary folder.
 
     >>> import wrf_mi
@@ -61,6 +63,7 @@ class Run:
     operator: bool = True
     scene: str | Path | None = None
     owner: Any = field(default=None, repr=False, compare=False)
+    own: OwnReadings | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Accept the folder's name as text."""
@@ -95,6 +98,8 @@ class Run:
     @cached_property
     def fitted(self) -> Fitted:
         """Fitted model; `InputError`: not a finished run, or a run with several splits."""
+        if self.own is not None:
+            return ForDevice(replace(self, own=None).fitted, self.device)
         if self.scene is not None:
             try:
                 return replace(self, scene=None).fitted.in_scene(str(self.scene))
@@ -108,6 +113,35 @@ class Run:
     def in_scene(self, scene: str | Path | Any) -> Run:
         """The run in an edited copy of its scene, a `wrf_mi.Scene` or folder; of hybrids, of the corrected scene."""
         return replace(self, scene=getattr(scene, "folder", scene), owner=(self.owner, scene))
+
+    def with_readings(self, tx_pos_m: ArrayLike, power_dbm: ArrayLike) -> Run:
+        """The run as it predicts for one device, a handful of whose readings tell its offset (`device`).
+
+        Args:
+            tx_pos_m: where they were taken [m, 3], metres.
+            power_dbm: received power [n_rx, m], dBm, receivers in the order of ``receivers``; NaN: nothing received.
+
+        Raises:
+            InputError: a run of another task or without standard deviations, or arrays of other shapes.
+        """
+        own = OwnReadings(np.atleast_2d(np.asarray(tx_pos_m, float)), np.asarray(power_dbm, float))
+        wanted, task = (len(self.receivers), len(own.tx_pos_m)), self.problem.record.task
+        if not task.in_decibel or task.axes:
+            raise InputError(f"{self.folder}: predicts {task.name}; readings tell offsets of signal strengths alone")
+        if own.power_dbm.shape != wanted or own.tx_pos_m.shape[1:] != (3,):
+            shapes = f"{list(own.tx_pos_m.shape)} and {list(own.power_dbm.shape)}"
+            raise InputError(f"own readings {shapes}; give positions [m, 3] and strengths [{wanted[0]}, m]")
+        return replace(self, own=own)
+
+    @cached_property
+    def device(self) -> DeviceOffset:
+        """Offset of the device that ``own`` readings are of; that of any device without them."""
+        any_device = replace(self, own=None)
+        try:
+            none = OwnReadings(np.zeros((0, 3)), np.zeros((len(any_device.receivers), 0)))
+            return device_offset(any_device.fitted, self.own or none)
+        except InputError as error:
+            raise InputError(f"{self.folder}: {error}") from None
 
     @property
     def receivers(self) -> tuple[Receiver, ...]:
@@ -317,7 +351,7 @@ class Run:
                 collect(parts[part], receiver, prediction)
             predictions.clear()  # the scheduler keeps results to the end
 
-        opener = partial(open_run, self.folder, operator=self.operator, scene=self.scene)
+        opener = partial(open_run, self.folder, operator=self.operator, scene=self.scene, own=self.own)
         sizes = [p.stop - p.start for p in parts]
         chosen = [inputs.rows(rows) for rows in parts]
         scheduler.map(_predict_part, chosen, opener, what="predicting", sizes=sizes, each=each, lines=True)
@@ -358,7 +392,13 @@ def load_fitted(config: RunConfig, problem: Problem, part: Path) -> tuple[Fitted
         return config.entry.load(arrays, visible, part), seconds
 
 
-def open_run(folder: str | Path, record: Record | None = None, operator: bool = True, scene: Any = None) -> Run:
+def open_run(
+    folder: str | Path,
+    record: Record | None = None,
+    operator: bool = True,
+    scene: Any = None,
+    own: OwnReadings | None = None,
+) -> Run:
     """Open a run: ``open_run(folder).predict(tx_pos_m, receiver)`` predicts what a receiver observes.
 
     Arguments are the attributes of `Run`; `InputError` where the folder is none of a run.
@@ -368,7 +408,7 @@ def open_run(folder: str | Path, record: Record | None = None, operator: bool = 
     >>> open_run(run.folder).config.model
     'idw'
     """
-    run = Run(Path(folder), record, operator, scene)
+    run = Run(Path(folder), record, operator, scene, own=own)
     _ = run.config
     return run
 

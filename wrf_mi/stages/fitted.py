@@ -130,6 +130,8 @@ class FittedMixture(Fitted):
 
     def __post_init__(self) -> None:
         self._distance = RowDistance.of_rows(self.problem.record, self.known)
+        told = [part.run_sd_db for part in self.parts.values() if part.run_sd_db is not None]
+        self.run_sd_db = max(told, default=None)
         model = self.parts.get(self.name)
         if model is not None:
             self.receivers, self.uses_heading, self.carriers_hz = model.receivers, model.uses_heading, model.carriers_hz

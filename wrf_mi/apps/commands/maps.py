@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core import InputError
-from .options import Arguments, add_command, add_scheduler, refuse
+from .options import Arguments, add_command, add_own, add_scheduler, refuse
 from .output import Watch, show, summary_table
 
 
@@ -38,6 +38,7 @@ def _add_map(commands: Any) -> None:
     text = "yaw of the transmitter, degrees, for models that know it (default: mean over 8 headings)"
     add("--heading", type=float, metavar="DEG", help=text)
     add("--frequency", type=float, metavar="HZ", help="carrier, where the data have several")
+    add_own(parser)
     add_scheduler(parser)
 
 
@@ -48,11 +49,12 @@ def map_command(a: Arguments) -> int:
     from ...runs.run import open_run
     from ..maps.api import radio_map
     from ..maps.dataset import check_map_file, write_map
+    from ..maps.locate_file import device_text, read_own
     from ..maps.picture import map_figure
 
     out = Path(a.out)
     check_map_file(out)
-    run = open_run(a.run)
+    run = open_run(a.run) if a.own is None else read_own(open_run(a.run), a.own)
     options = {"height_m": a.height, "step_m": a.step, "surface": a.surface, "receivers": a.receiver}
     options |= {"threshold_dbm": a.threshold, "transmit_dbm": a.transmit_power}
     options |= {"heading_deg": a.heading, "frequency_hz": a.frequency}
@@ -66,7 +68,7 @@ def map_command(a: Arguments) -> int:
     sizes = {str(name): int(dataset.sizes[name]) for name in ("receiver", "y", "x", "point") if name in dataset.sizes}
     names = [str(name) for name in dataset.data_vars]
     shape = " x ".join(str(count) for name, count in sizes.items() if name != "receiver")
-    text = f"{shape} positions, {sizes['receiver']} receivers: {out}\npicture: {picture}"
+    text = f"{device_text(run)}{shape} positions, {sizes['receiver']} receivers: {out}\npicture: {picture}"
     return show(a.json, {"out": str(out), "picture": str(picture), "sizes": sizes, "variables": names}, text)
 
 
@@ -127,6 +129,7 @@ def _add_locate(commands: Any) -> None:
     add("--height", type=float, metavar="M", help="height of the transmitters (default: that of the run's data)")
     text = "standard deviation of the transmitter's power about that of the data (default: chosen by held-out rows)"
     add("--offset", type=float, metavar="DB", help=text)
+    add_own(parser)
 
 
 def locate_command(a: Arguments) -> int:
@@ -142,6 +145,8 @@ def locate_command(a: Arguments) -> int:
     if a.posterior is not None and Path(a.posterior).suffix.lower() != ".npz":
         raise InputError(f"{a.posterior}: probabilities are written as .npz; give such a name")
     run = located_run(a.run)
+    if a.own is not None:
+        run = files.read_own(run, a.own)
     if a.observed is not None:
         strengths_dbm, true_m = files.read_observations(
             a.observed, run.receivers, run.config.left_out, run.problem.record.source
@@ -157,7 +162,7 @@ def locate_command(a: Arguments) -> int:
     if a.posterior is not None:
         write_arrays(Path(a.posterior), files.posterior_arrays(located), compressed=True)
     figures = files.figures_of(located, true_m)
-    text = f"{_summary(figures)}\n{len(located)} positions: {out}\npicture: {picture}"
+    text = f"{files.device_text(run)}{_summary(figures)}\n{len(located)} positions: {out}\npicture: {picture}"
     return show(a.json, {"out": str(out), "picture": str(picture), **figures}, text)
 
 

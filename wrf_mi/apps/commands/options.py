@@ -154,6 +154,12 @@ def add_scheduler(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scheduler", metavar="WHERE", help=text)
 
 
+def add_own(parser: argparse.ArgumentParser) -> None:
+    """Add ``--own``."""
+    text = "readings of the device to predict for, whose offset they tell: positions x, y and strengths, as of locate"
+    parser.add_argument("--own", metavar="FILE.csv", help=text)
+
+
 def add_operator(parser: argparse.ArgumentParser) -> None:
     """Add ``--no-operator``."""
     text = "splat each spectrum, also where geometry is static and one linear operator would do (docs/speed.md)"

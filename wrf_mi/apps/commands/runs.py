@@ -12,6 +12,7 @@ from .options import (
     add_command,
     add_n_train,
     add_operator,
+    add_own,
     add_replace,
     add_scheduler,
     check_operator,
@@ -125,6 +126,7 @@ def _add_predict(commands: Any) -> None:
     parser.add_argument("--out", required=True, metavar="FILE", help=text)
     text = "edited copy of the scene that the run was trained in (wrf-mi edit), in which to predict; nothing is fitted"
     parser.add_argument("--scene", metavar="SCENE", help=text)
+    add_own(parser)
     add_operator(parser)
     add_scheduler(parser)
 
@@ -134,14 +136,17 @@ def predict_command(a: Arguments) -> int:
     from ...parallel import open_scheduler
     from ...runs.prediction_file import read_inputs
     from ...runs.run import open_run
+    from ..maps.locate_file import device_text, read_own
 
     check_operator(a)
     inputs = read_inputs(a.tx, a.input)
     with open_scheduler(a.scheduler) as scheduler:
         run = open_run(a.run, operator=not a.no_operator, scene=a.scene)
+        if a.own is not None:
+            run = read_own(run, a.own)
         shapes = run.predict_to_file(inputs, Path(a.out), scheduler if a.scheduler else None, progress=True)
     value = {"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}}
-    return show(a.json, value, f"{shapes['tx_pos'][0]} predictions: {a.out}")
+    return show(a.json, value, f"{device_text(run)}{shapes['tx_pos'][0]} predictions: {a.out}")
 
 
 def _add_compare(commands: Any) -> None:

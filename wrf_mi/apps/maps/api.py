@@ -237,7 +237,11 @@ def map_values(
     run.check_inputs(conditions.inputs(positions_m[every]))  # before a line of progress
     if scheduler is None:
         on_progress("mapping", 0.0)
-    opener: Any = (lambda: run) if scheduler is None else partial(open_run, run.folder, operator=run.operator)
+    opener: Any = (
+        (lambda: run)
+        if scheduler is None
+        else partial(open_run, run.folder, operator=run.operator, scene=run.scene, own=run.own)
+    )
     chosen, sizes = [positions_m[part] for part in rows], list(map(len, rows))
     function = partial(_mapped_part, receivers, conditions)
     with _each_warning_once():

@@ -94,7 +94,7 @@ def located_run(run: str | Path | Run) -> Run:
         raise InputError(f"{opened.folder}: its data have several carriers; give a run on data of one carrier")
     if opened.scene is not None:
         raise InputError(f"{opened.folder}: rows of the scene of the fit calibrate positions; omit the edited scene")
-    _ = opened.fitted
+    _ = replace(opened, own=None).fitted
     if load_rows(opened.folder, record).held_receivers:
         raise InputError(f"{opened.folder}: its split holds receivers out; give a run trained on all receivers")
     return opened
@@ -124,7 +124,7 @@ def locate(
         height_m: height of the transmitters; None: the median of the training rows.
         level: probability that regions hold.
         offset_db: standard deviation of an unknown offset of the transmitter's power from that of the training rows'
-            transmitter; None: as chosen by held-out rows.
+            transmitter; None: as chosen by held-out rows, or that of the device of ``run.own``.
         on_progress: progress callback.
         stop: stop condition, called wherever nothing would be lost.
 
@@ -157,6 +157,10 @@ def locate(
     run = located_run(run)
     record, observed = run.problem.record, np.asarray(of_receivers(observed_dbm, run.receivers), float)
     _check(run, observed, level, offset_db)
+    if run.own is not None:  # what the mean device would have received
+        device, run = run.device, replace(run, own=None)
+        observed = observed - device.mean_db
+        offset_db = device.std_db if offset_db is None else offset_db
     candidates = candidates_of(run, step_m, height_m)
     session = Session(run.folder, run.folder, on_progress, stop)
     try:

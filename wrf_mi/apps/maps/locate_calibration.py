@@ -81,8 +81,10 @@ def predict_candidates(
     for part in slices(len(positions), TOGETHER):
         for number in range(headings):
             turned = np.full(part.stop - part.start, 2 * np.pi * number / headings) if headings > 1 else None
+            # Without the offset of an unknown device, which all receivers have in common: the likelihood has it.
+            inputs = Inputs(positions[part], turned, runs=np.full(part.stop - part.start, ""))
             for place, receiver in enumerate(receivers):
-                prediction = fitted.predict(Inputs(positions[part], turned), int(receiver))
+                prediction = fitted.predict(inputs, int(receiver))
                 if prediction.std is None:
                     raise InputError("its model states no standard deviation; train it with --intervals")
                 predicted[:, number, place, part] = prediction.mean, prediction.std

@@ -27,6 +27,7 @@ from ...tasks.scores import summary
 from ..importing.importing import FACTS
 from ..importing.observed import ObservedTable, read_observed
 from ..importing.readings import id_key
+from .grid import usual_height
 from .locate import LocatedPositions
 
 logger = logging.getLogger(__name__)
@@ -41,8 +42,41 @@ TRUTH: dict[str, Any] = {"marker": "*", "markersize": 11, "color": "white", "mar
 TRUTH |= {"linestyle": "none", "label": "true position"}
 
 
+def read_own(run: Run, path: str | Path) -> Run:
+    """The run as it predicts for the device of a table's readings, whose offset they tell (`Run.with_readings`).
+
+    The table is one of `read_observations` with positions x, y; those at which no receiver of the run received anything
+    tell nothing. They lie at the height of the transmitters in the run's data.
+
+    Raises:
+        InputError: a table that is not readable, without positions or without a reading of a receiver of the run.
+    """
+    record = run.problem.record
+    values, xy_m = read_observations(path, run.receivers, run.config.left_out, record.source, silent=True)
+    if xy_m is None:
+        raise DataFault(Path(path), "own readings without positions; give columns x, y in metres", line=1)
+    heard = np.isfinite(values).any(axis=0)
+    if not heard.any():
+        raise DataFault(Path(path), "no receiver of the run received anything; give readings of its receivers")
+    height_m = usual_height(run, record.tx_pos_m)
+    return run.with_readings(np.column_stack([xy_m[heard], np.full(heard.sum(), height_m)]), values[:, heard])
+
+
+def device_text(run: Run) -> str:
+    """Offset of the device of own readings in a line; "": none were given."""
+    if run.own is None:
+        return ""
+    offset = run.device
+    text = f"this device: {offset.mean_db:+.1f} +- {offset.std_db:.1f} dB against those of the data"
+    return f"{text}, by {offset.readings} of its readings\n"
+
+
 def read_observations(
-    path: str | Path, receivers: Sequence[Receiver], left_out: Collection[str] = (), data: str | Path | None = None
+    path: str | Path,
+    receivers: Sequence[Receiver],
+    left_out: Collection[str] = (),
+    data: str | Path | None = None,
+    silent: bool = False,
 ) -> tuple[FloatArray, FloatArray | None]:
     """Read the signal strengths [n_rx, m] of each receiver, and true positions [m, 2] or None, from a table.
 
@@ -57,6 +91,7 @@ def read_observations(
         receivers: receivers of the run.
         left_out: names of receivers that the run left out of its data.
         data: folder of the run's data, whose ``import.yml``, if any, states the frame of positions.
+        silent: whether rows without any strength are kept.
 
     Raises:
         InputError: missing or unreadable, receivers without a column or with several, columns of unknown receivers, a
@@ -68,12 +103,12 @@ def read_observations(
     # A table that was imported may have columns named as in data sets, and positions in another frame.
     was_imported = path.name in facts.get("files", ()) and path.resolve().parent != Path(data or "").resolve()
     if was_imported or not _has_layout(path, names):
-        return _imported(read_observed(path, facts), names, left_out)
+        return _imported(read_observed(path, facts), names, left_out, silent)
     table = read_csv(path, skip_blank=True)
     columns = _columns(table, names, left_out, imported=bool(facts))
     values = np.stack([table.numbers(column, may_be_empty=True) for column in columns])
-    if len(silent := _silent(values)):
-        raise DataFault(table.path, SILENT, row=int(silent[0]) + 1)
+    if len(rows := _silent(values)) and not silent:
+        raise DataFault(table.path, SILENT, row=int(rows[0]) + 1)
     stated = [axis for axis in "xy" if axis in table.header]
     if len(stated) == 1:
         raise DataFault(table.path, f"column {stated[0]} alone is no position; give x and y, or neither", line=1)
@@ -90,7 +125,7 @@ def _has_layout(path: Path, names: Sequence[str]) -> bool:
 
 
 def _imported(
-    observed: ObservedTable, names: Sequence[str], left_out: Collection[str]
+    observed: ObservedTable, names: Sequence[str], left_out: Collection[str], silent: bool
 ) -> tuple[FloatArray, FloatArray | None]:
     """Strengths [n_rx, m] of the receivers of a run from a table, and true positions [m, 2] or None."""
     numbers = {key: number for number, name in enumerate(names) for key in _keys(name)}
@@ -105,8 +140,8 @@ def _imported(
         logger.warning("%s: %d receivers unknown to the run are not used: %s", file, len(unknown), listed(unknown))
     values = np.full((len(names), len(observed.first_row)), np.nan)
     values[np.array(number_of)[heard]] = observed.dbm[heard]
-    if len(silent := _silent(values)):
-        raise observed.table.fault(SILENT, int(observed.first_row[silent[0]]))
+    if len(rows := _silent(values)) and not silent:
+        raise observed.table.fault(SILENT, int(observed.first_row[rows[0]]))
     return values, observed.xy_m
 
 

@@ -92,6 +92,7 @@ class Strengths(Fitted):
     def __post_init__(self) -> None:
         """Headings count where the training rows had them."""
         self.uses_heading = self.field.headings
+        self.run_sd_db = None if self.offsets is None else self.offsets.sd_db
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Signal strengths in dBm with standard deviations of a reading and of the local mean power, see `Fitted`.
