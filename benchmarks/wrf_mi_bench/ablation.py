@@ -9,7 +9,7 @@ where the interval of its held-out gain lies above zero on two data sets.
 import inspect
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -19,11 +19,9 @@ from unittest.mock import patch
 
 import numpy as np
 
-import wrf_mi
-from wrf_mi.core import InputError, Record, Split
+from wrf_mi.core import Record, Split
 from wrf_mi.core.angles import FloatArray
-from wrf_mi.datasets import load, make_splits
-from wrf_mi.datasets.registry import data_home
+from wrf_mi.datasets import make_splits
 from wrf_mi.estimators.held_out import fit_fold
 from wrf_mi.estimators.interpolation import pooled_process, strength_fit, strength_settings, strength_terms, strengths
 from wrf_mi.estimators.interpolation import strength_trees as trees
@@ -34,10 +32,10 @@ from wrf_mi.tasks.scores import bootstrap
 from wrf_mi.training.selection import hold_out
 
 from .bench import FLAT
+from .buildings import CAMPUS, FLOOR, measured_set
 from .comparison import line, measured_on, say, stored_part
 from .declared import pivoted
 
-CAMPUS, FLOOR = "duke-cbrs", "wifi-office"  # folders of measured data beside the known data sets
 CELLS = ((FLAT, 64), (FLAT, 400), (CAMPUS, 64), (CAMPUS, 200), (FLOOR, None))
 """Data sets and numbers of training rows; None: all."""
 SEED = 0
@@ -74,18 +72,6 @@ MECHANISMS: Mapping[str, Mechanism] = {
     "Student-t noise": Mechanism(((strengths, "ROBUST_ROUNDS", 0),), code=(pooled_process.PooledProcess._reweighted,)),
     "joined stops": Mechanism(((strengths, "STOP_ROWS", 1),), code=(strength_terms.stops_of,)),
 }
-
-
-def records(folder: Path) -> Iterator[tuple[Record, int | None]]:
-    """Records of the cells and their numbers of rows; `InputError` where measured data are not on this machine."""
-    for name, count in CELLS:
-        place = data_home() / name
-        if name != FLAT and not place.exists():
-            raise InputError(f"{name}: not in {data_home()}; give a folder of measured data by WRF_MI_DATA")
-        if name == FLOOR and not (folder / name).exists():
-            train, test = ([str(place / f"database_office_{part}.csv")] for part in ("train", "test"))
-            wrf_mi.import_measurements(train, folder / name, test=test, pitch_m=0.6)
-        yield load(name if name == FLAT else folder / name if name == FLOOR else place), count
 
 
 def errors(record: Record, split: Split, rows: Any, mechanism: Mechanism) -> FloatArray:
@@ -134,7 +120,8 @@ def main() -> dict[str, Any]:
     """Measure the cells that are not stored; ``rows`` has a line for each cell and mechanism."""
     rows, parts = list[dict[str, Any]](), list[dict[str, Any]]()
     with tempfile.TemporaryDirectory() as folder:
-        for record, count in records(Path(folder)):
+        for name, count in CELLS:
+            record = measured_set(Path(folder), name)
             cell = f"{record.name}, {'all' if count is None else count} rows"
             parts.append(stored_part("ablation", f"{record.name}-{count or 'all'}", partial(measured, record, count)))
             rows += [{**row, "cell": cell} for row in parts[-1]["rows"]]

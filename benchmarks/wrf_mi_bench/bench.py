@@ -115,6 +115,8 @@ _OWN: Mapping[str, Check] = {
         **_STORED,
     ),
     "ablation": _here("mechanisms of signal strengths", "ablation:main", FLAT, resumes=True, table="ablation:table"),
+    "buildings": _here("measured buildings", "buildings:main", FLAT, resumes=True, table="buildings:table"),
+    "devices": _here("own readings of a device", "buildings:devices", resumes=True, table="buildings:devices_table"),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),
     "fdtd": _here("Maxwell's equations in a toy scene", "fdtd:main", table="fdtd:table"),
     "far-scans": _here("scans off by wavelengths", "far_scans:main", resumes=True, table="far_scans:table"),

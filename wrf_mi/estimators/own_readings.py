@@ -1,9 +1,11 @@
 """Predictions for a device whose offset a handful of its own readings tell.
 
 Phones differ by decibels, and how they are held: what one receives lies above or below what a model of other phones'
-readings predicts, at all receivers alike. The offset is normal a priori, with the deviation of the runs of the data.
+readings predicts, at all receivers alike. The offset has a Student-t prior with the scale of the runs of the data: the
+device may be of another make than theirs.
 
-Source: Robinson, "That BLUP is a good thing: the estimation of random effects" (1991), Statistical Science 6(1).
+Source: Robinson, "That BLUP is a good thing: the estimation of random effects" (1991), Statistical Science 6(1); Lange,
+Little and Taylor, "Robust statistical modeling using the t distribution" (1989), JASA 84.
 """
 
 from __future__ import annotations
@@ -16,12 +18,14 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Prediction
 from ..core.angles import FloatArray
+from .interpolation.pooled_process import DEGREES
 from .interpolation.run_offsets import NEAR_M, RUN_SD_DB
 from .model import Arrays, Decomposition, Fitted, Inputs
 
-PLACE_DB = 3.0
-"""Standard deviation of what the receivers of one place have in common, such as a crowd: ten readings of a place tell
-little more than three."""
+PLACE_DB = 6.0
+"""Standard deviation of the error that all readings of a place have in common, by walks of a shopping centre that were
+held out: ten readings of a place tell little more than three."""
+ROUNDS = 20  # reweightings of the prior, which converge by a factor of two each
 
 
 @dataclass(frozen=True)
@@ -79,9 +83,13 @@ def device_offset(fitted: Fitted, own: OwnReadings) -> DeviceOffset:
     told = weight > 0
     residual_db, precision = weighted[told] / weight[told], 1 / (PLACE_DB**2 + 1 / weight[told])
     sd_db = RUN_SD_DB if fitted.run_sd_db is None else fitted.run_sd_db
-    variance = 1 / (sd_db**-2 + precision.sum())
-    readings = int(np.isfinite(own.power_dbm).sum())
-    return DeviceOffset(float(variance * (precision @ residual_db)), float(np.sqrt(variance)), readings)
+    mean_db, variance = 0.0, sd_db**2
+    for _ in range(ROUNDS if told.any() else 0):
+        # The scale that a Student-t prior has at the offset so far.
+        prior = sd_db**2 * (DEGREES + mean_db**2 / sd_db**2) / (DEGREES + 1)
+        variance = 1 / (1 / max(prior, sd_db**2) + precision.sum())
+        mean_db = float(variance * (precision @ residual_db))
+    return DeviceOffset(mean_db, float(np.sqrt(variance)), int(np.isfinite(own.power_dbm).sum()))
 
 
 class ForDevice(Fitted):
