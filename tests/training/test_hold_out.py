@@ -15,7 +15,7 @@ from wrf_mi.core import Receiver, Record, Split
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.tasks.scores import ssim
 from wrf_mi.training.fit_plan import FitPlan
-from wrf_mi.training.selection import FAR_POSITIONS, HELD_OUT, cells, hold_out, hold_out_far
+from wrf_mi.training.selection import FAR_POSITIONS, HELD_OUT, HeldOut, cells, hold_out, hold_out_far
 from wrf_mi.training.trainer import Trainer
 
 FACTOR = 1.6
@@ -197,3 +197,21 @@ def test_no_receiver_loses_its_batches_to_far_validation_rows():
         np.testing.assert_array_equal(FitPlan(both, split, quick(f"batch={batch}")).choosing.train, train)
     every = replace(both, receivers=RECEIVERS[:1], observation=strengths[:1])
     np.testing.assert_array_equal(FitPlan(every, split, quick("batch=4")).choosing.train, far.train)
+
+
+def test_runs_are_held_out_where_other_runs_are_predicted() -> None:
+    rng = np.random.default_rng(0)
+    runs = np.repeat(list("abcdefgh"), 30)
+    record = replace(record_of(rng.uniform(0, 20, (240, 3))), runs=runs)
+    rows = np.arange(240)
+    fold = hold_out(record, Split("made", 0, rows[:180], rows[:0], rows[180:]))
+    assert fold is not None
+    assert not {*runs[fold.test]} & {*runs[fold.all_train]}
+    assert 0.1 < len(fold.test) / 180 <= 0.5
+    held_out = HeldOut.of(record, fold, 0)
+    assert all(len({*held_out.group[runs[held_out.row] == run]}) == 1 for run in np.unique(runs[fold.test]))
+    # Runs that train are predicted, or too few train: by place.
+    for split in (Split("made", 0, rows[::2], rows[:0], rows[1::2]), Split("made", 0, rows[:60], rows[:0], rows[180:])):
+        fold = hold_out(record, split)
+        assert fold is not None
+        assert {*runs[fold.test]} & {*runs[fold.all_train]}

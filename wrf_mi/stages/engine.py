@@ -195,8 +195,9 @@ class Engine:
     def _scores(self, fold: Fold, plan: Plan, stage: Stage) -> FloatArray:
         """Mean scores of the independent units of rows that judge a stage by a chain, the higher the better."""
         record, judging = self._problem.record, np.flatnonzero(stage.judging(self._split, fold.held_out.row))
-        means = self._predicted(fold, plan).mean[None, judging]
-        of_each = record.task.mixtures(means, fold.held_out.observed(record)[judging])
+        mean = self._predicted(fold, plan).mean
+        observed = stage.judged(record, fold.held_out, mean)[judging]
+        of_each = record.task.mixtures(mean[None, judging], observed)
         return unit_means(of_each(np.ones((len(judging), 1)), np.arange(len(judging))), self._unit(fold)[judging])
 
     def _path(self, plan: Plan, finish: bool = False) -> Path:

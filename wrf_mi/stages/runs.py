@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
-from ..core import Split
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core import Record, Split
 from ..datasets.observations import LEAST_RUNS, trained_runs
 from ..estimators.model import Problem, Session
+from ..training.selection import HeldOut
 from .stage import Option, Stage, State
 
 POOLED, OFFSETS = "pooled", "offsets"
@@ -23,7 +28,16 @@ class Runs(Stage):
         """Both, which held-out runs choose from; none without several runs."""
         if not LEAST_RUNS <= len(trained_runs(problem.record, split.all_train)) <= MOST_RUNS:
             return []
-        return [Option(POOLED, self._pooled), Option(OFFSETS, self._offsets)]
+        return [Option(POOLED, self._pooled), Option(OFFSETS, self._offsets, freedom=1)]
+
+    def judged(self, record: Record, held_out: HeldOut, mean: NDArray[Any]) -> NDArray[Any]:
+        """Observations without the offset that predictions leave of each held-out run, which neither option knows."""
+        observed = held_out.observed(record)
+        if record.runs is None:
+            return observed
+        _, run = np.unique(record.runs[held_out.row], return_inverse=True)
+        offset = np.bincount(run, observed - mean) / np.bincount(run)
+        return np.asarray(observed - offset[run])
 
     def _pooled(self, state: State, split: Split, session: Session) -> State:
         return state

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import Split
+from ..core import Record, Split
 from ..core.types import FloatArray, IntArray
 from ..estimators.model import Fitted, Problem, Session
+from ..training.selection import HeldOut
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,10 @@ class Stage(ABC):
     def judging(self, split: Split, row: IntArray) -> NDArray[np.bool_]:
         """Which held-out rows [q] judge the options of a fit to a split; all but those that its fits have seen."""
         return np.ones(len(row), bool)
+
+    def judged(self, record: Record, held_out: HeldOut, mean: NDArray[Any]) -> NDArray[Any]:
+        """What predictions [q, ...] of held-out rows are judged by: their observations [q, ...]."""
+        return held_out.observed(record)
 
     def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
         """An option for all rows, given the state that the rows of a fold led to.

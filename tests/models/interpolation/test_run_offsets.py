@@ -1,0 +1,84 @@
+"""Offsets of the runs of a measurement, and predictions for other runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_walks import STEPS, walked
+
+from wrf_mi.core import Record, Split
+from wrf_mi.core.stored import from_arrays, to_arrays
+from wrf_mi.datasets import make_splits
+from wrf_mi.estimators.interpolation import strengths
+from wrf_mi.estimators.interpolation.run_offsets import RUN_SD_DB, RunOffsets
+from wrf_mi.estimators.interpolation.strengths import Strengths, fit_strengths
+from wrf_mi.estimators.model import Inputs
+from wrf_mi.runs.api import train
+
+OFFSETS = dict(zip("abcdefghij", (9.0, -8.0, 5.0, -6.0, 0.0, 7.0, -4.0, -3.0, 0.0, 0.0), strict=True))
+WITHIN_DB = 1.5
+"""Of an offset: a walk crosses seven others at two or three stops of eight receivers each, whose noise and shadowing
+over a metre make 3 dB a difference."""
+
+
+@pytest.fixture(scope="module")
+def record() -> Record:
+    return walked(OFFSETS)
+
+
+@pytest.fixture(scope="module")
+def split(record: Record) -> Split:
+    return make_splits(record, "official")[0]
+
+
+@pytest.fixture(scope="module")
+def fitted(record: Record, split: Split) -> Strengths:
+    return fit_strengths(record, split.all_train, runs=True)
+
+
+def test_offsets_are_told_where_runs_cross(fitted: Strengths) -> None:
+    assert fitted.offsets is not None
+    true = np.array([OFFSETS[name] for name in fitted.offsets.names])
+    np.testing.assert_allclose(fitted.offsets.offset_db, true - true.mean(), atol=WITHIN_DB)
+    assert fitted.offsets.sd_db == pytest.approx(true.std(), rel=0.4)  # of eight draws
+
+
+def test_runs_that_never_meet_have_no_offsets() -> None:
+    record = walked({"a": 9.0, "b": -9.0, "c": 0.0, "d": 0.0, "e": 0.0})
+    apart = record.tx_pos_m + np.repeat(np.arange(5), STEPS)[:, None] * [0.0, 1000.0, 0.0]
+    # Their stops are compared, as no run is nearer, and differ by all that changes over a kilometre.
+    near = strengths._measured(replace(record, tx_pos_m=apart), np.arange(len(apart)), False)
+    alone = replace(near, poses=replace(near.poses, run=np.zeros(len(near.rows), int)))
+    offsets = RunOffsets.fit(strengths._stops(alone), ["a"])
+    assert (offsets.sd_db, offsets.offset_db.tolist()) == (RUN_SD_DB, [0.0])
+
+
+def test_another_run_is_as_uncertain_as_runs_differ(fitted: Strengths, record: Record) -> None:
+    assert fitted.offsets is not None
+    where = record.tx_pos_m[:4]
+    other, mean, known = (
+        fitted.predict(Inputs(where, runs=runs), 0) for runs in (None, np.full(4, ""), np.full(4, "a"))
+    )
+    assert other.std is not None
+    assert mean.std is not None
+    np.testing.assert_allclose(other.mean, mean.mean)
+    np.testing.assert_allclose(other.std**2 - mean.std**2, (fitted.offsets.sd_db * fitted.widen[0]) ** 2)
+    np.testing.assert_allclose(known.mean - mean.mean, fitted.offsets.offset_db[0])
+    np.testing.assert_allclose(fitted.predict_mean(Inputs(where, runs=np.full(4, "a")), 0), known.mean)
+    again = from_arrays(RunOffsets, to_arrays(fitted.offsets))
+    np.testing.assert_array_equal(again.of(np.array(["b", "", "z"]), 3), fitted.offsets.of(np.array(["b", "", "z"]), 3))
+
+
+def test_the_engine_takes_offsets_where_runs_differ(record: Record, tmp_path: Path) -> None:
+    of_runs = {}
+    for name, data in {"offsets": record, "pooled": walked(dict.fromkeys(OFFSETS, 0.0))}.items():
+        run = train(data, "kriging", split="official", out=tmp_path / name)
+        taken = [each["option"] for each in run.metrics["options"] if each["stage"] == "runs" and each["taken"]]
+        of_runs[name] = (taken, run.metrics["abs_error_db"]["median"], run.metrics["inside_90"])
+    assert of_runs["offsets"][0] == ["offsets"]
+    # Test walks have no offset: what offsets of the others leave is little more than without any.
+    assert of_runs["offsets"][1] < of_runs["pooled"][1] + 1
+    assert of_runs["offsets"][2] > 0.85
