@@ -97,9 +97,9 @@ def test_import_states_columns_assumptions_and_the_next_command(
     status, out, err = command(importing)
     assert (status, err) == (0, "")
     for line in (
-        "PCI        id                         120",
-        "latitude   lat             EPSG:4326  120",
-        "device     kept, not used             120",
+        "PCI        id                  120",
+        "latitude   lat      EPSG:4326  120",
+        "device     run                 120",
         "projected to metres east and north",
         "by reciprocity",
         f"{folder}: no fault, no suspicion\nnext: wrf-mi train {folder} [--scene SCENE] --out RUN\n",
@@ -129,4 +129,4 @@ def test_wifi_office_imports_by_one_command(tmp_path: Path, command: Command) ->
     assert "split: 81 training and 27 test rows" in out
     command.done(["train", folder, "--model", "idw", "--out", run])
     error_db = json.loads((run / "metrics.json").read_text())["abs_error_db"]["median"]
-    assert error_db == pytest.approx(1.9, abs=0.1)
+    assert error_db == pytest.approx(2.0, abs=0.2)

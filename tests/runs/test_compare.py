@@ -208,7 +208,7 @@ UNFINISHED_LOG = '{"step": 1, "seconds": 1, "validation_score": 1, "held_out": t
         (write("metrics.json", "{"), "not readable"),
         (write("predictions.npz", "not a zip"), "predictions.npz: not readable"),
         (write("log.jsonl", UNFINISHED_LOG), "line 2 is no log entry"),
-        (write("config.yaml", "seed: 1"), "format not stated, this version reads 4; train it anew"),
+        (write("config.yaml", "seed: 1"), "format not stated, this version reads 5; train it anew"),
         (edit_metrics(task="rssi"), "no abs_error_db or no reference idw"),
         (edit_metrics(n_test=...), "no n_test"),
         (edit_metrics(reference={}), "no reference idw"),

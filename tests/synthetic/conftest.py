@@ -9,7 +9,7 @@ import trimesh
 from wrf_mi.synthetic import stored
 
 
-@pytest.fixture(scope="package", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def _coarse() -> Iterator[None]:
     sample = trimesh.sample.sample_surface
 
