@@ -29,6 +29,7 @@ ON_PAGE = {
     **dict.fromkeys(("stages", "ablation"), "hybrid.md"),
     **{"rooms": "correction.md", "locate": "locate.md", "moved": "scenes.md"},
     **dict.fromkeys(("fdtd", "far-scans"), "correction.md"),
+    **{"buildings": "results.md", "devices": "models.md"},
     **{"reception": "maps.md", "plan": "maps.md", "closed-forms": "numerics.md"},
 }
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
