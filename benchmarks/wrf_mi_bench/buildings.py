@@ -32,7 +32,7 @@ SETS = ((FLAT, 64), (FLAT, None), (CAMPUS, None), (FLOOR, None), (MALL, None))
 """Data sets and numbers of training rows; None: all."""
 HEARD = 60  # least training rows of a receiver of the shopping centre
 HYBRID, SIMPLE = "hybrid", ("kriging", "trees", "idw", "mri")
-NEAR_M = 1.0  # distance of two readings whose difference is noise
+NEAR_M, LEAST_PAIRS = 1.0, 20  # distance of two readings whose difference is noise, and fewest pairs that tell it
 OWN = (0, 1, 3, 10, 30)  # numbers of a device's own readings
 ADDED_DB = 0.0, 10.0  # offsets of phones: those of the walks, and of another make
 SEED = 0
@@ -57,9 +57,11 @@ def noise_db(record: Record) -> float:
     for received in np.asarray(record.observation, float):
         rows = np.flatnonzero(np.isfinite(received))
         pairs = rows[cKDTree(record.tx_pos_m[rows]).query_pairs(NEAR_M, output_type="ndarray")]
-        differences.append(received[pairs[:, 0]] - received[pairs[:, 1]])
+        # Of one position, rows may be repeated.
+        a, b = pairs[(record.tx_pos_m[pairs[:, 0]] != record.tx_pos_m[pairs[:, 1]]).any(axis=1)].T
+        differences.append(received[a] - received[b])
     every = np.abs(np.concatenate(differences))
-    return float(np.median(every) / np.sqrt(2)) if len(every) else np.nan
+    return float(np.median(every) / np.sqrt(2)) if len(every) >= LEAST_PAIRS else np.nan
 
 
 def measured(folder: Path, name: str, count: int | None) -> dict[str, Any]:
@@ -99,13 +101,14 @@ def main() -> dict[str, Any]:
         inside = "" if row["inside"] is None else f"; {row['inside']:.0%} inside"
         row["scores"] = f"{row['median']:.2f}, {row['mean']:.2f}{inside}"
         row["over"] = "" if row["model"] == HYBRID else f"{row['gain']:+.2f} ({row['low']:+.2f} to {row['high']:+.2f})"
+        row["bound"] = "" if np.isnan(row["noise"]) else f"{row['noise']:.2f}"
         row |= line(f"{row['cell']}: {row['model']}", row["scores"])
     return {"rows": rows, "measured": measured_on(parts)}
 
 
 table = lined(
     "| data | model | median, mean absolute error (dB) | gain of the hybrid in the mean | noise (dB) | fit (s) |",
-    "| {cell} | {model} | {scores} | {over} | {noise:.2f} | {seconds:.0f} |",
+    "| {cell} | {model} | {scores} | {over} | {bound} | {seconds:.0f} |",
 )
 
 

@@ -210,6 +210,12 @@ def test_runs_are_held_out_where_other_runs_are_predicted() -> None:
     assert 0.1 < len(fold.test) / 180 <= 0.5
     held_out = HeldOut.of(record, fold, 0)
     assert all(len({*held_out.group[runs[held_out.row] == run]}) == 1 for run in np.unique(runs[fold.test]))
+    # A run of one row alone is no hold-out, and where held-out runs were heard by nobody who trains, places are.
+    short = replace(record, runs=np.repeat(["x", "y", "z", "w"], [1, 89, 90, 60]))
+    for seed in range(6):
+        fold = hold_out(short, Split("made", seed, rows[:180], rows[:0], rows[180:]))
+        assert fold is not None
+        assert len(fold.test) > 20
     # Runs that train are predicted, or too few train: by place.
     for split in (Split("made", 0, rows[::2], rows[:0], rows[1::2]), Split("made", 0, rows[:60], rows[:0], rows[180:])):
         fold = hold_out(record, split)

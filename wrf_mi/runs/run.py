@@ -122,12 +122,14 @@ class Run:
             power_dbm: received power [n_rx, m], dBm, receivers in the order of ``receivers``; NaN: nothing received.
 
         Raises:
-            InputError: a run of another task or without standard deviations, or arrays of other shapes.
+            InputError: a run of another task or of several carriers, or arrays of other shapes.
         """
         own = OwnReadings(np.atleast_2d(np.asarray(tx_pos_m, float)), np.asarray(power_dbm, float))
         wanted, task = (len(self.receivers), len(own.tx_pos_m)), self.problem.record.task
         if not task.in_decibel or task.axes:
             raise InputError(f"{self.folder}: predicts {task.name}; readings tell offsets of signal strengths alone")
+        if self.problem.record.carriers_hz is not None:
+            raise InputError(f"{self.folder}: its data have several carriers; own readings are of one")
         if own.power_dbm.shape != wanted or own.tx_pos_m.shape[1:] != (3,):
             shapes = f"{list(own.tx_pos_m.shape)} and {list(own.power_dbm.shape)}"
             raise InputError(f"own readings {shapes}; give positions [m, 3] and strengths [{wanted[0]}, m]")
@@ -135,7 +137,10 @@ class Run:
 
     @cached_property
     def device(self) -> DeviceOffset:
-        """Offset of the device that ``own`` readings are of; that of any device without them."""
+        """Offset of the device that ``own`` readings are of; that of any device without them.
+
+        `InputError`: a model without standard deviations.
+        """
         any_device = replace(self, own=None)
         try:
             none = OwnReadings(np.zeros((0, 3)), np.zeros((len(any_device.receivers), 0)))

@@ -196,7 +196,7 @@ class Engine:
         """Mean scores of the independent units of rows that judge a stage by a chain, the higher the better."""
         record, judging = self._problem.record, np.flatnonzero(stage.judging(self._split, fold.held_out.row))
         mean = self._predicted(fold, plan).mean
-        observed = stage.judged(record, fold.held_out, mean)[judging]
+        observed = stage.judged(record, self._split, fold.held_out, mean)[judging]
         of_each = record.task.mixtures(mean[None, judging], observed)
         return unit_means(of_each(np.ones((len(judging), 1)), np.arange(len(judging))), self._unit(fold)[judging])
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import Record, Split
-from ..datasets.observations import LEAST_RUNS, trained_runs
+from ..datasets.observations import LEAST_RUNS, predicts_new_runs, trained_runs
 from ..estimators.model import Problem, Session
 from ..training.selection import HeldOut
 from .stage import Option, Stage, State
@@ -30,10 +30,10 @@ class Runs(Stage):
             return []
         return [Option(POOLED, self._pooled), Option(OFFSETS, self._offsets, freedom=1)]
 
-    def judged(self, record: Record, held_out: HeldOut, mean: NDArray[Any]) -> NDArray[Any]:
-        """Observations without the offset that predictions leave of each held-out run, which neither option knows."""
+    def judged(self, record: Record, split: Split, held_out: HeldOut, mean: NDArray[Any]) -> NDArray[Any]:
+        """Observations; of runs that are held out without what predictions leave of each, which no option knows."""
         observed = held_out.observed(record)
-        if record.runs is None:
+        if record.runs is None or not predicts_new_runs(record, split):
             return observed
         _, run = np.unique(record.runs[held_out.row], return_inverse=True)
         offset = np.bincount(run, observed - mean) / np.bincount(run)

@@ -61,8 +61,8 @@ class Stage(ABC):
         """Which held-out rows [q] judge the options of a fit to a split; all but those that its fits have seen."""
         return np.ones(len(row), bool)
 
-    def judged(self, record: Record, held_out: HeldOut, mean: NDArray[Any]) -> NDArray[Any]:
-        """What predictions [q, ...] of held-out rows are judged by: their observations [q, ...]."""
+    def judged(self, record: Record, split: Split, held_out: HeldOut, mean: NDArray[Any]) -> NDArray[Any]:
+        """What predictions [q, ...] of held-out rows of a split are judged by: their observations [q, ...]."""
         return held_out.observed(record)
 
     def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:

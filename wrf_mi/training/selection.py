@@ -196,20 +196,25 @@ def hold_out(record: Record, split: Split) -> Split | None:
         return _without_carrier(record.tx_pos_m, carriers, split)
     if predicts_new_runs(record, split):
         out = _of_runs(record, split)
-        return _fold(split, out, out)
+        fold = _fold(split, out, out)
+        numbers = np.flatnonzero(rows_received(record, fold.all_train) >= LEAST_ROWS)
+        if np.isfinite(record.observation[numbers][:, out]).any():  # held-out runs may be of other receivers
+            return fold
     out = _clusters_or_farthest(split, record.tx_pos_m)
     fold = _fold(split, out, out)
     return fold if rows_received(record, fold.all_train).max() >= LEAST_ROWS else None
 
 
 def _of_runs(record: Record, split: Split) -> IntArray:
-    """Training rows of some runs, drawn with the split's seed: about a share `HELD_OUT` of all."""
+    """Training rows of some runs, drawn with the split's seed: about a share `HELD_OUT` of all, half of it at least
+    where runs are short enough.
+    """
     assert record.runs is not None
     rows, runs = split.all_train, record.runs[split.all_train]
     out = np.zeros(len(rows), bool)
     for run in np.random.default_rng([split.seed, 13]).permutation(trained_runs(record, rows)):
         more = out | (runs == run)
-        if more.mean() <= (HELD_OUT if out.any() else MOST_HELD_OUT):
+        if more.mean() <= (HELD_OUT if 2 * out.mean() >= HELD_OUT else MOST_HELD_OUT):
             out = more
     return rows[out]
 
@@ -225,7 +230,7 @@ def _clusters_or_farthest(split: Split, tx_pos_m: FloatArray) -> IntArray:
 
 def away_as(record: Record, split: Split) -> str:
     """How far from the others the rows of `hold_out` are, in words for a report."""
-    if predicts_new_runs(record, split):
+    if not split.held_receivers and predicts_new_runs(record, split):
         return "of other runs"
     if len(split.wanted_m):
         return "as far from the others as the wanted positions (transductive)"

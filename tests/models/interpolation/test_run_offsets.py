@@ -12,7 +12,6 @@ from made_walks import STEPS, walked
 from wrf_mi.core import Record, Split
 from wrf_mi.core.stored import from_arrays, to_arrays
 from wrf_mi.datasets import make_splits
-from wrf_mi.estimators.interpolation import strengths
 from wrf_mi.estimators.interpolation.run_offsets import RUN_SD_DB, RunOffsets
 from wrf_mi.estimators.interpolation.strengths import Strengths, fit_strengths
 from wrf_mi.estimators.model import Inputs
@@ -46,14 +45,30 @@ def test_offsets_are_told_where_runs_cross(fitted: Strengths) -> None:
     assert fitted.offsets.sd_db == pytest.approx(true.std(), rel=0.4)  # of eight draws
 
 
+def offsets_of(record: Record) -> RunOffsets:
+    fitted = fit_strengths(record, np.arange(len(record)), runs=True, calibrate=False)
+    assert fitted.offsets is not None
+    return fitted.offsets
+
+
 def test_runs_that_never_meet_have_no_offsets() -> None:
     record = walked({"a": 9.0, "b": -9.0, "c": 0.0, "d": 0.0, "e": 0.0})
     apart = record.tx_pos_m + np.repeat(np.arange(5), STEPS)[:, None] * [0.0, 1000.0, 0.0]
-    # Their stops are compared, as no run is nearer, and differ by all that changes over a kilometre.
-    near = strengths._measured(replace(record, tx_pos_m=apart), np.arange(len(apart)), False)
-    alone = replace(near, poses=replace(near.poses, run=np.zeros(len(near.rows), int)))
-    offsets = RunOffsets.fit(strengths._stops(alone), ["a"])
-    assert (offsets.sd_db, offsets.offset_db.tolist()) == (RUN_SD_DB, [0.0])
+    offsets = offsets_of(replace(record, tx_pos_m=apart))
+    assert (offsets.sd_db, offsets.offset_db.tolist()) == (RUN_SD_DB, [0.0] * 5)
+
+
+def test_rows_without_a_run_and_runs_that_nobody_received_change_no_offset(record: Record) -> None:
+    every = offsets_of(record)
+    runs, observation = record.runs, record.observation.copy()
+    assert runs is not None
+    unnamed = offsets_of(replace(record, runs=np.where(runs == "a", "", runs)))
+    assert "a" not in unnamed.names
+    np.testing.assert_allclose(unnamed.offset_db, every.offset_db[1:], atol=WITHIN_DB)
+    observation[:, runs == "a"] = np.nan
+    silent = offsets_of(replace(record, observation=observation))
+    np.testing.assert_array_equal(silent.names, unnamed.names)
+    np.testing.assert_allclose(silent.offset_db, unnamed.offset_db)
 
 
 def test_another_run_is_as_uncertain_as_runs_differ(fitted: Strengths, record: Record) -> None:

@@ -94,7 +94,7 @@ def located_run(run: str | Path | Run) -> Run:
         raise InputError(f"{opened.folder}: its data have several carriers; give a run on data of one carrier")
     if opened.scene is not None:
         raise InputError(f"{opened.folder}: rows of the scene of the fit calibrate positions; omit the edited scene")
-    _ = replace(opened, own=None).fitted
+    _ = (opened if opened.own is None else replace(opened, own=None)).fitted
     if load_rows(opened.folder, record).held_receivers:
         raise InputError(f"{opened.folder}: its split holds receivers out; give a run trained on all receivers")
     return opened

@@ -150,13 +150,12 @@ class KrigingSystem:
         if trend is None:
             return np.asarray(left)
         # And that of the trend's coefficients, R^T (B^T K^-1 B)^-1 R with R = b - B^T K^-1 k (equation 2.42).
-        gap = trend - half.T @ self._trend
         if covariance is None:
+            gap = trend - half.T @ self._trend
             return np.asarray(left + (gap * np.linalg.solve(self.information, gap.T).T).sum(axis=1))
-        used = np.flatnonzero(gap.any(axis=0))  # of other receivers' terms none
-        return np.asarray(
-            left + np.einsum("mp,pq,mq->m", gap[:, used], covariance[np.ix_(used, used)], gap[:, used], optimize=True)
-        )
+        used = np.union1d(self._used, np.flatnonzero(trend.any(axis=0)))  # of other receivers' terms none
+        gap = trend[:, used] - half.T @ self._trend[:, used]
+        return np.asarray(left + np.einsum("mp,mp->m", gap @ covariance[np.ix_(used, used)], gap))
 
     @property
     def precision(self) -> Values:

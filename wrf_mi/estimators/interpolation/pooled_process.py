@@ -96,12 +96,12 @@ class PooledProcess:
         self._information = np.diag(1 / np.square(self._prior_sd))
         for each in self._systems:
             each.add_information(self._information)
-        vars(self).pop("_covariance", None)
+        vars(self).pop("covariance", None)
         self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
         self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
 
     @cached_property
-    def _covariance(self) -> FloatArray:
+    def covariance(self) -> FloatArray:
         """Posterior covariance of the shared coefficients [k, k], which serves all predictions."""
         return np.asarray(np.linalg.inv(self._information))
 
@@ -119,7 +119,7 @@ class PooledProcess:
         """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis`` [m, k]."""
         cross = self._kernel(inputs, self._inputs.take(self._parts[receiver].rows))
         mean = basis @ self.beta + cross @ self._weights[receiver]
-        return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self._covariance)
+        return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self.covariance)
 
     def weights(self, receiver: int) -> tuple[Any, FloatArray]:
         """Inputs of a receiver's observations, and weights [n] of the field's covariances with them in a mean."""

@@ -23,7 +23,10 @@ from .strength_terms import Stops, run_numbers
 
 RUN_SD_DB = 3.0
 """Standard deviation of offsets where no runs tell it: walks of one phone differ by 1 to 3 dB, phones by 5 to 10."""
-NEAR_M = 2.0  # least distance within which stops of two runs are compared: the correlation length of shadowing indoors
+NEAR_M, FAR_M = 2.0, 10.0
+"""Least and largest distance within which stops of two runs are compared: the correlation length of shadowing indoors,
+and what positions outdoors are known to. Of runs farther apart, the law of distance would pass for offsets."""
+MOST_STOPS = 2000  # stops of a receiver that are compared: pairs are as many as their square where runs are dense
 SHARE = 0.1  # least share of stops that are compared with another run, which few campaigns cross at a step's distance
 ALIKE = 20  # differences of two runs that count at most: those of one aisle, or of one receiver, have errors in common
 LEAST_DIFFERENCES = 3  # differences of two runs from which their mean tells the deviation of offsets
@@ -89,9 +92,12 @@ def _differences(stops: Stops) -> Iterator[FloatArray]:
     """Runs of two stops that are near each other, and the difference of what a receiver received there [q, 3]."""
     run, position_m = stops.poses.run, stops.poses.position_m
     assert run is not None
-    reach_m = max(NEAR_M, _apart_m(position_m, run))
+    stated = run >= 0
+    reach_m = float(np.clip(_apart_m(position_m[stated], run[stated]), NEAR_M, FAR_M))
     for values in stops.value_dbm:
-        received = np.flatnonzero(np.isfinite(values))
+        received = np.flatnonzero(np.isfinite(values) & stated)
+        if len(received) > MOST_STOPS:
+            received = received[np.linspace(0, len(received) - 1, MOST_STOPS).round().astype(np.int64)]
         near = cKDTree(position_m[received]).query_pairs(reach_m, output_type="ndarray")
         a, b = received[near].T
         swapped = run[a] > run[b]
@@ -105,4 +111,4 @@ def _apart_m(position_m: FloatArray, run: IntArray) -> float:
     for number in np.unique(run):
         own = run == number
         nearest[own] = cKDTree(position_m[~own]).query(position_m[own])[0] if (~own).any() else np.inf
-    return float(np.quantile(nearest, SHARE)) if np.isfinite(nearest).all() else 0.0
+    return float(np.quantile(nearest, SHARE)) if len(run) and np.isfinite(nearest).all() else 0.0

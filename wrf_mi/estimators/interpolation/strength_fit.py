@@ -150,7 +150,8 @@ class StrengthPosterior:
                 mean, variance = mean + more[0], variance + more[1]
             return terms[k][0] + mean, variance
 
-        spread = self._spread_process  # computed here, not on threads
+        spread = self._spread_process
+        _ = spread.covariance  # computed here, not on threads
         return of_each(posterior, range(len(poses)), sum(map(len, poses)))
 
     @property

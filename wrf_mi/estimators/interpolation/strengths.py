@@ -229,7 +229,7 @@ def fit_strengths(
         raise InputError(f"{record.name}: carrier frequency unknown; state it in the data")
     measured, offsets = _measured(record, rows, settings.heading), None
     if runs:
-        offsets = RunOffsets.fit(_stops(measured), trained_runs(record, rows).tolist())
+        offsets = RunOffsets.fit(_stops(measured), trained_runs(record, measured.rows).tolist())
         measured = _without_offsets(measured, record, offsets)
     if not len(measured.rows) and power_map is None:
         raise InputError(f"{record.name}: neither a training row that was received nor a scene; give one of them")
@@ -270,7 +270,6 @@ def calibrated(
     field, facts = strengths.field, dict(strengths.fit_facts)
     prior, hyperparameters = field.prior, field.hyperparameters
     measured = _measured(record, rows, field.headings)
-    values, widen = measured.value_dbm, strengths.widen.copy()
     if len(measured.rows) < 2:
         return strengths
     # Rows of a run that is held out have an offset that nobody knows.
