@@ -49,6 +49,7 @@ EXTRAS = {
 }
 """Extra of this package that installs a package; `SYSTEM` are libraries that Open3D needs and a small system lacks."""
 SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
+LONGITUDE, LATITUDE = 180.0, 90.0  # largest angles, degrees
 LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
 """Bounds of the extent of a building; outside them the units are wrong."""
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -73,6 +74,14 @@ FLOOR_M = 0.05  # largest height of a floor that counts as zero
 CELLS = 40  # cells along the longest side, in which areas are seen
 CORE = (0.005, 0.995)
 """Quantiles of the coordinates between which the extent is taken: strays do not make a room larger."""
+
+
+def local_projection(longitude: float, latitude: float) -> str:
+    """The azimuthal equidistant projection about a place in degrees (PROJ), to metres east and north.
+
+    Distances from the place are exact.
+    """
+    return f"+proj=aeqd +lon_0={longitude:.10g} +lat_0={latitude:.10g} +datum=WGS84 +units=m"
 
 
 def up_of(path: str | Path, up: Up | None) -> Up:

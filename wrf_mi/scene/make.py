@@ -27,6 +27,7 @@ from .mesh.files import SUFFIXES, read_mesh
 from .mesh.measured import is_measured
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
 from .mesh.surfaces import Surface, bounds, box_of, moved, sampled, with_area
+from .plan.geojson import GEOJSON_SUFFIXES, Extent
 from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES
 from .plan.sources import PlanGrid, Row0, read_layout, read_plan
 from .plan.storey import layout_walls, plan_surfaces
@@ -40,11 +41,11 @@ from .scan.points import Scan, read_scan, sampled_scan
 
 logger = logging.getLogger(__name__)
 
-PLAN_SUFFIXES = (*PICTURE_SUFFIXES, *SHEET_SUFFIXES, ".csv")
+PLAN_SUFFIXES = (*PICTURE_SUFFIXES, *SHEET_SUFFIXES, *GEOJSON_SUFFIXES, ".csv")
 PREVIEW_POINTS = 20_000
-Storey = tuple[float | None, float, float | None, Row0 | None]
-"""Options of a plan: height of the ceiling, z of the floor, side of a cell, and the side where the first row lies."""
-UNSTATED: Storey = (None, 0.0, None, None)  # these options where none is given
+Storey = tuple[float | None, float, float | None, Row0 | None, Extent | None]
+"""Options of a plan: height of the ceiling, z of the floor, side of a cell, side where the first row lies, extent."""
+UNSTATED: Storey = (None, 0.0, None, None, None)  # these options where none is given
 RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
 
@@ -63,6 +64,7 @@ def make_scene(
     register_walls_of: str | Path | None = None,
     positions: str | Path | None = None,
     row_0: Row0 | None = None,
+    extent_m: Extent | None = None,
     replace: bool = False,
 ) -> SceneFolder:
     r"""Make a scene folder that Mitsuba and Sionna RT both open, and return its content.
@@ -90,6 +92,7 @@ def make_scene(
         positions: CSV file of measured positions in the scene's frame (`wrf_mi.scene.positions.read_positions`); a
             source whose walls they cross, or that they fit better when mirrored, is refused.
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
+        extent_m: width and height of a plan in longitude and latitude (`wrf_mi.scene.plan.geojson.read_geojson`).
         replace: replace an existing folder.
 
     Raises:
@@ -116,7 +119,7 @@ def make_scene(
     materials = read_materials(materials) if isinstance(materials, str | Path) else materials
     matrix, known_walls, measured = _references(file, registration, register_walls_of, positions)
     shift = _shift(file, origin_m)
-    source = _read_source(files, units, up, (height_m, floor_m, resolution_m, row_0))
+    source = _read_source(files, units, up, (height_m, floor_m, resolution_m, row_0, extent_m))
     if origin_m is None and matrix is known_walls is measured is None:
         origin_m = local_origin(source.extent_m)
         shift = _shift(file, origin_m)
@@ -239,7 +242,7 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
     if is_plan(file):
         return _read_plan(file, units, up, storey)
     if storey != UNSTATED:
-        raise InputError(f"{file}: no plan; leave out --wall-height, --floor, --resolution and --row-0")
+        raise InputError(f"{file}: no plan; leave out --wall-height, --floor, --resolution, --row-0 and --extent")
     if has_faces(file):
         raw = read_mesh(file, units, up)
         require_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in raw])), file, up)
@@ -282,7 +285,7 @@ def _rigid(registration: ArrayLike) -> FloatArray:
 
 
 def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> _Source:
-    height_m, floor_m, resolution_m, row_0 = storey
+    height_m, floor_m, resolution_m, row_0, extent_m = storey
     if file.suffix.lower() == ".csv" and _has_heights(file):
         text = f"{file}: has a column z or three numbers in a row, and a CSV is a plan of wall corners, x,y"
         raise InputError(f"{text}; for points in three dimensions leave out its header and call it .xyz")
@@ -292,7 +295,7 @@ def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> 
         raise InputError(f"{file}: a plan is in metres; give its cell with --resolution and leave out --units")
     if up is not None:
         raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
-    plan = read_plan(file, resolution_m, row_0)
+    plan = read_plan(file, resolution_m, row_0, extent_m)
     walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, name=str(file))
     return _Source(file, walls, plan if isinstance(plan, PlanGrid) and plan.free.any() else None)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,8 +26,8 @@ def _add_mesh(commands: Any) -> None:
     text = "make a scene for both tracers from a LiDAR scan, a plan or a mesh"
     parser = add_command(commands, "mesh", mesh_command, text)
     add = parser.add_argument
-    text = "scans of one place (E57, PCD, PTS, PTX, PLY, LAS, LAZ, XYZ, NPZ), a plan (NPZ, PNG, ROS map YAML, CSV) or "
-    text += "a mesh (OBJ, STL, GLB, PLY, COLLADA, USD)"
+    text = "scans of one place (E57, PCD, PTS, PTX, PLY, LAS, LAZ, XYZ, NPZ), a plan (NPZ, PNG, ROS map YAML, CSV, "
+    text += "GeoJSON) or a mesh (OBJ, STL, GLB, PLY, COLLADA, USD)"
     add("points", nargs="+", metavar="POINTS", help=text)
     add("--out", required=True, metavar="DIR", help="scene folder to make")
     add("--units", help="unit of the coordinates: m, dm, cm, mm, ft or in (default: that of COLLADA and USD, else m)")
@@ -34,12 +35,16 @@ def _add_mesh(commands: Any) -> None:
     add("--up", choices=("y", "z"), help=text)
     text = "point of the source (of a picture, from its lower left corner), metres, z up, that becomes the origin, "
     text += "such as 701300,4485500,0"
-    add("--origin", type=_point, metavar="X,Y,Z", help=text)
+    add("--origin", type=_numbers(3, "X,Y,Z"), metavar="X,Y,Z", help=text)
     add("--wall-height", type=float, metavar="M", help="height from floor to ceiling; required for a plan")
     add("--floor", type=float, default=0.0, metavar="M", help="z of a plan's floor (default: 0)")
     add("--resolution", type=float, metavar="M", help="side of a plan's cell where the file has none")
     text = "side of the plan at which the first row of an NPZ grid lies, where the file does not state row_0"
     add("--row-0", choices=("top", "bottom"), help=text)
+    text = (
+        "width and height of a plan in longitude and latitude, metres, from its lower left corner, such as 236.7,219.7"
+    )
+    add("--extent", type=_numbers(2, "WIDTH,HEIGHT"), metavar="WIDTH,HEIGHT", help=text)
     add("--materials", metavar="FILE", help="materials.yml with rules and exceptions")
     add("--register-pairs", metavar="CSV", help="move by pairs of points: x,y[,z],to_x,to_y[,to_z]")
     add("--register-walls", metavar="CSV", help="move so that walls lie on those of a layout: x,y")
@@ -58,7 +63,7 @@ def mesh_command(a: Arguments) -> int:
 
     pairs = None if a.register_pairs is None else register_pairs(*read_pairs(a.register_pairs), name=a.register_pairs)
     source = {"units": a.units, "up": a.up, "origin_m": a.origin, "row_0": a.row_0, "resolution_m": a.resolution}
-    storey = {"height_m": a.wall_height, "floor_m": a.floor, "materials": a.materials}
+    storey = {"height_m": a.wall_height, "floor_m": a.floor, "extent_m": a.extent, "materials": a.materials}
     frame = {"registration": pairs, "register_walls_of": a.register_walls, "positions": a.positions}
     scene = make_scene(a.points, a.out, **source, **storey, **frame, replace=a.replace)
     kinds = list(scene.materials.surfaces.values())
@@ -84,14 +89,19 @@ def mesh_command(a: Arguments) -> int:
     return show(a.json, facts, "\n".join(lines))
 
 
-def _point(text: str) -> tuple[float, ...]:
-    try:
-        values = tuple(float(value) for value in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != 3:
-        raise argparse.ArgumentTypeError(f"{text!r} is no point; give X,Y,Z in metres")
-    return values
+def _numbers(count: int, form: str) -> Callable[[str], tuple[float, ...]]:
+    """Type of an option of numbers between commas."""
+
+    def parsed(text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(value) for value in text.split(","))
+        except ValueError:
+            values = ()
+        if len(values) != count:
+            raise argparse.ArgumentTypeError(f"{text!r}: give {form} in metres")
+        return values
+
+    return parsed
 
 
 def _add_correct(commands: Any) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
 from ...core.files import one_line
+from ...scene.coordinates import LATITUDE, LONGITUDE, local_projection
 from .files import Table, package
 from .forms import METRES, named_columns, shown_names, unit_of
 
@@ -20,7 +21,7 @@ DEGREES = "EPSG:4326"
 FAR_M = 10_000.0  # largest coordinate without a shift: single precision resolves a millimetre to 16 km
 ROUND_M, ROUND_DEG = 10.0, 1e-4  # origins are rounded to these
 POSITION_DIGITS = 6  # decimals of metres that are written: the mean of equal positions is not exactly theirs
-LONGITUDE, LATITUDE, WIDEST_DEG = 180.0, 90.0, 1.0  # largest angles, and largest extent of a place in degrees
+WIDEST_DEG = 1.0  # largest extent of a place in degrees
 AWAY = 20.0
 """Least distance of a place in degrees from the origin in its extents, 1 km at 0.2 degrees: a room in metres is not a
 metre wide and twenty metres away."""
@@ -55,8 +56,8 @@ class LocalFrame:
 
     @property
     def local_crs(self) -> str:
-        """The azimuthal equidistant projection about the origin, in which distances from the origin are exact."""
-        return f"+proj=aeqd +lon_0={self.origin[0]:.10g} +lat_0={self.origin[1]:.10g} +datum=WGS84 +units=m"
+        """The projection to metres east and north of the origin (`wrf_mi.scene.coordinates.local_projection`)."""
+        return local_projection(*self.origin)
 
     def local_m(self, xy: FloatArray) -> FloatArray:
         """Metres [n, 2] from coordinates [n, 2] of the table, NaN where unknown."""

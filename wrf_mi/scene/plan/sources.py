@@ -1,4 +1,4 @@
-"""Files that show a building from above: occupancy grids, LiDAR returns in a plane, wall vertices.
+"""Files that show a building from above: occupancy grids, LiDAR returns in a plane, wall vertices, GeoJSON.
 
 Walls are found in a `PlanGrid` of occupied, free and unknown cells, whose rows run with y. Row 0 of a picture, and so
 of a ROS map, is its top (largest y); an NPZ file states on which side its row 0 lies.
@@ -22,6 +22,7 @@ from ...core.array_files import stored_arrays
 from ...core.files import inside, listed, one_line, text_lines
 from ...core.types import IntArray
 from ...datasets.folder_files import read_columns
+from .geojson import GEOJSON_SUFFIXES, Extent, read_geojson
 from .pictures import (
     FREE_PROBABILITY,
     OCCUPIED_PROBABILITY,
@@ -135,7 +136,9 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None) -> Plan
     return PlanGrid(occupied, np.zeros_like(occupied), cell, low)
 
 
-def read_plan(path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None) -> PlanGrid | FloatArray:
+def read_plan(
+    path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None, extent_m: Extent | None = None
+) -> PlanGrid | FloatArray:
     """Any file that shows a plan, recognised by its ending and its content.
 
     - ``.npz`` with ``log_odds`` [rows, columns], ``row_0`` ("top" or "bottom"), ``resolution_m``, and optionally
@@ -147,27 +150,34 @@ def read_plan(path: str | Path, resolution_m: float | None = None, row_0: Row0 |
       yaw has to be zero. Without a YAML, and with other greys than those of map_saver, lines thinner than
       `THINNEST_WALL_M` are not walls (`without_thin_lines`), and a picture with colours has no unmapped cells.
     - ``.csv`` with the header ``x,y``: wall vertices (`read_layout`).
+    - ``.geojson``, ``.json``: outlines of rooms in longitude and latitude (`wrf_mi.scene.plan.geojson.read_geojson`).
     - ``.xyz``, ``.txt``: points in two columns x, y (metres), separated by spaces, tabs or commas; # begins a comment.
 
     Args:
         path: path of the file.
         resolution_m: side of a cell of a grid; overrides that of the file.
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
+        extent_m: width and height of the plan in GeoJSON.
 
     Returns:
-        A grid, whose cells are nowhere free where the file holds points, or wall vertices [n, 2].
+        A grid, whose cells are nowhere free where the file holds points, wall vertices [n, 2], or the straight pieces
+        of outlines [n, 2, 2].
 
     Raises:
-        InputError: missing, unreadable or incomplete, points with the times of their scans, or ``row_0`` for a file
-            whose format fixes it.
+        InputError: missing, unreadable or incomplete, points with the times of their scans, ``row_0`` for a file
+            whose format fixes it, or ``extent_m`` for a file in metres.
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: missing; give a plan as .npz, .png, .pgm, .jpg, .yaml, .csv or .xyz")
+        raise InputError(f"{path}: missing; give a plan as .npz, .png, .pgm, .jpg, .yaml, .csv, .xyz or .geojson")
     suffix = path.suffix.lower()
     if row_0 is not None and suffix != ".npz":
         fixed = suffix in (*PICTURE_SUFFIXES, *SHEET_SUFFIXES)
         raise _no_rows(path, "the first row of a picture is its top" if fixed else "this file has no rows of cells")
+    if suffix in GEOJSON_SUFFIXES:
+        return read_geojson(path, extent_m)
+    if extent_m is not None:
+        raise InputError(f"{path}: --extent is for plans in longitude and latitude (GeoJSON); leave it out")
     if suffix in (*PICTURE_SUFFIXES, *SHEET_SUFFIXES):
         return _read_picture(path, resolution_m)
     match suffix:
@@ -177,7 +187,7 @@ def read_plan(path: str | Path, resolution_m: float | None = None, row_0: Row0 |
             return read_layout(path)
         case ".xyz" | ".txt":
             return _grid_of_points(path, _read_text(path), resolution_m)
-    raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .jpg, .yaml, .csv or .xyz")
+    raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .jpg, .yaml, .csv, .xyz or .geojson")
 
 
 def read_layout(path: str | Path) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Walls, floor and ceiling of a scene from a plan: occupancy grid, LiDAR returns in a plane, or wall vertices."""
+"""Walls, floor and ceiling from an occupancy grid, LiDAR returns in a plane, wall vertices or outlines of rooms."""
 
 from __future__ import annotations
 
@@ -23,15 +23,28 @@ WALLED = 0.75  # least share of a room's outline along walls: the rest are gaps;
 COVERED = 0.9  # least share of the walls that stand on the floor or at its edge
 EDGE_M = 0.1  # a wall this near to the floor's edge stands at it
 SMALLEST_FLOOR_M2 = 0.5
+SHARED_EDGE_M = 0.01  # grid of the outlines of rooms: common edges differ by millimetres, as each room is drawn alone
+STRAIGHT_M = 0.05  # largest deviation of vertices of such outlines from a straight wall
 
 
 def layout_walls(vertices_m: FloatArray) -> FloatArray:
     """Straight walls of a path of vertices [n, 2] that may double back and cross: end points [m, 2, 2]."""
     pieces = np.stack([vertices_m[:-1], vertices_m[1:]], axis=1)
-    pieces = pieces[np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=-1) > 0]
+    return merged_walls(pieces)
+
+
+def merged_walls(pieces_m: FloatArray, grid_m: float | None = None, tolerance_m: float = 1e-6) -> FloatArray:
+    """Straight walls [m, 2, 2] of pieces [n, 2, 2] that may repeat each other and cross.
+
+    Args:
+        pieces_m: end points of the pieces.
+        grid_m: spacing of a grid that the ends are moved to; None: none.
+        tolerance_m: largest deviation of a vertex between two pieces that is left out.
+    """
+    pieces = pieces_m[np.linalg.norm(pieces_m[:, 1] - pieces_m[:, 0], axis=-1) > 0]
     # The union cuts at crossings and keeps doubled stretches once; merging undoes needless cuts.
-    lines = shapely.line_merge(shapely.unary_union(shapely.linestrings(pieces)))
-    paths = [shapely.get_coordinates(shapely.simplify(line, 1e-6)) for line in shapely.get_parts(lines)]
+    lines = shapely.line_merge(shapely.union_all(shapely.linestrings(pieces), grid_size=grid_m))
+    paths = [shapely.get_coordinates(shapely.simplify(line, tolerance_m)) for line in shapely.get_parts(lines)]
     return np.concatenate([np.stack([xy[:-1], xy[1:]], axis=1) for xy in paths])
 
 
@@ -131,7 +144,8 @@ def plan_surfaces(
             walls_m = at_inner_faces(walls_m, source) if source.free.any() else walls_m
             area = mapped_part(floor_of(walls_m), source, name)
         else:
-            walls_m = layout_walls(np.asarray(source, float))
+            xy = np.asarray(source, float)
+            walls_m = layout_walls(xy) if xy.ndim == 2 else merged_walls(xy, SHARED_EDGE_M, STRAIGHT_M)
             area = floor_of(walls_m)
         flat, faces = triangulated(area)
     except InputError as error:
