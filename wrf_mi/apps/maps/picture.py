@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 PANEL_IN, BAR_IN, COLUMNS = 3.2, 0.5, 3  # width of a panel and of its colour scale; number of panels in a line
 MOST_PANELS = 12  # largest number of receivers that are drawn, the first ones
+MOST_ELLIPSES = 8  # receivers in one panel up to which ellipses of estimated places are drawn
 MOST_POINTS = 250  # largest number of training rows of a panel, and of other measured rows
 TAIL = 1.0  # percentage of values beyond either end of the colour scale
 MEASURED_TAIL = 10.0  # the same percentage of measured levels, among which are single deep fades
@@ -252,7 +253,8 @@ def _draw_points(
         colour = drawing.ENDS["receiver"][1]
         mark = {} if place is None else {"markeredgecolor": colour, "label": AT_ESTIMATED, "markerfacecolor": "none"}
         drawing.draw_devices(axes, "receiver", at[k], **mark)
-        if place is not None and dims == 2:
+        # Ellipses of a dozen receivers would hide a panel of all of them.
+        if place is not None and dims == 2 and (panel.number is not None or is_drawn.sum() <= MOST_ELLIPSES):
             spread = 2 * np.array(place["std_m"])[:2]
             axes.add_patch(Ellipse((at[k, 0], at[k, 1]), *spread, fill=False, edgecolor=colour, linewidth=1, zorder=5))
             paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
