@@ -24,7 +24,7 @@ from wrf_mi.runs.run import Run
 from wrf_mi.tasks.scores import REAL_90, block_bootstrap
 
 from .bench import FLAT
-from .comparison import line, measured_on, say, stored_part
+from .comparison import data_folder, line, measured_on, say, stored_part
 from .declared import lined
 
 CAMPUS, FLOOR, MALL = "duke-cbrs", "wifi-office", "mall-f3"  # folders of measured data beside the known data sets
@@ -38,11 +38,18 @@ ADDED_DB = 0.0, 10.0  # offsets of phones: those of the walks, and of another ma
 SEED = 0
 
 
+def source_folder(name: str) -> Path:
+    """Folder of the data of a set; `InputError` where they are not on this machine."""
+    if name == FLAT:
+        return data_folder(name)
+    if not (data_home() / name).exists():
+        raise InputError(f"{name}: not on this machine; give a folder of measured data by WRF_MI_DATA")
+    return data_home() / name
+
+
 def measured_set(folder: Path, name: str) -> Record:
     """A set by name, imported into a folder where needed; `InputError` where its data are not on this machine."""
-    place = data_home() / name
-    if name != FLAT and not place.exists():
-        raise InputError(f"{name}: not in {data_home()}; give a folder of measured data by WRF_MI_DATA")
+    place = source_folder(name)
     files = {FLOOR: ("database_office_train.csv", "database_office_test.csv"), MALL: ("train.csv", "test.csv")}
     if name in files and not (folder / name).exists():
         train, test = ([str(place / file)] for file in files[name])
@@ -91,6 +98,7 @@ def measured(folder: Path, name: str, count: int | None) -> dict[str, Any]:
 def main() -> dict[str, Any]:
     """Measure the sets that are not stored; ``rows`` has a line for each set and model."""
     parts, rows = list[dict[str, Any]](), list[dict[str, Any]]()
+    _ = [source_folder(name) for name, _ in SETS]  # before hours of work
     with tempfile.TemporaryDirectory() as place:
         for name, count in SETS:
             part = partial(measured, Path(place), name, count)
@@ -114,6 +122,7 @@ table = lined(
 
 def devices() -> dict[str, Any]:
     """Walks of the shopping centre that are held out, by the number of their own readings that calibrate each."""
+    source_folder(MALL)
     with tempfile.TemporaryDirectory() as place:
         part = stored_part("devices", "walks", partial(_of_walks, Path(place)))
     for row in part["rows"]:
