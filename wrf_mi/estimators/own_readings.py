@@ -25,7 +25,7 @@ from .model import Arrays, Decomposition, Fitted, Inputs
 PLACE_DB = 6.0
 """Standard deviation of the error that all readings of a place have in common, by walks of a shopping centre that were
 held out: ten readings of a place tell little more than three."""
-ROUNDS = 20  # reweightings of the prior, which converge by a factor of two each
+ROUNDS = 20  # reweightings of the prior, after which the offset changes by less than 0.05 dB
 
 
 @dataclass(frozen=True)

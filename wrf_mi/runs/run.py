@@ -88,6 +88,8 @@ class Run:
     @cached_property
     def problem(self) -> Problem:
         """Data, scene and settings that the model was fitted to, with an edited scene in place of its own."""
+        if self.own is not None:
+            return self.of_any_device.problem
         config = self.config
         scene = (config.scene, config.material) if self.scene is None else (str(self.scene), None)
         data, left_out = self.record or config.dataset, tuple(config.left_out)
@@ -99,7 +101,7 @@ class Run:
     def fitted(self) -> Fitted:
         """Fitted model; `InputError`: not a finished run, or a run with several splits."""
         if self.own is not None:
-            return ForDevice(replace(self, own=None).fitted, self.device)
+            return ForDevice(self.of_any_device.fitted, self.device)
         if self.scene is not None:
             try:
                 return replace(self, scene=None).fitted.in_scene(str(self.scene))
@@ -133,7 +135,14 @@ class Run:
         if own.power_dbm.shape != wanted or own.tx_pos_m.shape[1:] != (3,):
             shapes = f"{list(own.tx_pos_m.shape)} and {list(own.power_dbm.shape)}"
             raise InputError(f"own readings {shapes}; give positions [m, 3] and strengths [{wanted[0]}, m]")
-        return replace(self, own=own)
+        run = replace(self, own=own)
+        vars(run)["of_any_device"] = self.of_any_device  # whose data and model are open already
+        return run
+
+    @cached_property
+    def of_any_device(self) -> Run:
+        """The run without own readings."""
+        return self if self.own is None else replace(self, own=None)
 
     @cached_property
     def device(self) -> DeviceOffset:
@@ -141,10 +150,10 @@ class Run:
 
         `InputError`: a model without standard deviations.
         """
-        any_device = replace(self, own=None)
+        run = self.of_any_device
         try:
-            none = OwnReadings(np.zeros((0, 3)), np.zeros((len(any_device.receivers), 0)))
-            return device_offset(any_device.fitted, self.own or none)
+            none = OwnReadings(np.zeros((0, 3)), np.zeros((len(run.receivers), 0)))
+            return device_offset(run.fitted, self.own or none)
         except InputError as error:
             raise InputError(f"{self.folder}: {error}") from None
 

@@ -94,7 +94,7 @@ def located_run(run: str | Path | Run) -> Run:
         raise InputError(f"{opened.folder}: its data have several carriers; give a run on data of one carrier")
     if opened.scene is not None:
         raise InputError(f"{opened.folder}: rows of the scene of the fit calibrate positions; omit the edited scene")
-    _ = (opened if opened.own is None else replace(opened, own=None)).fitted
+    _ = opened.of_any_device.fitted
     if load_rows(opened.folder, record).held_receivers:
         raise InputError(f"{opened.folder}: its split holds receivers out; give a run trained on all receivers")
     return opened
@@ -158,7 +158,7 @@ def locate(
     record, observed = run.problem.record, np.asarray(of_receivers(observed_dbm, run.receivers), float)
     _check(run, observed, level, offset_db)
     if run.own is not None:  # what the mean device would have received
-        device, run = run.device, replace(run, own=None)
+        device, run = run.device, run.of_any_device
         observed = observed - device.mean_db
         offset_db = device.std_db if offset_db is None else offset_db
     candidates = candidates_of(run, step_m, height_m)
