@@ -195,7 +195,7 @@ def test_measured_tables_are_made_from_results(path):
 def test_earlier_measurements_are_stated_and_shown(path):
     result = json.loads(path.read_text(encoding="utf-8"))
     for measurement in result.get("measurements", [result]):
-        assert re.fullmatch(r"\d{4}-\d{2}-\d{2} [0-9a-f]{7}", f"{measurement['date']} {measurement['commit']}")
+        assert re.fullmatch(r"\d{4}-\d{2}-\d{2} [0-9a-f]{7,40}", f"{measurement['date']} {measurement['commit']}")
         assert measurement.get("rows") or (measurement["what"] and measurement["figures"] not in ([], {})), measurement
     if "measurements" not in result:
         assert earlier_block(path.stem, result) in (CHECKOUT / result["page"]).read_text(encoding="utf-8")
