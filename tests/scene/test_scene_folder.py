@@ -17,7 +17,8 @@ from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from wrf_mi import backend
 from wrf_mi.apps.checking import check_scene
-from wrf_mi.core import InputError
+from wrf_mi.core import InputError, Receiver
+from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.paths import Paths
 from wrf_mi.scene.folder import read_scene_folder, write_scene
@@ -28,7 +29,7 @@ from wrf_mi.scene.mesh.surfaces import Surface, number_names, with_area
 from wrf_mi.scene.plan.storey import plan_surfaces
 from wrf_mi.scene.preview import GaussianCloud, draw_scene
 from wrf_mi.scene.scan import simulate_scan
-from wrf_mi.tracing import open_scene
+from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.sionna.materials import perfect_reflector
 
 FREQUENCY_HZ = 2.4e9
@@ -99,6 +100,22 @@ def test_a_perfect_conductor_is_a_material_of_a_scene_folder(folder):
     assert len(rt.load_scene(str(folder / "scene.xml"), merge_shapes=False).objects) == 3
 
 
+@pytest.mark.parametrize(("loss_db", "carrier_hz", "slack_db"), [(6, 2.4e9, 0.02), (20, 2.4e9, 0.02), (6, 5.2e9, 0.5)])
+def test_a_stated_loss_weakens_the_direct_path(loss_db, carrier_hz, slack_db, folder):
+    """At its carrier to the three digits of the conductivity, at another one above within half a decibel."""
+
+    def power_db(loss_db):
+        facts = yaml.safe_load((folder / "materials.yml").read_text())
+        facts["surfaces"]["table"], facts["constants"] = "top", {"top": {"loss_db": loss_db}}
+        (folder / "materials.yml").write_text(yaml.safe_dump(facts))
+        receiver = Receiver("below", np.array([2.0, 1.5, 0.2]), np.array(UPRIGHT))
+        options = TraceOptions(transmission=True, reflections=0)
+        paths = trace_paths(open_scene(folder, carrier_hz), [[2.0, 1.5, 2.0]], receiver, options).paths
+        return 20 * np.log10(np.abs(paths.gain).item())
+
+    assert power_db(1e-3) - power_db(loss_db) == pytest.approx(loss_db, abs=slack_db)
+
+
 PANEL = "constants: {{panel: {{relative_permittivity: 2.9, conductivity: 0.01, thickness: 0.08, {}}}}}"
 
 
@@ -116,6 +133,8 @@ PANEL = "constants: {{panel: {{relative_permittivity: 2.9, conductivity: 0.01, t
         (PANEL.format("conductivity_exponent: 1"), "panel: give relative_permittivity, .* with"),
         (PANEL.format("conductivity_exponent: 9, carrier_hz: 1.0e+9"), "conductivity_exponent is 9; give -5 to 5"),
         (PANEL.format("conductivity_exponent: 1, carrier_hz: 0"), "carrier_hz is 0; give a number from 0 upwards"),
+        ("constants: {front: {loss_db: -3}}", "front: loss_db is -3; give dB above 0, 60 at most"),
+        ("constants: {front: {loss_db: 3, thickness: 1}}", "front: give relative_permittivity, .* or loss_db"),
     ],
 )
 def test_unusable_materials_are_refused(text, message, folder):

@@ -129,7 +129,7 @@ def test_trees_stand_about_the_power_of_an_edited_scene(tmp_path: Path) -> None:
     record = made("walls")
     x, z = np.array([-1.0, 17.0]), np.array([0.0, 3.0])
     settings = default_settings(MODELS["kriging"].serving("rssi", False), ("shadowing=trees",), {})
-    power = PowerMap(x, x, z, np.full((3, 2, 2, 2), -60.0))
+    power = PowerMap(x, x, z, np.full((3, 2, 2, 2), -60.0), 0)
     fitted = fit_strengths(record, record.official[0], power, settings)
     field = copy(fitted.field)
     # A screen at the first receiver: its power is 7 dB lower, by the fitted factor of traced decibels.

@@ -17,14 +17,14 @@ from wrf_mi.tracing.power_map import PowerMap, TracedPower, trace_map
 
 def test_map_is_linear_between_its_points():
     x, y, z = np.array([0.0, 1.0, 2.0]), np.array([0.0, 2.0]), np.array([1.0])
-    power = PowerMap(x, y, z, (x[:, None, None] * 10 + y[None, :, None])[None])
+    power = PowerMap(x, y, z, (x[:, None, None] * 10 + y[None, :, None])[None], 0)
     where = np.array([[0.5, 1.0, 1.0], [1.5, 0.0, 9.0], [9.0, 9.0, 1.0]])
     np.testing.assert_allclose(power(where, 0), [6.0, 15.0, 22.0])
 
 
 def test_traced_power_asks_for_each_position_once_and_falls_back_to_the_local_mean():
     axis = np.array([0.0, 2.0])
-    local = PowerMap(axis, axis, np.array([1.0]), np.stack([np.full((2, 2, 1), -50.0), np.full((2, 2, 1), -70.0)]))
+    local = PowerMap(axis, axis, np.array([1.0]), np.stack([np.full((2, 2, 1), -50.0), np.full((2, 2, 1), -70.0)]), 0)
     asked = []
 
     def trace(position_m, places):

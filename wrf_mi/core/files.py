@@ -26,7 +26,10 @@ def one_line(error: object) -> str:
     return text if len(text) <= MOST_MESSAGE else f"{text[:MOST_MESSAGE]} ..."
 
 
-def listed(names: Iterable[str], most: int = 6, mark: str = ", ") -> str:
+MOST_LISTED = 6  # names, or lines of the same kind, that a message has at most
+
+
+def listed(names: Iterable[str], most: int = MOST_LISTED, mark: str = ", ") -> str:
     """The first names, and the number of the others."""
     names = list(names)
     return mark.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -36,7 +36,7 @@ from threadpoolctl import threadpool_limits
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
-from ..core.files import listed, readable, write_atomically
+from ..core.files import MOST_LISTED, listed, readable, write_atomically
 from ..core.types import IntArray
 from ..tasks.scores import LEVEL, REAL_90
 from ..training.session import OnProgress, quiet
@@ -342,10 +342,14 @@ def check_placeable(problem: Problem, splits: Sequence[Split]) -> None:
 
 
 def tell_places(problem: Problem) -> None:
-    """Log the estimated positions of receivers in a scene."""
-    for receiver in problem.record.receivers if problem.scene is not None else ():
-        if receiver.position_std_m is not None:
-            x, y, z = receiver.position_m
-            deviations = ", ".join(f"{std:.1f}" for std in receiver.position_std_m)
-            text = "receiver %s: position estimated at x %.1f, y %.1f, z %.1f m, deviations %s m, used in the scene"
-            logger.warning(text, receiver.name, x, y, z, deviations)
+    """Log the estimated positions of receivers in a scene, of many those of the least certain ones."""
+    receivers = problem.record.receivers if problem.scene is not None else ()
+    estimated = [(each, each.position_std_m) for each in receivers if each.position_std_m is not None]
+    estimated.sort(key=lambda pair: float(np.linalg.norm(pair[1])), reverse=True)
+    for receiver, deviation_m in estimated[:MOST_LISTED]:
+        x, y, z = receiver.position_m
+        deviations = ", ".join(f"{std:.1f}" for std in deviation_m)
+        text = "receiver %s: position estimated at x %.1f, y %.1f, z %.1f m, deviations %s m, used in the scene"
+        logger.warning(text, receiver.name, x, y, z, deviations)
+    if len(estimated) > MOST_LISTED:
+        logger.warning("positions of %d further receivers are estimated more closely", len(estimated) - MOST_LISTED)

@@ -14,6 +14,12 @@ the law of ITU-R P.2040; a scene file holds it at f0:
     surfaces: {wall_03: panel}
     constants: {panel: {relative_permittivity: 2.9, conductivity: 0.01, thickness: 0.08}}
 
+A wall may have a measured loss in place of constants, in dB at normal incidence and ``carrier_hz`` (2.4 GHz), as
+programs for site surveys have it (`absorbing_slab`):
+
+    surfaces: {wall_04: shop_front}
+    constants: {shop_front: {loss_db: 4}}
+
 Any material may scatter, with the share of the amplitude, and of the other polarisation's power, and a pattern of
 Degli-Esposti et al. (2007), ``lambertian`` by default, ``directive`` (alpha_r) or ``backscattering`` (alpha_r, alpha_i,
 lambda_):
@@ -29,7 +35,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from scipy.constants import epsilon_0, speed_of_light
+from scipy.optimize import brentq
 from wrf_mi_scenes.mitsuba_xml import ABSORBER, PERFECT, PERFECT_CONSTANTS, PERFECT_THICKNESS_M, Constants
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M as ITU_THICKNESS_M
 
@@ -46,6 +55,8 @@ EXPONENT, CARRIER = "conductivity_exponent", "carrier_hz"
 STEEPEST = 5.0  # largest exponent; ITU-R P.2040 has 0 to 2.4
 LEAST = {"relative_permittivity": 1.0, "conductivity": 0.0, "thickness": 0.0, EXPONENT: -STEEPEST, CARRIER: 0.0}
 POSITIVE = ("thickness", CARRIER)  # constants that must be above `LEAST`
+LOSS, MOST_LOSS_DB = "loss_db", 60.0
+LOSS_CARRIER_HZ, LOSS_THICKNESS_M = 2.4e9, 0.1  # of a material with a loss: default carrier, and thickness of its slab
 NAME = re.compile(r"(?!itu)\w+", re.ASCII)
 SURFACE_NAME = re.compile(r"[\w.-]+")
 THICKEST_M = 1e3
@@ -115,6 +126,8 @@ def read_materials(path: str | Path) -> Materials:
     parts = _read_parts(file)
     for name, values in parts["constants"].items():
         _check_constants(file, name, values)
+        if LOSS in values:
+            parts["constants"][name] = absorbing_slab(**values)
     allowed = (*parts["constants"], *KNOWN)
     for kind, material in parts["rules"].items():
         if kind not in KINDS:
@@ -177,14 +190,46 @@ def _check_constants(file: Path, name: Any, values: Any) -> None:
     if not isinstance(name, str) or not NAME.fullmatch(name) or name in (*KNOWN, *KINDS):
         raise InputError(f"{where}: choose a name of letters, digits and _ that is no kind and does not begin with itu")
     needed = set(PERFECT_CONSTANTS)
-    if not isinstance(values, dict) or set(values) not in (needed, needed | {EXPONENT, CARRIER}):
+    forms = needed, needed | {EXPONENT, CARRIER}, {LOSS}, {LOSS, CARRIER}
+    if not isinstance(values, dict) or set(values) not in forms:
         law = f"{EXPONENT} and {CARRIER} for a law of the conductivity"
-        raise InputError(f"{where}: give {', '.join(PERFECT_CONSTANTS)}, with {law}")
+        raise InputError(f"{where}: give {', '.join(PERFECT_CONSTANTS)}, with {law}; or {LOSS}")
+    if LOSS in values and not (_is_number(values[LOSS]) and 0 < values[LOSS] <= MOST_LOSS_DB):
+        raise InputError(f"{where}: {LOSS} is {shown(values[LOSS])}; give dB above 0, {MOST_LOSS_DB:g} at most")
     for key, value in values.items():
-        if not _in_range(key, value):
+        if key != LOSS and not _in_range(key, value):
             raise InputError(f"{where}: {key} is {shown(value)}; give a number from {LEAST[key]:g} upwards")
     if abs(values.get(EXPONENT, 0)) > STEEPEST:
         raise InputError(f"{where}: {EXPONENT} is {values[EXPONENT]!r}; give -{STEEPEST:g} to {STEEPEST:g}")
+
+
+def absorbing_slab(loss_db: float, carrier_hz: float = LOSS_CARRIER_HZ) -> dict[str, float]:
+    """Constants of a slab that absorbs a loss in dB at normal incidence.
+
+    Its permittivity is that of air, so that it reflects no more than its loss makes it to: a tenth of the amplitude at
+    a loss of 6 dB. The loss of another carrier above differs by less than 0.5 dB up to 12 dB.
+
+    Args:
+        loss_db: ratio of incident to transmitted power, dB, above 0.
+        carrier_hz: carrier at which it was measured, Hz.
+
+    >>> absorbing_slab(6.0)
+    {'relative_permittivity': 1.0, 'conductivity': 0.03732, 'thickness': 0.1}
+    """
+
+    def excess_db(conductivity: float) -> float:
+        # Transmission of a slab, see `wrf_mi.tracing.slabs.slab_coefficients`, at normal incidence.
+        index = np.sqrt(1 - 1j * conductivity / (2 * np.pi * carrier_hz * epsilon_0))
+        reflected = (1 - index) / (1 + index)
+        passed = np.exp(-2j * np.pi * carrier_hz / speed_of_light * LOSS_THICKNESS_M * index)
+        transmitted = (1 - reflected**2) * passed / (1 - (reflected * passed) ** 2)
+        return float(-20 * np.log10(np.abs(transmitted))) - loss_db
+
+    # Without reflection a slab absorbs 20 log10(e) / 2 times conductivity, thickness and impedance of free space: this
+    # conductivity is the least, and a hundred times it reflects more than the loss.
+    least = loss_db / (10 * np.log10(np.e) * LOSS_THICKNESS_M * 377)
+    conductivity = float(brentq(excess_db, least / 2, 100 * least))
+    return dict(zip(PERFECT_CONSTANTS, (1.0, float(f"{conductivity:.4g}"), LOSS_THICKNESS_M), strict=True))
 
 
 def materials_text(materials: Materials) -> str:

@@ -20,7 +20,7 @@ from typing import Annotated
 from pydantic import Field
 
 from ..core import InputError, Record, Split
-from ..core.settings import CheckedSettings
+from ..core.settings import CheckedSettings, Positive
 from ..estimators.checks import check_held_receivers, check_record
 from ..estimators.few_rows import with_few_rows
 from ..estimators.model import (
@@ -60,6 +60,9 @@ class HybridSettings(CheckedSettings):
     #: optimiser steps of the graph of paths and Gaussians, or, without a scene, of the field; null: the default of
     #: `TrainConfig` for the task
     steps: Annotated[int | None, Field(ge=1, description="1 or more")] = None
+    #: longest search for reflected paths to all receivers of signal strengths, as estimated for two cores, seconds: in
+    #: place of longer ones, power is that of direct paths through walls, and materials are not calibrated; null: any
+    search_seconds: Positive | None = None
     deterministic: bool = False  #: bit-identical results from run to run, on one thread of the CPU
 
     def __post_init__(self) -> None:
@@ -195,7 +198,7 @@ class Hybrid(Model):
     scene, uplink, headings = "optional", "optional", True
     several_carriers, new_receivers = True, True
     train_arguments = ("deterministic",)
-    presets = MappingProxyType({"fast": (f"stages={','.join(FAST)}",), "default": ()})
+    presets = MappingProxyType({"fast": (f"stages={','.join(FAST)}", "search_seconds=20"), "default": ()})
 
     def __init__(self, gaps: tuple[str, ...] = ()) -> None:
         self.gaps = gaps

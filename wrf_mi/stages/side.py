@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import Prediction, Split
+from ..core.types import IntArray
 from ..correction import default_options
 from ..estimators.gaussian.model import FittedField
 from ..estimators.model import Arrays, Decomposition, Fitted, Inputs, PredictAll, Problem
@@ -60,6 +61,25 @@ class FittedInScene(Fitted):
         """The fitted model in an edited copy of the scene that it was fitted in."""
         return type(self)(self.fitted.in_scene(scene), replace(self.problem, scene=scene, material=None))
 
+    def traced(self, problem: Problem, split: Split) -> PredictAll:
+        """Observations [n_rx, m, ...] traced in a problem's scene, of strengths with offsets by some training rows."""
+        record, how = problem.record, default_options(problem.record)
+        stated = record if record.carriers_hz is None else record.at_carrier(record.carriers_hz[0])
+        options = TraceOptions(transmission=True, depth=how.depth, reflections=how.reflections)
+        assert problem.scene is not None
+        tracer = RayTracer(problem.scene, instrument_of(stated), options, problem.material)
+        offsets = None
+        if record.task.has_offsets:
+            rows = some_rows(split)
+            offsets = fit_offsets(tracer(record.tx_pos_m[rows]), record.seen(split).observation[:, rows])
+
+        def predict(inputs: Inputs) -> NDArray[np.generic]:
+            traced = tracer.trace(inputs.tx_pos_m, first_row=inputs.first_row, carriers_hz=inputs.carriers_hz)
+            observed = tracer.observe(traced)
+            return observed if offsets is None else offsets(observed)
+
+        return predict
+
     def arrays(self) -> Arrays:
         """Arrays of the fitted model."""
         return self.fitted.arrays()
@@ -73,9 +93,10 @@ def by_stage(problem: Problem, split: Split, side: FittedInScene, used: Collecti
     predictions: dict[str, PredictAll] = {}
     earlier = [stage for stage in STAGES if stage in used][:-1]
     if MEAN in earlier:
-        predictions[MEAN] = _traced(problem, split)
+        predictions[MEAN] = side.traced(problem, split)
     if side.problem.scene != problem.scene:
-        predictions |= {stage: _traced(side.problem, split) for stage in (CALIBRATION, CORRECTED) if stage in earlier}
+        stages = [stage for stage in (CALIBRATION, CORRECTED) if stage in earlier]
+        predictions |= {stage: side.traced(side.problem, split) for stage in stages}
     field, count = side.fitted, len(problem.record.receivers)
     if isinstance(field, FittedField):
         if SURFACES in earlier:
@@ -91,22 +112,6 @@ def at_all_receivers(fitted: Fitted, count: int, inputs: Inputs) -> NDArray[Any]
     return np.stack([fitted.predict_mean(inputs, receiver) for receiver in range(count)])
 
 
-def _traced(problem: Problem, split: Split) -> PredictAll:
-    """Traced reports; strengths with the offset of each receiver that fits its training rows."""
-    record, how = problem.record, default_options(problem.record)
-    stated = record if record.carriers_hz is None else record.at_carrier(record.carriers_hz[0])
-    options = TraceOptions(transmission=True, depth=how.depth, reflections=how.reflections)
-    assert problem.scene is not None
-    tracer = RayTracer(problem.scene, instrument_of(stated), options, problem.material)
-    offsets = None
-    if record.task.has_offsets:
-        every = split.all_train
-        rows = every[:: -(-len(every) // OFFSET_ROWS)]
-        offsets = fit_offsets(tracer(record.tx_pos_m[rows]), record.seen(split).observation[:, rows])
-
-    def predict(inputs: Inputs) -> NDArray[np.generic]:
-        traced = tracer.trace(inputs.tx_pos_m, first_row=inputs.first_row, carriers_hz=inputs.carriers_hz)
-        observed = tracer.observe(traced)
-        return observed if offsets is None else offsets(observed)
-
-    return predict
+def some_rows(split: Split) -> IntArray:
+    """Training rows whose traces tell offsets, evenly spaced: `OFFSET_ROWS` at most."""
+    return split.all_train[:: -(-len(split.all_train) // OFFSET_ROWS)]

@@ -13,6 +13,7 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -36,6 +37,7 @@ from .sionna.scattering import scattering_of
 FOLDER, POWER = "powers", "power_dbm"
 PACKAGES = ("mitsuba", "drjit", "sionna-rt", "numpy")
 MOST_POINTS = 6000  # most traced positions; the grid becomes wider for larger scenes
+PAIRS_TOGETHER = 1 << 17  # pairs of a position and a receiver whose paths are traced together
 LAYER_M = 0.5  # greatest distance of the grid's layers over the transmitter's heights
 SAME_HEIGHT_M = 0.02  # range of heights that one layer serves: survey of a mast or trolley on a floor
 LEAST_SHARE = 1e-3  # least share of a neighbourhood outside of solids; below, the nearest point with more is used
@@ -43,13 +45,17 @@ LEAST_SHARE = 1e-3  # least share of a neighbourhood outside of solids; below, t
 
 @dataclass(frozen=True)
 class PowerMap:
-    """Local mean of traced power on a grid [n_rx, x, y, z], dBm for 0 dBm sent; one layer serves all heights."""
+    """Local mean of traced power on a grid [n_rx, x, y, z], dBm for 0 dBm sent; one layer serves all heights.
+
+    Paths have at most so many ``reflections``; 0: the direct path alone, through what is in its way.
+    """
 
     exact: ClassVar[Literal[False]] = False
     x_m: FloatArray
     y_m: FloatArray
     z_m: FloatArray
     power_dbm: FloatArray
+    reflections: int
 
     def __call__(self, position_m: FloatArray, receiver: int) -> FloatArray:
         """Power in dBm at positions [m, 3], linear between the grid's points; outside that of its nearest edge."""
@@ -57,6 +63,15 @@ class PowerMap:
         inside = [np.clip(position_m[:, k], axis[0], axis[-1]) for k, axis in axes]
         grid = RegularGridInterpolator([axis for _, axis in axes], self.power_dbm[receiver].squeeze())
         return np.asarray(grid(np.stack(inside, axis=-1)))
+
+    @cached_property
+    def level_dbm(self) -> float:
+        """Median power."""
+        return float(np.median(self.power_dbm))
+
+    def at(self, places: IntArray) -> PowerMap:
+        """The map at some of the receivers."""
+        return replace(self, power_dbm=self.power_dbm[places])
 
 
 Tracer = Callable[[FloatArray, IntArray | None], FloatArray]
@@ -79,9 +94,9 @@ class TracedPower:
         self.local, self._trace, self._places, self._known, self._keeps = local, trace, places, known, keeps
 
     @property
-    def power_dbm(self) -> FloatArray:
-        """Powers of the local means [n_rx, x, y, z], dBm."""
-        return self.local.power_dbm
+    def level_dbm(self) -> float:
+        """Median power of the local means."""
+        return self.local.level_dbm
 
     def traced_dbm(self, position_m: FloatArray) -> FloatArray:
         """Power [n_rx, m] at positions [m, 3], each traced once and kept."""
@@ -116,8 +131,7 @@ class TracedPower:
 
     def at(self, places: IntArray) -> TracedPower:
         """Power at some of the receivers, which shares what is known."""
-        local = replace(self.local, power_dbm=self.local.power_dbm[places])
-        return TracedPower(local, self._trace, self._places[places], self._known, self._keeps)
+        return TracedPower(self.local.at(places), self._trace, self._places[places], self._known, self._keeps)
 
 
 Traced = PowerMap | TracedPower  # mean of signal strengths
@@ -171,7 +185,7 @@ def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, opt
         if not (grid_mw > 0).any():
             raise InputError(f"{receiver.name}: no path from anywhere in the scene; check its position, or depth")
         grid_mw[grid_mw <= 0] = grid_mw[grid_mw > 0].min()  # no path: as weak as the weakest point with one
-    return PowerMap(x_m, y_m, z_m, 10 * np.log10(power))
+    return PowerMap(x_m, y_m, z_m, 10 * np.log10(power), options.most_reflections)
 
 
 def _means_outside(
@@ -190,7 +204,10 @@ def _power_dbm(
 ) -> FloatArray:
     """Received power [n_rx, m] in dBm for 0 dBm sent from points [m, 3] outside of solids, NaN without a path."""
     how: dict[str, Any] = {"prepared": prepared, "tx_antenna": tx_antenna, "check": False}
-    return np.asarray(rssi_dbm(trace_paths(prepared.scene, tx_pos_m, receivers, options, **how).paths), float)
+    # In chunks: a path takes a kilobyte, and what is kept of it here is its power. Chains of reflections are kept.
+    chunks = np.array_split(tx_pos_m, max(1, len(tx_pos_m) * len(receivers) // PAIRS_TOGETHER))
+    traced = (trace_paths(prepared.scene, chunk, receivers, options, **how).paths for chunk in chunks)
+    return np.concatenate([np.asarray(rssi_dbm(paths), float) for paths in traced], axis=1)
 
 
 def traced_powers(

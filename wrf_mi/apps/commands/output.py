@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 if TYPE_CHECKING:
     from ...training.loop import Progress as FitProgress
-from ...core.files import listed
+from ...core.files import MOST_LISTED, listed
 
 QUANTITIES = ("median", "mean", "p10", "p90")
 
@@ -108,11 +108,14 @@ def _show_receivers(metrics: dict[str, Any]) -> None:
         if key in metrics:
             named = listed(f"{name} ({rows})" for name, rows in metrics[key].items())
             print(f"receivers with {what} (number): {named}")
-    for name, place in metrics.get("receiver_places", {}).items():
+    places = metrics.get("receiver_places", {})
+    for name, place in list(places.items())[:MOST_LISTED]:
         axes = zip("xyz", place["position_m"], place["std_m"], strict=True)
         # A coordinate that the data state is not estimated.
         words = (f"{axis} {value:.1f} " + (f"± {std:.1f} m" if std else "m as stated") for axis, value, std in axes)
         print(f"receiver {name}: position estimated at {', '.join(words)} (± standard deviation)")
+    if len(places) > MOST_LISTED:
+        print(f"positions of {len(places) - MOST_LISTED} further receivers are estimated: metrics.json has them")
 
 
 def _show_stages(reports: list[dict[str, Any]], label: str, weighed: dict[str, float]) -> None:

@@ -61,7 +61,7 @@ class PriorMean:
         """Expected dBm [n], columns [n, k] of its corrections, and their prior standard deviations [k]."""
         if self.traced is not None:
             power = self.traced(poses.position_m, receiver)
-            level = power - float(np.median(self.traced.power_dbm))  # centred, so that factor and offset are apart
+            level = power - self.traced.level_dbm  # centred, so that factor and offset are apart
         else:
             distance = np.linalg.norm(self.receivers_m[receiver] - poses.position_m, axis=1)
             frequency_hz = np.broadcast_to(self.frequency_hz, len(self.receivers_m))[receiver]
@@ -215,17 +215,15 @@ def by_likelihood(
 
 
 def _most_heard(prior: PriorMean, value_dbm: FloatArray) -> tuple[PriorMean, IntArray]:
-    """The mean at the receivers with most of the values [n_rx, n], `LIKELIHOOD_RECEIVERS` at most, and their numbers.
-
-    About traced power, which is that of all receivers, all.
-    """
+    """The mean at the receivers with most values [n_rx, n], `LIKELIHOOD_RECEIVERS` at most, and their numbers."""
     count = len(prior.receivers_m)
-    if prior.traced is not None or count <= LIKELIHOOD_RECEIVERS:
+    if count <= LIKELIHOOD_RECEIVERS:
         return prior, np.arange(count)
     received = np.isfinite(value_dbm).sum(axis=1)
     most = np.sort(np.argsort(-received, kind="stable")[:LIKELIHOOD_RECEIVERS])
     frequency_hz = np.broadcast_to(prior.frequency_hz, count)[most]
-    return replace(prior, receivers_m=prior.receivers_m[most], frequency_hz=frequency_hz), most
+    traced = None if prior.traced is None else prior.traced.at(most)
+    return replace(prior, receivers_m=prior.receivers_m[most], frequency_hz=frequency_hz, traced=traced), most
 
 
 def by_search(

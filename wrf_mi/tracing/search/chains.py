@@ -279,9 +279,14 @@ def hits(options: TraceOptions, rays: int) -> int:
     return len(patterns(met, options.most_reflections, options.transmission)) * rays * met
 
 
+def search_seconds(options: TraceOptions, rays: int, sources: int) -> float:
+    """Estimated duration of a search from a number of sources on two cores, seconds."""
+    return sources * hits(options, rays) * SECONDS_PER_HIT
+
+
 def check_search(options: TraceOptions, rays: int, sources: int) -> None:
     """Announce a search from a number of sources that takes long; `InputError` for one of more than an hour."""
-    duration_s = sources * hits(options, rays) * SECONDS_PER_HIT
+    duration_s = search_seconds(options, rays, sources)
     if duration_s < WARN_S:
         return
     search = f"search for paths with up to {options.most_reflections} reflections"
