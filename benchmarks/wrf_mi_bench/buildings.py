@@ -1,9 +1,9 @@
 """Measured buildings: the hybrid beside simple models, and devices that a handful of their own readings calibrates.
 
-Sets are public measurements in which nothing was tuned on test rows; each is a fit of the hybrid without a plan and of
-four simple models to the training rows, scored on the test rows, which lie on other paths or walks. No model can be
-better than the noise of single readings: the median difference of two readings of a receiver within a metre, over the
-square root of two, stands beside.
+Sets are public measurements in which nothing was tuned on test rows; each is a fit of the hybrid without a plan, with
+the set's plan where it has one, and of four simple models to the training rows, scored on the test rows, which lie on
+other paths or walks. No model can be better than the noise of single readings: the median difference of two readings of
+a receiver within a metre, over the square root of two, stands beside.
 """
 
 import tempfile
@@ -21,6 +21,7 @@ from wrf_mi.datasets import load
 from wrf_mi.datasets.registry import data_home
 from wrf_mi.runs.results import read_run
 from wrf_mi.runs.run import Run
+from wrf_mi.scene.make import make_scene
 from wrf_mi.tasks.scores import REAL_90, block_bootstrap
 
 from .bench import FLAT
@@ -31,7 +32,8 @@ CAMPUS, FLOOR, MALL = "duke-cbrs", "wifi-office", "mall-f3"  # folders of measur
 SETS = ((FLAT, 64), (FLAT, None), (CAMPUS, None), (FLOOR, None), (MALL, None))
 """Data sets and numbers of training rows; None: all."""
 HEARD = 60  # least training rows of a receiver of the shopping centre
-HYBRID, SIMPLE = "hybrid", ("kriging", "trees", "idw", "mri")
+HYBRID, WITH_PLAN, SIMPLE = "hybrid", "hybrid with plan", ("kriging", "trees", "idw", "mri")
+PLANS = {FLAT: ("layout.csv", 2.7), MALL: ("geojson_map.json", 4.0)}  # file of a set's plan, and height of its walls, m
 NEAR_M, LEAST_PAIRS = 1.0, 20  # distance of two readings whose difference is noise, and fewest pairs that tell it
 OWN = (0, 1, 3, 10, 30)  # numbers of a device's own readings
 ADDED_DB = 0.0, 10.0  # offsets of phones: those of the walks, and of another make
@@ -75,9 +77,16 @@ def measured(folder: Path, name: str, count: int | None) -> dict[str, Any]:
     """``rows``: the scores of each model on a set, with the paired gain of the hybrid over it."""
     record, errors, rows = measured_set(folder, name), dict[str, FloatArray](), list[dict[str, Any]]()
     noise = noise_db(record)
-    for model in (HYBRID, *SIMPLE):
+    for model in (HYBRID, *[WITH_PLAN] * (name in PLANS), *SIMPLE):
+        scene = None
+        if model == WITH_PLAN:
+            file, height_m = PLANS[name]
+            scene = make_scene(
+                source_folder(name) / file, folder / f"{name}-plan", height_m=height_m, replace=True
+            ).folder
         out = folder / f"{name}-{count or 'all'}-{model}"
-        run = wrf_mi.train(record, model, split="official", n_train=count, seed=SEED, out=out)
+        how: dict[str, Any] = {"split": "official", "n_train": count, "seed": SEED, "out": out}
+        run = wrf_mi.train(record, model.partition(" ")[0], scene, preset="fast" if scene else None, **how)
         results = read_run(run.folder)
         error = np.abs(np.asarray(results.prediction, float) - results.truth)
         errors[model] = error
