@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +50,7 @@ class FittedStrengths(FittedInScene):
         """Kriged differences from the power traced in the stated scene, about the power traced in an edited one."""
         problem, field = replace(self.problem, scene=scene, material=None), copy(self.fitted.field)
         exact = field.prior.traced is not None and field.prior.traced.exact
-        power = _traced(problem)(problem.record.receivers) if exact else _local_mean(problem)
+        power = _mean(problem, exact)
         # The posterior of the training rows is about the scene in which they were measured.
         field.prior = replace(field.prior, traced=power)
         return FittedStrengths(replace(self.fitted, field=field), problem)
@@ -75,18 +75,18 @@ class Mean(Stage):
         Whoever turns carries the antenna beside the stated position, and receivers whose places are estimates are
         estimated anew by each hold-out.
         """
-        options = [Option("local", self._local)]
+        options = [Option("local", partial(self._fit, False))]
         if problem.record.tx_heading_rad is None and all(each.is_surveyed for each in problem.record.receivers):
-            options.append(Option("exact", self._exact))
+            options.append(Option("exact", partial(self._fit, True)))
         return options
 
-    def _local(self, state: State, split: Split, session: Session) -> State:
+    def _fit(self, exact: bool, state: State, split: Split, session: Session) -> State:
         session.report("tracing a map", 0.0)
-        return replace(state, mean=_local_mean(state.problem))
+        return replace(state, mean=_mean(state.problem, exact))
 
-    def _exact(self, state: State, split: Split, session: Session) -> State:
-        session.report("tracing a map", 0.0)
-        return replace(state, mean=_traced(state.problem)(state.problem.record.receivers))
+
+def _mean(problem: Problem, exact: bool) -> TracedPower | PowerMap:
+    return _traced(problem)(problem.record.receivers) if exact else _local_mean(problem)
 
 
 def _traced(problem: Problem) -> ExactMean:
