@@ -8,6 +8,8 @@ import numpy as np
 
 from wrf_mi.core import Receiver, Record
 from wrf_mi.gaussians import Encoding, WrfGs, WrfGsPlus, random_gaussians
+from wrf_mi.graph.graph import Graph
+from wrf_mi.receivers.registry import PIXEL, ObservationSpec
 from wrf_mi.training.predictor import Predictor
 
 RECEIVERS = (
@@ -44,6 +46,11 @@ def true_field(model: str, count: int = 8, seed: int = 0, width: int = WIDTH) ->
     return field, params
 
 
+def spectra_predictor(field: Any, params: Any, receivers: Any, height: int, width: int, operator: bool = False) -> Any:
+    """Predictor of spectra of an image size by a field alone, with the papers' receiver."""
+    return Predictor(Graph(field, receivers, ObservationSpec(PIXEL, (height, width))), params, operator)
+
+
 def spectra(
     model: str = "wrf-gs+", rows: int = 24, receivers: int = 1, size: tuple[int, int] = SIZE, **field: Any
 ) -> tuple[Record, Any, dict[str, np.ndarray]]:
@@ -56,7 +63,7 @@ def spectra(
     tx_pos = np.random.default_rng(1).uniform(-1, 1, (rows, 3))
 
     def observe() -> np.ndarray:
-        predict = Predictor.of_field(model_field, params, RECEIVERS[:receivers], *size)
+        predict = spectra_predictor(model_field, params, RECEIVERS[:receivers], *size)
         return np.stack([predict(tx_pos, r) for r in range(receivers)])
 
     largest = observe().max()

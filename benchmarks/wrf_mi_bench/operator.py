@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from wrf_mi.gaussians import Factorised, WrfGs, WrfGsPlus
+from wrf_mi.graph.graph import Graph
+from wrf_mi.receivers.registry import PIXEL, ObservationSpec
 from wrf_mi.synthetic.laboratory import RECEIVER
 from wrf_mi.tasks.scores import bootstrap
 from wrf_mi.training.predictor import Predictor
@@ -37,7 +39,8 @@ def main() -> dict[str, Any]:
     }
     rows = []
     for name, (field, count, size) in cases.items():
-        predictor = partial(Predictor.of_field, field, parameters(field, count, size), [RECEIVER], HEIGHT, WIDTH)
+        graph = Graph(field, [RECEIVER], ObservationSpec(PIXEL, (HEIGHT, WIDTH)))
+        predictor = partial(Predictor, graph, parameters(field, count, size))
         calls = {"both": partial(predictor(), tx[:1])}
         if field.static_geometry:
             by_operator = predictor(operator=True)

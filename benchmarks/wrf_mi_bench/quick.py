@@ -151,7 +151,7 @@ def _alone() -> tuple[Call, Call]:
     side = graph.trace(known.tx_pos_m, 0)[0]
     assert side is not None
     adam = Adam(lr=0.05, params={name: to_tensor(value) for name, value in trainer.state.params().items()})
-    names, model, size = list(adam), graph.models[0], targets.truth.shape[2:]
+    names, model, size = list(adam), graph.models[0], targets.observed.shape[2:]
     loss_of = partial(trainer.plan.task.loss, ssim_weight=config.loss.ssim_weight)
 
     def step(adam: Any, data: TrainingData, rows: Any, receiver: Any) -> Any:

@@ -16,7 +16,9 @@ from wrf_mi.backend.device import to_tensor
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import FIELDS
 from wrf_mi.gaussians.parameters import gaussians_in_parts
+from wrf_mi.graph.graph import Graph
 from wrf_mi.receivers import antenna_csi, bartlett_spectrum
+from wrf_mi.receivers.registry import PIXEL, ObservationSpec
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tasks.scores import Interval
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
@@ -76,7 +78,8 @@ def _networks(count: int) -> Call:
 def _field(transmitters: int) -> Call:
     tx = transmitter_path(transmitters)
     field = make_field(TrainConfig().resolved(tx))
-    predictor = Predictor.of_field(field, parameters(field, SMALL, size_deg(SMALL)), [RECEIVER], HEIGHT, WIDTH)
+    graph = Graph(field, [RECEIVER], ObservationSpec(PIXEL, (HEIGHT, WIDTH)))
+    predictor = Predictor(graph, parameters(field, SMALL, size_deg(SMALL)))
     return lambda: predictor(tx)
 
 

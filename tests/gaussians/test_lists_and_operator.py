@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_fields import BATCH, COUNT, POSE, RECEIVER, SIZE, device_gaussians, fields, oracle_image
-from made_spectra import RECEIVERS, true_field
+from made_spectra import RECEIVERS, spectra_predictor, true_field
 from made_spectra import SIZE as SPECTRUM_SIZE
 from scipy.special import logit
 from wrf_mi_bench import field_oracle as oracle
@@ -25,7 +25,6 @@ from wrf_mi.gaussians.operator import BLOCK, PixelOperator, pixel_weights
 from wrf_mi.gaussians.parameters import gaussians_in_parts
 from wrf_mi.gaussians.tiles import TileLists, build_lists, perception_plane
 from wrf_mi.training import evaluator
-from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 
 pytestmark = pytest.mark.all_threads
@@ -98,11 +97,11 @@ def test_predictions_of_many_gaussians_equal_recorded_ones(monkeypatch):
     """Above a number of Gaussians nothing is recorded, networks run in chunks and lists are counted."""
     field, params = true_field("wrf-gs+")
     tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))
-    recorded = Predictor.of_field(field, params, RECEIVERS, *SPECTRUM_SIZE)
+    recorded = spectra_predictor(field, params, RECEIVERS, *SPECTRUM_SIZE)
     expected = recorded(tx)
     monkeypatch.setattr(evaluator, "CHUNK_SIZE", 1)
     monkeypatch.setattr(tiles, "RESERVED", 0)
-    parts = Predictor.of_field(field, params, RECEIVERS, *SPECTRUM_SIZE)
+    parts = spectra_predictor(field, params, RECEIVERS, *SPECTRUM_SIZE)
     np.testing.assert_allclose(parts(tx), expected, atol=ROUNDING)
     evaluators: tuple[Any, Any] = parts.evaluate, recorded.evaluate
     assert not evaluators[0].recordings

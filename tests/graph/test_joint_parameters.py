@@ -17,6 +17,7 @@ from traced_rooms import SHOEBOX, write_xml
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.settings import with_settings
+from wrf_mi.estimators.gaussian.curriculum import fit_curriculum
 from wrf_mi.receivers.receiver_models import PowerReceiver
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
@@ -26,7 +27,7 @@ from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.config import calibration_config, default_config
 from wrf_mi.training.fit_plan import FitPlan
 from wrf_mi.training.loop import FitState
-from wrf_mi.training.trainer import Trainer, fit_curriculum
+from wrf_mi.training.trainer import Trainer
 
 ARRAY_M = planar_array(4, 4, 0.16)
 BAND_HZ = FREQUENCY_HZ + np.linspace(-10e6, 10e6, 4)
@@ -209,7 +210,7 @@ def test_resumed_fit_keeps_its_paths(rooms):
     part.run(stop=stop_after(9))
     state = FitState.from_arrays(part.state.arrays())
     resumed = Trainer(part.plan.record, part.plan.split, part.config, scene=part.graph.scene, state=state)
-    for side, searched_m in zip(resumed.sides, part.state.searched_m, strict=True):
+    for side, searched_m in zip(resumed.plan.sides, part.state.searched_m, strict=True):
         np.testing.assert_array_equal(side.searched_at_m, searched_m)
     resumed.run()
     np.testing.assert_equal(resumed.state.params(), whole.state.params())

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
-from made_spectra import RECEIVERS, small_field
+from made_spectra import RECEIVERS, small_field, spectra_predictor
 from small_fits import QUICK, official, settings
 from traced_rooms import FREQUENCY_HZ, SHOEBOX, receiver, room, write_xml
 from wrf_mi_plugins.blend_rays import blend_rays
@@ -32,7 +32,6 @@ from wrf_mi.tasks.scores import ssim
 from wrf_mi.tracing.paths.instrument_parameters import pose_names, receiver_pose
 from wrf_mi.tracing.slabs import slab
 from wrf_mi.training.config import TrainConfig
-from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.step import device_pose
 from wrf_mi.training.trainer import Trainer
 
@@ -163,7 +162,7 @@ def made_record(rows=60):
     values = field.init(start, rng)
     values |= {name: 4 * value for name, value in values.items() if name.startswith("deform.signal.")}
     tx = np.random.default_rng(1).uniform(-1, 1, (rows, 3))
-    spectra = Predictor.of_field(field, values, RECEIVERS[:1], *SIZE)(tx)
+    spectra = spectra_predictor(field, values, RECEIVERS[:1], *SIZE)(tx)
     spectra, (train, test) = np.minimum(spectra / spectra.max(), 1)[None], np.split(np.arange(rows), [40])
     return Record("made", "spectrum", tx, RECEIVERS[:1], spectra, official=(train, test)), start
 

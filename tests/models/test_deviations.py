@@ -14,6 +14,7 @@ from wrf_mi.core.types import Inputs
 from wrf_mi.estimators.interpolation.strengths import Strengths, fit_strengths
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.other_models import score_predictions
+from wrf_mi.runs.predict_to_file import write_run_predictions
 from wrf_mi.runs.results import read_run
 from wrf_mi.tasks.scores import inside_interval
 
@@ -91,11 +92,11 @@ def test_run_states_both_deviations_and_scores_the_one_of_its_truth(model: str, 
     prediction = run.predict(record.tx_pos_m[-3:])
     np.testing.assert_allclose(prediction.std_mean, read_run(run.folder).std_mean[:, -3:], rtol=1e-5)
     assert set(prediction.to_xarray()) >= {"std", "std_mean"}
-    run.predict_to_file(Inputs(record.tx_pos_m[-3:]), tmp_path / "new.csv")
+    write_run_predictions(run, Inputs(record.tx_pos_m[-3:]), tmp_path / "new.csv")
     header, first = (tmp_path / "new.csv").read_text().splitlines()[:2]
     row = dict(zip(header.split(","), map(float, first.split(",")), strict=True))
     assert row["r0_std_mean_db"] == pytest.approx(prediction.std_mean[0, 0], rel=1e-5)
-    run.predict_to_file(Inputs(record.tx_pos_m), tmp_path / "all.csv")
+    write_run_predictions(run, Inputs(record.tx_pos_m), tmp_path / "all.csv")
     scored = score_predictions(record, tmp_path / "all.csv", tmp_path / "other", "other")
     assert scored.metrics["inside_90"] == pytest.approx(metrics["mean"]["inside_90"])
     dataset = run.map(height_m=1.3, step_m=5, receivers=["r0"])

@@ -21,6 +21,7 @@ from wrf_mi.estimators.held_out import held_out_predictions
 from wrf_mi.estimators.model import default_settings
 from wrf_mi.estimators.reception import Sensitivity
 from wrf_mi.models import MODELS, Problem, Session
+from wrf_mi.runs.predict_to_file import write_run_predictions
 from wrf_mi.scene.correction_data import FILE, CorrectionData
 from wrf_mi.tasks.scores import crps, inside_interval, probability_scores
 from wrf_mi.training.by_distance import fit_intervals
@@ -262,8 +263,8 @@ def test_reception_is_in_files_and_maps_and_coverage_is_received_and_strong(tmp_
     with np.load(run.folder / "predictions.npz") as arrays:
         again = run.predict(arrays["tx_pos"], 1)
         np.testing.assert_allclose(arrays["probability_of_reception"][1], again.reception, rtol=FLOAT32)
-    run.predict_to_file(wrf_mi.models.Inputs(at_m), tmp_path / "new.npz")
-    run.predict_to_file(wrf_mi.models.Inputs(at_m), tmp_path / "new.csv")
+    write_run_predictions(run, wrf_mi.models.Inputs(at_m), tmp_path / "new.npz")
+    write_run_predictions(run, wrf_mi.models.Inputs(at_m), tmp_path / "new.csv")
     with np.load(tmp_path / "new.npz") as arrays:
         np.testing.assert_allclose(arrays["probability_of_reception"][0], stated.reception, rtol=FLOAT32)
     assert "rx0_received" in (tmp_path / "new.csv").read_text().splitlines()[0].split(",")

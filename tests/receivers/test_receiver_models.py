@@ -26,8 +26,7 @@ from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.receivers import antenna_csi, csi
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
-from wrf_mi.receivers.device_paths import Ports, path_sum
-from wrf_mi.receivers.receiver_models import magnitude, power
+from wrf_mi.receivers.device_paths import Ports, magnitude, path_sum, power
 from wrf_mi.receivers.reports import minmax_scale
 
 DOUBLE = 1e-11  # float64, sums of a thousand terms, phases of a hundred radians

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from calling import contents, copied
 from commands import Command, arrays_in, positions_file
-from made_spectra import OCTAVES, RECEIVERS, SIZE, true_field
+from made_spectra import OCTAVES, RECEIVERS, SIZE, spectra_predictor, true_field
 from small_fits import settings
 
 from wrf_mi.backend.device import to_tensor
@@ -43,7 +43,7 @@ def made(model: str) -> tuple[Any, dict[str, np.ndarray]]:
 
 
 def predictor(field: Any, params: Any, receivers: Any = RECEIVERS[:1], size: Any = SIZE, **more: Any) -> Predictor:
-    return Predictor.of_field(field, params, receivers, *size, **more)
+    return spectra_predictor(field, params, receivers, *size, **more)
 
 
 class Operator:

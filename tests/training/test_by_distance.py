@@ -182,20 +182,18 @@ def test_reach_with_the_best_held_out_scores_is_chosen(higher_is_better):
     held, reach, sign = [at(*np.linspace(0.05, 1.0, 20))], Reach(ORIGIN, 0.0), -1 if higher_is_better else 1
     lengths = reach.lengths(held)
     truth = replace(reach, length_m=lengths[3]).weight(held[0], 0)
-    found = choose_reach(reach, lengths, held, lambda r, weight: sign * np.abs(weight - truth), higher_is_better)
+    found = choose_reach(reach, lengths, lambda r: sign * np.abs(r.weight(held[0], 0) - truth), higher_is_better)
     assert found[0] == lengths[3]
     assert not found[1].any()
 
 
 def test_reach_whose_gain_is_within_its_standard_error_is_not_chosen():
     """Gaussians that add noise of mean zero, and a gain of half its standard error."""
-    held, noise = [at(*np.linspace(0.05, 1.0, 40))], np.random.default_rng(0).normal(0, 1, 40)
+    held, noise = at(*np.linspace(0.05, 1.0, 40)), np.random.default_rng(0).normal(0, 1, 40)
     noise += 0.5 * noise.std() / np.sqrt(40) - noise.mean()
     for gain, chosen in ((0, 0), (1, np.inf)):
-        score = partial(lambda gain, r, weight: (noise + gain) * weight, gain)
-        assert choose_reach(Reach(ORIGIN, np.inf), [0.0, np.inf], held, score, True)[0] == chosen
-    reach, scores = choose_reach(Reach(ORIGIN, 2.0), [0.0, 1.0], [np.zeros((0, 3))], lambda r, w: w.astype(float), True)
-    assert (reach, len(scores)) == (2.0, 0)  # without held-out rows it is kept
+        score = partial(lambda gain, reach: (noise + gain) * reach.weight(held, 0), gain)
+        assert choose_reach(Reach(ORIGIN, np.inf), [0.0, np.inf], score, True)[0] == chosen
 
 
 def channels(channel, position):
@@ -281,5 +279,5 @@ def test_held_out_rows_do_not_extend_the_reach(holdout_steps_fraction, known):
     record = channels(np.ones((60, 1)), np.random.default_rng(0).uniform(1, 2, (60, 3)))
     trainer = of_gaussians(record, f"holdout_steps_fraction={holdout_steps_fraction}")
     assert trainer.state.chosen
-    assert len(trainer.reach().known_m[0]) == (known or len(trainer.plan.choosing.train))
-    assert len(trainer.plan.choosing.train) < 40
+    assert len(trainer.reach().known_m[0]) == (known or len(trainer.plan.selection.train))
+    assert len(trainer.plan.selection.train) < 40

@@ -26,11 +26,11 @@ from wrf_mi.tasks import TASKS
 from wrf_mi.training.checkpoint import read_checkpoint, write_checkpoint
 from wrf_mi.training.config import default_config
 from wrf_mi.training.evaluator import TOGETHER
-from wrf_mi.training.fit_plan import targets_of
 from wrf_mi.training.loop import FitState
 from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.session import FitSession
 from wrf_mi.training.step import TrainingData, device_pose
+from wrf_mi.training.targets import targets_of
 from wrf_mi.training.trainer import Trainer
 
 MODELS = tuple(FIELDS)
@@ -290,8 +290,9 @@ def test_resumed_fit_chooses_the_same_state(stop, uninterrupted, tmp_path):
 def test_missing_observations_do_not_train():
     record, rows = strengths(), np.arange(40)
     targets, schedule = targets_of(record, rows), Trainer(record, halves(record), config(record)).schedule
-    assert set(rows) - set(targets.received(0, rows)) == {0, 1, 2}
-    np.testing.assert_array_equal(targets.received(1, rows), rows)
+    first, second = targets.received(rows)
+    assert set(rows) - set(first) == {0, 1, 2}
+    np.testing.assert_array_equal(second, rows)
     assert not set(schedule.rows[schedule.receiver == 0].ravel()) & {0, 1, 2}
 
 
@@ -308,7 +309,7 @@ def test_loss_divides_differences_by_stated_noise():
     assert targets_of(record, rows).weight is None
     np.testing.assert_array_equal(targets_of(replace(record, std=np.full_like(std, 3)), rows).weight, 1)
     batch, scale = rng.permutation(rows)[:6], 1 / targets.unit
-    data = TrainingData(to_tensor(targets.condition), to_float(targets.truth), to_float(scale), to_float(weight))
+    data = TrainingData(to_tensor(targets.condition), to_float(targets.observed), to_float(scale), to_float(weight))
     for r in (0, 1):
         _, truth, factor = data.select(mi.UInt32(batch.tolist()), r, 1)
         found = TASKS["rssi"].loss((truth + 2) * factor, truth * factor, len(batch), ssim_weight=0.0)

@@ -162,7 +162,7 @@ def test_score_in_training_is_that_of_rows_held_out_as_far_as_test_rows(walked):
     record, split = walked
     received = []
     trainer = Trainer(record, split, quick("steps=40", "holdout_steps_fraction=0.5", "validate_every=20"))
-    held_out, joined = trainer.plan.choosing, trainer.schedule.joined
+    held_out, joined = trainer.plan.selection, trainer.schedule.joined
     moved = np.setdiff1d(held_out.validation, split.validation)
     assert len(moved)
     assert not np.isin(trainer.schedule.rows[:joined], held_out.validation).any()
@@ -194,9 +194,9 @@ def test_no_receiver_loses_its_batches_to_far_validation_rows():
     strengths[1, far.train[1:]] = np.nan
     both = Record("made-here", "rssi", tx_pos_m, RECEIVERS, strengths, frequencies_hz=np.array([2.4e9]))
     for batch, train in ((4, split.train), (1, far.train)):
-        np.testing.assert_array_equal(FitPlan(both, split, quick(f"batch={batch}")).choosing.train, train)
+        np.testing.assert_array_equal(FitPlan(both, split, quick(f"batch={batch}")).selection.train, train)
     every = replace(both, receivers=RECEIVERS[:1], observation=strengths[:1])
-    np.testing.assert_array_equal(FitPlan(every, split, quick("batch=4")).choosing.train, far.train)
+    np.testing.assert_array_equal(FitPlan(every, split, quick("batch=4")).selection.train, far.train)
 
 
 def test_runs_are_held_out_where_other_runs_are_predicted() -> None:

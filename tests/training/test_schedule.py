@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from wrf_mi.core import InputError, Split
 from wrf_mi.core.settings import with_settings
-from wrf_mi.training.adam import density_rounds, plan
+from wrf_mi.training.adam import density_rounds, schedule_of
 from wrf_mi.training.config import TrainConfig
 
 
@@ -24,7 +24,7 @@ def split_of(train, validation=3):
 def plan_of(split, receivers=1, *settings, **values):
     config = with_settings(TrainConfig(**values), settings)
     rng, rounds = np.random.default_rng([config.seed, 1]), density_rounds(config.density, config.steps)
-    return plan(config, [split.train] * receivers, [split.all_train] * receivers, rng, rounds)
+    return schedule_of(config, [split.train] * receivers, [split.all_train] * receivers, rng, rounds)
 
 
 @given(
@@ -130,7 +130,7 @@ def test_a_batch_is_no_larger_than_the_rows_of_any_receiver():
     assert plan_of(split_of(3, 1), 1, "batch=5", "holdout_steps_fraction=0", steps=10).rows.shape == (10, 4)
     rows = [np.array([4, 7, 9]), np.array([1, 2, 3, 5, 6, 8])]
     config = with_settings(TrainConfig(batch=5, steps=9), ["holdout_steps_fraction=1"])
-    schedule = plan(config, rows, rows, np.random.default_rng(0))
+    schedule = schedule_of(config, rows, rows, np.random.default_rng(0))
     assert schedule.rows.shape == (9, 3)
     # An epoch has one batch of the first receiver and two of the second, each of its own rows.
     for three in range(0, 9, 3):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_spectra import RECEIVERS, SIZE, small_field, spectra, true_field
+from made_spectra import RECEIVERS, SIZE, small_field, spectra, spectra_predictor, true_field
 from small_fits import official, settings, stop_after
 
 from wrf_mi.backend.device import to_float
@@ -24,7 +24,6 @@ from wrf_mi.tasks.scores import ssim
 from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.loop import FitState
-from wrf_mi.training.predictor import Predictor
 from wrf_mi.training.trainer import Trainer
 
 pytestmark = pytest.mark.all_threads
@@ -74,7 +73,7 @@ def test_density_rounds_within_a_run(one_gateway):
     assert losses[100] < 0.9 * losses[45]
     # The recordings are those for this number of Gaussians: a new predictor of the same parameters agrees.
     tx = one_gateway.tx_pos_m[:2]
-    again = Predictor.of_field(trainer.field, trainer.state.mean_params(), RECEIVERS[:1], *SIZE)
+    again = spectra_predictor(trainer.field, trainer.state.mean_params(), RECEIVERS[:1], *SIZE)
     np.testing.assert_allclose(trainer.predictor()(tx), again(tx), atol=FLOAT32_TOLERANCE)
 
 
@@ -216,7 +215,7 @@ def test_loss_of_a_step_is_that_of_its_batch(two_gateways):
     growth, received, expected = rounds(3, 0.7, 0.5, "density.max_gaussians=18"), list[Any](), []
     trainer = trainer_of(two_gateways, "steps=10", "batch=3", "log_every=1", *growth)
     for rows, r in zip(trainer.schedule.rows, trainer.schedule.receiver.tolist(), strict=True):
-        predict = Predictor.of_field(trainer.field, trainer.state.params(), two_gateways.receivers, *SIZE)
+        predict = spectra_predictor(trainer.field, trainer.state.params(), two_gateways.receivers, *SIZE)
         greys, truth = predict(two_gateways.tx_pos_m[rows], r), two_gateways.observation[r, rows]
         error, light = np.abs(greys - truth), truth - truth.min(axis=(1, 2), keepdims=True)
         by_light = ((light * error).sum(axis=(1, 2)) / light.sum(axis=(1, 2))).mean()
@@ -319,13 +318,13 @@ def test_fits_of_any_learning_rates_and_start_end_finite_or_name_step_and_group(
 def test_predictor_of_other_receivers_and_sizes():
     field, params = true_field("wrf-gs")
     tx = np.random.default_rng(5).uniform(-1, 1, (3, 3))
-    both = Predictor.of_field(field, params, RECEIVERS, *SIZE)
+    both = spectra_predictor(field, params, RECEIVERS, *SIZE)
     for r, receiver in enumerate(RECEIVERS):
-        alone = Predictor.of_field(field, params, [receiver], *SIZE)(tx)
+        alone = spectra_predictor(field, params, [receiver], *SIZE)(tx)
         np.testing.assert_array_equal(both(tx, r), alone)
         np.testing.assert_array_equal(both(tx, receiver.name), alone)
         # Pixels are points: twice the size has the same directions at every other pixel.
-        double = Predictor.of_field(field, params, [receiver], 2 * SIZE[0], 2 * SIZE[1])(tx)
+        double = spectra_predictor(field, params, [receiver], 2 * SIZE[0], 2 * SIZE[1])(tx)
         np.testing.assert_allclose(double[:, ::2, ::2], alone, atol=FLOAT32_TOLERANCE)
     assert np.abs(both(tx, 0) - both(tx, 1)).max() > 0.01
     # One by one or together.
@@ -333,7 +332,7 @@ def test_predictor_of_other_receivers_and_sizes():
 
 
 def test_invalid_positions_are_refused():
-    predict = Predictor.of_field(*true_field("wrf-gs+"), RECEIVERS, *SIZE)
+    predict = spectra_predictor(*true_field("wrf-gs+"), RECEIVERS, *SIZE)
     for positions, message in (
         (np.zeros(3), r"expected shape \[m, 3\], got \[3\]"),
         (np.zeros((2, 4)), r"expected shape \[m, 3\], got \[2, 4\]"),

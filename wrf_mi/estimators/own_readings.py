@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ..core import InputError, Prediction
+from ..core import InputError, Prediction, Record
 from ..core.angles import FloatArray
 from .interpolation.pooled_process import DEGREES
 from .interpolation.run_offsets import NEAR_M, RUN_SD_DB
@@ -41,6 +41,26 @@ class OwnReadings:
     power_dbm: FloatArray
 
 
+def checked_readings(tx_pos_m: ArrayLike, power_dbm: ArrayLike, record: Record, receivers: int) -> OwnReadings:
+    """Readings of a device beside those of a record, at a number of receivers.
+
+    Raises:
+        InputError: a record of another task or of several carriers, or arrays of other shapes.
+    """
+    own = OwnReadings(np.atleast_2d(np.asarray(tx_pos_m, float)), np.asarray(power_dbm, float))
+    if not record.task.in_decibel or record.task.axes:
+        raise InputError(f"predicts {record.task.name}; readings tell offsets of signal strengths alone")
+    if record.carriers_hz is not None:
+        raise InputError("its data have several carriers; own readings are of one")
+    if own.power_dbm.shape != (receivers, len(own.tx_pos_m)) or own.tx_pos_m.shape[1:] != (3,):
+        shapes = f"{list(own.tx_pos_m.shape)} and {list(own.power_dbm.shape)}"
+        raise InputError(f"own readings {shapes}; give positions [m, 3] and strengths [{receivers}, m]")
+    return own
+
+
+NO_READINGS = OwnReadings(np.zeros((0, 3)), np.zeros((0, 0)))
+
+
 @dataclass(frozen=True)
 class DeviceOffset:
     """Offset of a device from the mean of those that a model learned from.
@@ -56,16 +76,17 @@ class DeviceOffset:
     readings: int
 
 
-def device_offset(fitted: Fitted, own: OwnReadings) -> DeviceOffset:
+def device_offset(fitted: Fitted, own: OwnReadings | None) -> DeviceOffset:
     """The offset of a device by its own readings.
 
     Args:
         fitted: model of signal strengths that states standard deviations.
-        own: readings, perhaps none.
+        own: readings; None: none.
 
     Raises:
         InputError: a model without standard deviations.
     """
+    own = own or NO_READINGS
     count = len(own.tx_pos_m)
     inputs = Inputs(own.tx_pos_m, runs=np.full(count, ""))  # of the mean device
     # Receivers of one place, and readings a step apart, have errors in common.

@@ -20,7 +20,6 @@ from scipy.special import expit, logit
 from ..core import InputError, Receiver, rotation_matrix, unit_vectors
 from .network import Weights
 
-Arrays = dict[str, NDArray[np.float32]]
 SPLIT_SHRINK = 1.6  # ratio of sizes of a split Gaussian and its parts (Kerbl et al. 2023)
 SPLIT_RAD = float(np.radians(5.0))  # size from the receiver above which a growing Gaussian is split, not cloned
 LEAST_OPACITY = 0.005  # opacity below which a Gaussian is pruned (Kerbl et al. 2023)
@@ -127,13 +126,13 @@ def gaussians_from_points(points_m: NDArray[np.float64], count: int, rng: np.ran
 class DensityChange:
     """A new set of Gaussians in terms of the old one."""
 
-    parameters: Arrays  # per-Gaussian parameters of the new set, [k, m]
+    parameters: Weights  # per-Gaussian parameters of the new set, [k, m]
     source: NDArray[np.int64]  # old Gaussian of each new one, [m]
     fresh: NDArray[np.bool_]  # new Gaussians whose optimiser moments start at zero, [m]
 
 
 def adapt(
-    parameters: Arrays,
+    parameters: Weights,
     view_gradient_norm: NDArray[np.floating],
     distance_m: NDArray[np.float64],
     rng: np.random.Generator,

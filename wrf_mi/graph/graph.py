@@ -65,6 +65,15 @@ class Batch:
     carrier: Any | None = None  # logarithm of the carrier over the middle one; None: rows have a single carrier
     signal: Complex | None = None  # learned signal without its unit (`Graph.learned`); None: it is evaluated
 
+    @property
+    def inputs(self) -> Any:
+        """Conditions [3 or features, batch] with the carrier, if rows have several, as the last row."""
+        if self.carrier is None:
+            return self.condition
+        values, (count, width) = self.condition.array, self.condition.shape
+        joint = dr.concat([values, dr.repeat(type(values)(self.carrier), width)])
+        return type(self.condition)(joint, (count + 1, width))
+
 
 Alone = Literal["traced", "learned"]  # component reported alone: traced or learned
 Report = Callable[[Mapping[str, Any], Batch], Any]  # ``report(params, batch)``: flat, differentiable observations
@@ -233,7 +242,7 @@ class Graph:
         """Signal (re, im) of the Gaussians, [batch * components * directions], at a port, without the `unit`."""
         assert self.field is not None
         evaluate = partial(gaussians_in_parts, self.field) if chunked else self.field.gaussians
-        gaussians = by_component(evaluate(params, _condition(batch)), self.form.components)
+        gaussians = by_component(evaluate(params, batch.inputs), self.form.components)
         pose = batch.pose
         if self.moves:
             pose = receiver_pose(self.receivers[number // self.carriers], params, mi.Float)
@@ -327,14 +336,3 @@ class Graph:
             report = report.astype(float).reshape(len(rows), *np.shape(observed)[1:])
             gain[0] += model.missing_gain(report, observed[rows])
         return gain
-
-
-def _condition(batch: Batch) -> Any:
-    """Conditions [3 or features, batch] with the carrier, if rows have several, as the last row."""
-    if batch.carrier is None:
-        return batch.condition
-    tensor = type(batch.condition)
-    flat = batch.condition.array
-    count, width = batch.condition.shape
-    joint = dr.concat([flat, dr.repeat(type(flat)(batch.carrier), width)])
-    return tensor(joint, (count + 1, width))

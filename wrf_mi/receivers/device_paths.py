@@ -1,4 +1,4 @@
-"""Paths on the device: the values that receivers read, coherent sums at ports, and draws of uncertain phases.
+"""Paths on the device: the values that receivers read, coherent sums at ports and of both sides, and draws of phases.
 
 A *port* is a position in the receiver's frame with a frequency. Arrays are Dr.Jit arrays with derivatives, complex
 numbers pairs (re, im).
@@ -21,6 +21,8 @@ from ..backend.device import columns_on_device, on_device
 from ..backend.vectors import Complex, Float64, Vector, times
 from ..core.angles import FloatArray, solid_angles
 from .channel import DRAWS, phase_draws
+from .registry import How
+from .reports import SQUARED_MAGNITUDE_EPS
 
 
 @dataclass
@@ -180,3 +182,24 @@ def weighted(signal: Complex, weight: Any) -> Complex:
     index = dr.arange(dr.uint32_array_t(type(weight)), dr.width(signal[0])) % dr.width(weight)
     factor = dr.gather(type(weight), weight, index)
     return signal[0] * factor, signal[1] * factor
+
+
+def magnitude(traced: Complex | None, learned: Complex | None, how: How) -> Any:
+    """abs(T + L) or sqrt(abs(T)^2 + abs(L)^2), flat arrays; None is an absent side."""
+    return dr.sqrt(power(traced, learned, how) + SQUARED_MAGNITUDE_EPS)
+
+
+def power(traced: Complex | None, learned: Complex | None, how: How) -> Any:
+    """abs(T + L)^2 or abs(T)^2 + abs(L)^2, flat arrays; `ValueError` of two absent sides (None) or another ``how``."""
+    sides = [side for side in (traced, learned) if side is not None]
+    if not sides or how not in ("coherent", "power"):
+        raise ValueError(f"power: how {how!r} with {len(sides)} sides; give coherent or power, and one side at least")
+    if how == "coherent":
+        sides = [add(*sides)]
+    squares = [re * re + im * im for re, im in sides]
+    return sum(squares[1:], squares[0])
+
+
+def add(*sides: Complex) -> Complex:
+    """Sum of complex flat arrays."""
+    return sum((re for re, _ in sides[1:]), sides[0][0]), sum((im for _, im in sides[1:]), sides[0][1])

@@ -1,24 +1,4 @@
-"""Receiver models: how a receiver combines the traced and the learned field, and what it reports.
-
-The traced field is given as paths, the learned one as a complex signal R(u) on directions. Each side is summed
-coherently; the two, T and L, then add as complex numbers (``how="coherent"``: abs(T + L)) or as powers
-(``how="power"``: sqrt(abs(T)^2 + abs(L)^2)).
-
-| receiver | T | L | reports |
-| --- | --- | --- | --- |
-| pixel | image of h_m, sum_m h_m exp(-j k p_m . u) | R(u) | magnitude at every pixel u |
-| array | image of h_m | image of sum_u w(u) R(u) exp(+j k p_m . u) | magnitude at every pixel u |
-| power | h at the origin | sum_u w(u) R(u) over the full sphere | power in dB |
-| csi | h at each antenna, on each subcarrier | the same sum, or several: coefficients of a basis | T + L |
-
-with h_m = sum over paths of g (d / d_m) exp(-j k d_m), d_m from the path's image source to element m, and w(u) the
-solid angle of a pixel. A model reports in three ways:
-
-- the call, in Dr.Jit and of the float type of the learned side, with derivatives (complex numbers are pairs re, im);
-- `observed`, in NumPy and float64, of `wrf_mi.core.Paths`: the reference, and the observation of a synthetic record;
-- `signal_report` and `signal_slopes`, in NumPy, of signals that a caller has summed over paths already: trials of
-  `wrf_mi.correction.path_sum`, thousands of them with few paths changed, where a recorded call costs too much.
-"""
+"""Receiver models of spectra, channels and signal strengths (`wrf_mi.receivers.registry`)."""
 
 from __future__ import annotations
 
@@ -26,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 from ..backend.vectors import Complex  # chooses the backend before Dr.Jit is imported
 
@@ -41,33 +21,21 @@ from ..core.angles import FloatArray, pixel_directions
 from ..core.types import IntArray
 from .array import bartlett_spectrum, steering_matrix
 from .channel import antenna_csi, csi, rssi_dbm, with_phase_errors
-from .device_paths import ComplexMatrix, Ports, TracedPaths, direction_weights, path_sum, weighted
-from .registry import PIXEL, ComplexArray, ObservationSpec, ReceiverModel, Slopes, Sums
-from .reports import LEAST_POWER, SILENCE, SQUARED_MAGNITUDE_EPS, arrives, minmax_scale, scaled, strength_db
+from .device_paths import (
+    ComplexMatrix,
+    Ports,
+    TracedPaths,
+    add,
+    direction_weights,
+    magnitude,
+    path_sum,
+    power,
+    weighted,
+)
+from .registry import PIXEL, ComplexArray, How, ObservationSpec, ReceiverModel, Slopes, Sums
+from .reports import LEAST_POWER, SILENCE, arrives, magnitudes, minmax_scale, scaled, scaled_rows, strength_db
 
-How = Literal["coherent", "power"]
 CHUNK_SIZE = 64  # transmitters observed together: float64 spectra of all would take several times the result
-
-
-def magnitude(traced: Complex | None, learned: Complex | None, how: How) -> Any:
-    """abs(T + L) or sqrt(abs(T)^2 + abs(L)^2), flat arrays; None is an absent side."""
-    return dr.sqrt(power(traced, learned, how) + SQUARED_MAGNITUDE_EPS)
-
-
-def power(traced: Complex | None, learned: Complex | None, how: How) -> Any:
-    """abs(T + L)^2 or abs(T)^2 + abs(L)^2, flat arrays; `ValueError` of two absent sides (None) or another ``how``."""
-    sides = [side for side in (traced, learned) if side is not None]
-    if not sides or how not in ("coherent", "power"):
-        raise ValueError(f"power: how {how!r} with {len(sides)} sides; give coherent or power, and one side at least")
-    if how == "coherent":
-        sides = [add(*sides)]
-    squares = [re * re + im * im for re, im in sides]
-    return sum(squares[1:], squares[0])
-
-
-def add(*sides: Complex) -> Complex:
-    """Sum of complex flat arrays."""
-    return sum((re for re, _ in sides[1:]), sides[0][0]), sum((im for _, im in sides[1:]), sides[0][1])
 
 
 def _float_type(learned: Complex | None) -> Any:
@@ -200,13 +168,13 @@ class ArrayReceiver(PixelReceiver):
 
     def signal_report(self, signal: ComplexArray) -> FloatArray:
         """Scaled spectra [n, pixels] of element signals [n, m], in single precision as those of the call."""
-        return np.asarray(_scaled_rows(_magnitudes(self._images(signal)))[0], float)
+        return np.asarray(scaled_rows(magnitudes(self._images(signal)))[0], float)
 
     def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
         """Derivative of `signal_report` at parts of element signals [n, m], pixels that set the scale included."""
         image = np.concatenate([np.zeros((0, self.height * self.width), np.complex64), *map(self._images, parts)])
-        spectrum = _magnitudes(image)
-        share, low, high, inverse = _scaled_rows(spectrum)
+        spectrum = magnitudes(image)
+        share, low, high, inverse = scaled_rows(spectrum)
         weight = image.conj() / spectrum  # d|z| = Re(conj(z) dz) / |z|
 
         def slopes(change: ComplexArray, which: IntArray) -> FloatArray:
@@ -235,19 +203,6 @@ class ArrayReceiver(PixelReceiver):
         if not self.instrument_scale:
             return super().missing_gain(report, observed)
         return float(-np.log(np.asarray(report).reshape(len(observed), -1).max(axis=1).mean()))
-
-
-def _magnitudes(image: NDArray[np.complex64]) -> NDArray[np.float32]:
-    return np.sqrt(np.square(image.real) + np.square(image.imag) + np.float32(SQUARED_MAGNITUDE_EPS))
-
-
-def _scaled_rows(spectrum: NDArray[np.float32]) -> tuple[NDArray[np.float32], IntArray, IntArray, NDArray[np.float32]]:
-    """Rows scaled to 0..1, places of their least and largest values [n, 1], and the factor by which they are scaled."""
-    low, high = spectrum.argmin(axis=1)[:, None], spectrum.argmax(axis=1)[:, None]
-    least = np.take_along_axis(spectrum, low, axis=1)
-    span = np.take_along_axis(spectrum, high, axis=1) - least
-    inverse = np.divide(1, span, out=np.zeros_like(span), where=span > 0)
-    return (spectrum - least) * inverse, low, high, inverse
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,27 @@ One class states all of a receiver: its observation of traced paths in NumPy, it
 what the correction of a scene needs of it (`ReceiverModel`). Instruments, the graph and the correction take it from
 `RECEIVERS`. Another package adds one by an entry point of the group `ENTRY_POINTS` that names the class. Dr.Jit is
 imported with the first class: a command that only reads data does without it.
+
+The traced field is given as paths, the learned one as a complex signal R(u) on directions. Each side is summed
+coherently; the two, T and L, then add as complex numbers (``how="coherent"``: abs(T + L)) or as powers
+(``how="power"``: sqrt(abs(T)^2 + abs(L)^2)).
+
+| receiver | T | L | reports |
+| --- | --- | --- | --- |
+| pixel | image of h_m, sum_m h_m exp(-j k p_m . u) | R(u) | magnitude at every pixel u |
+| array | image of h_m | image of sum_u w(u) R(u) exp(+j k p_m . u) | magnitude at every pixel u |
+| power | h at the origin | sum_u w(u) R(u) over the full sphere | power in dB |
+| csi | h at each antenna, on each subcarrier | the same sum, or several: coefficients of a basis | T + L |
+
+with h_m = sum over paths of g (d / d_m) exp(-j k d_m), d_m from the path's image source to element m, and w(u) the
+solid angle of a pixel.
+
+A model reports in three ways:
+
+- the call, in Dr.Jit and of the float type of the learned side, with derivatives (complex numbers are pairs re, im);
+- `observed`, in NumPy and float64, of `wrf_mi.core.Paths`: the reference, and the observation of a synthetic record;
+- `signal_report` and `signal_slopes`, in NumPy, of signals that a caller has summed over paths already: trials of
+  `wrf_mi.correction.path_sum`, thousands of them with few paths changed, where a recorded call costs too much.
 """
 
 from __future__ import annotations
@@ -29,6 +50,7 @@ Slopes = Callable[[ComplexArray, IntArray], FloatArray]
 """Changes of reports by changes [k, values] of signals of the rows ``which`` [k]."""
 Sums = Literal["fields", "elements", "powers"]
 """Sums over paths: of fields at one antenna on each subcarrier, of fields at the elements of an array, or of powers."""
+How = Literal["coherent", "power"]  # sum of the traced and the learned field: of complex numbers, or of powers
 GAPS = ("floor_db",)
 """Attributes of a specification that may be NaN."""
 

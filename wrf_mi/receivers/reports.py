@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.angles import FloatArray
+from ..core.types import IntArray
 
 SQUARED_MAGNITUDE_EPS = 1e-8  # added to |R|^2 under a root or logarithm, whose gradient is unbounded at zero
 LEAST_POWER = 1e-20  # constant added to a power before its logarithm in a fit: the lowest report is -200 dB
@@ -60,3 +61,17 @@ def scaled(image: Any, pixels: int) -> Any:
     # The inner selection keeps the derivative of an image without contrast finite.
     inverse = dr.select(span > 0, dr.rcp(dr.select(span > 0, span, 1)), 0)
     return (image - dr.gather(type(image), low, index)) * dr.gather(type(image), inverse, index)
+
+
+def magnitudes(image: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Magnitudes of complex numbers, as `wrf_mi.receivers.device_paths.magnitude` has them."""
+    return np.sqrt(np.square(image.real) + np.square(image.imag) + np.float32(SQUARED_MAGNITUDE_EPS))
+
+
+def scaled_rows(spectrum: NDArray[np.float32]) -> tuple[NDArray[np.float32], IntArray, IntArray, NDArray[np.float32]]:
+    """Rows scaled to 0..1, places of their least and largest values [n, 1], and the factor by which they are scaled."""
+    low, high = spectrum.argmin(axis=1)[:, None], spectrum.argmax(axis=1)[:, None]
+    least = np.take_along_axis(spectrum, low, axis=1)
+    span = np.take_along_axis(spectrum, high, axis=1) - least
+    inverse = np.divide(1, span, out=np.zeros_like(span), where=span > 0)
+    return (spectrum - least) * inverse, low, high, inverse

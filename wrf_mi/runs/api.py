@@ -17,7 +17,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..backend import init
-from ..core import AntennaOptions, InputError, Record, Split
+from ..core import AntennaOptions, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
 from ..core.locks import alone_in_process, locked_folder
@@ -34,7 +34,7 @@ from ..synthetic import load_record
 from ..training.checkpoint import CHECKPOINT, checkpoint_seconds
 from ..training.session import Interrupted, OnProgress, quiet
 from .applications import APPLICATIONS
-from .evaluate import FittedPart, score_other, score_part, score_run
+from .evaluate import FittedPart, score_part, score_run
 from .folder import (
     FITTED,
     RunConfig,
@@ -50,8 +50,8 @@ from .folder import (
     write_fitted,
 )
 from .plan import least_rows, plan_run
-from .run import Run, load_fitted, open_run, predict_to_file
-from .scenes import Scene
+from .predict_to_file import predict_to_file
+from .run import Run, load_fitted, open_run
 
 if TYPE_CHECKING:
     import xarray
@@ -63,7 +63,7 @@ logger = logging.getLogger(__name__)
 def train(
     data: str | Path | Record | xarray.Dataset,
     model: str = "hybrid",
-    scene: str | Path | Scene | None = None,
+    scene: str | Path | Any | None = None,
     *,
     out: str | Path | None = None,
     overwrite: bool = False,
@@ -137,7 +137,7 @@ def train(
         check_new(Path(out), overwrite)
     if deterministic:  # before anything is read: reading a data set may choose the GPU
         init("llvm", threads=1)
-    place = scene.folder if isinstance(scene, Scene) else scene
+    place = getattr(scene, "folder", scene)
     what = RunRequest(model, place, material, antennas, receiver, evaluation, split, n_train, seed, settings)
     request = replace(
         what,
@@ -257,33 +257,11 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
     score_run(folder, config, parts, scores)
 
 
-@alone_in_process()
 def evaluate_run(
     folder: str | Path, split: str | None = None, operator: bool = True, record: Record | None = None
 ) -> dict[str, Any]:
-    """Score a run again.
-
-    Args:
-        folder: run folder; without ``split`` its ``metrics.json`` and ``predictions.npz`` are written anew.
-        split: name of another split, whose test rows are scored except those used in training; nothing is written.
-        operator: learned fields predict by operator where they can.
-        record: data that the model was fitted to; None: the data set that the folder names.
-
-    Returns:
-        The metrics.
-
-    Raises:
-        InputError: not a run folder, a stopped run, or no row of ``split`` that was not used in training.
-    """
-    run = open_run(folder, record, operator)
-    config, problem, folders = run.config, run.problem, run_parts(run.folder)
-    if split is not None and folders != [run.folder]:
-        raise InputError(f"{run.folder}: every row is held out in one of its folds; omit --split")
-    parts = [FittedPart(part, load_rows(part, problem.record), *load_fitted(config, problem, part)) for part in folders]
-    if split is not None:
-        return score_other(config, problem, parts[0], split)
-    scores = [score_part(run.folder, config, problem, part) for part in parts if len(part.split.test)]
-    return score_run(run.folder, config, parts, scores)
+    """Scores of the run in a folder; arguments, result and errors of `Run` and `Run.score`."""
+    return open_run(folder, record, operator).score(split)
 
 
 __all__ = ["Interrupted", "Run", "evaluate_run", "open_run", "plan_run", "predict_to_file", "resume", "train"]

@@ -82,7 +82,8 @@ def local_mean_scores(folder: str | Path, wavelengths: float) -> LocalMean:
     count, window = np.concatenate(counts), (float(diameter_m.min()), float(diameter_m.max()))
     if not len(count):
         return LocalMean(wavelengths, window)
-    scores = (_scores(np.concatenate(values, axis=1)) for values in (pairs, single))
+    powers_dbm = (np.concatenate(values, axis=1) for values in (pairs, single))
+    scores = (summary(abs_error_db(*pair)) | signed_errors_db(*pair) for pair in powers_dbm)
     return LocalMean(wavelengths, window, len(count), float(np.median(count)), *scores)
 
 
@@ -122,8 +123,3 @@ def _carriers_hz(record: Record, rows: IntArray) -> FloatArray:
         raise InputError(f"{record.name}: carrier frequency unknown; state {record.task.carrier_stated_in}")
     stated = [receiver.frequency_hz or float(record.frequencies_hz[0]) for receiver in record.receivers]
     return np.broadcast_to(np.array(stated)[:, None], shape)
-
-
-def _scores(powers_dbm: FloatArray) -> dict[str, float]:
-    """Scores of predicted and measured powers [2, q]."""
-    return summary(abs_error_db(*powers_dbm)) | signed_errors_db(*powers_dbm)

@@ -4,36 +4,35 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, partial
+from functools import cached_property
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..core import InputError, Prediction, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.carriers import FREQUENCY, carriers_text
 from ..core.files import readable
+from ..core.locks import alone_in_process
 from ..core.memory import require_memory
 from ..core.receivers import receiver_index
-from ..core.registry import resolve
 from ..datasets import load_split
 from ..datasets.labelled import LabelledPrediction, ordered
 from ..estimators.checks import check_inputs
 from ..estimators.gaussian.model import FittedField
 from ..estimators.model import UNUSED_HEADING, UNUSED_UPLINK
-from ..estimators.own_readings import DeviceOffset, ForDevice, OwnReadings, device_offset
+from ..estimators.own_readings import DeviceOffset, ForDevice, OwnReadings, checked_readings, device_offset
 from ..estimators.receiver_places import stored_problem
 from ..models import Fitted, Inputs, Model, Problem
-from ..parallel import PartsProgress, Scheduler, row_parts
 from ..training.predictor import Predictor
 from .applications import APPLICATIONS
-from .folder import FITTED, METRICS, SPLIT, RunConfig, read_config, read_fitted
-from .prediction_file import check_prediction_file, spooled, write_prediction_file
-from .results import RECEPTION, STD_MEAN
+from .evaluate import FittedPart, score_other, score_part, score_run
+from .folder import FITTED, METRICS, SPLIT, RunConfig, load_rows, read_config, read_fitted, run_parts
 
 PREDICTED_PER_CHUNK = 256  # positions that are predicted at a time: 33 MB of spectra of 90 x 360 for each receiver
 MOST_PER_CHUNK, CHUNK_BYTES = 4096, 1 << 25
@@ -103,14 +102,20 @@ class Run:
         if self.own is not None:
             return ForDevice(self.of_any_device.fitted, self.device)
         if self.scene is not None:
-            try:
+            with self._named():
                 return replace(self, scene=None).fitted.in_scene(str(self.scene))
-            except InputError as error:
-                raise InputError(f"{self.folder}: {error}") from None
         problem = self.problem
         if not (self.folder / SPLIT).exists():
             raise InputError(f"{self.folder}: one model for each block; choose one, e.g. {self.folder / 'fold0'}")
         return load_fitted(self.config, problem, self.folder)[0]
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Name the folder in an `InputError`."""
+        try:
+            yield
+        except InputError as error:
+            raise InputError(f"{self.folder}: {error}") from None
 
     def in_scene(self, scene: str | Path | Any) -> Run:
         """The run in an edited copy of its scene, a `wrf_mi.Scene` or folder; of hybrids, of the corrected scene."""
@@ -126,15 +131,8 @@ class Run:
         Raises:
             InputError: a run of another task or of several carriers, or arrays of other shapes.
         """
-        own = OwnReadings(np.atleast_2d(np.asarray(tx_pos_m, float)), np.asarray(power_dbm, float))
-        wanted, task = (len(self.receivers), len(own.tx_pos_m)), self.problem.record.task
-        if not task.in_decibel or task.axes:
-            raise InputError(f"{self.folder}: predicts {task.name}; readings tell offsets of signal strengths alone")
-        if self.problem.record.carriers_hz is not None:
-            raise InputError(f"{self.folder}: its data have several carriers; own readings are of one")
-        if own.power_dbm.shape != wanted or own.tx_pos_m.shape[1:] != (3,):
-            shapes = f"{list(own.tx_pos_m.shape)} and {list(own.power_dbm.shape)}"
-            raise InputError(f"own readings {shapes}; give positions [m, 3] and strengths [{wanted[0]}, m]")
+        with self._named():
+            own = checked_readings(tx_pos_m, power_dbm, self.problem.record, len(self.receivers))
         run = replace(self, own=own)
         vars(run)["of_any_device"] = self.of_any_device  # whose data and model are open already
         return run
@@ -150,12 +148,8 @@ class Run:
 
         `InputError`: a model without standard deviations.
         """
-        run = self.of_any_device
-        try:
-            none = OwnReadings(np.zeros((0, 3)), np.zeros((len(run.receivers), 0)))
-            return device_offset(run.fitted, self.own or none)
-        except InputError as error:
-            raise InputError(f"{self.folder}: {error}") from None
+        with self._named():
+            return device_offset(self.of_any_device.fitted, self.own)
 
     @property
     def receivers(self) -> tuple[Receiver, ...]:
@@ -212,7 +206,8 @@ class Run:
             InputError: not a finished run with one split, inputs that the model does not predict from, or no such
                 receiver.
         """
-        inputs, known = _inputs(ordered(tx_pos_m, "row", "axis"), tx_heading_rad, uplink, carriers_hz), self.receivers
+        inputs = known_inputs(ordered(tx_pos_m, "row", "axis"), tx_heading_rad, uplink, carriers_hz)
+        known = self.receivers
         of_one = receiver is not None or len(known) == 1
         numbers = [receiver_index(known, receiver or 0)] if of_one else range(len(known))
         every = [self.predict_inputs(inputs, number) for number in numbers]
@@ -221,9 +216,31 @@ class Run:
         places: dict[str, Any] = {"tx_pos_m": inputs.tx_pos_m, "receiver_names": names}
         return LabelledPrediction(**joined, **places, task=self.config.task, of_one=of_one)
 
+    @alone_in_process()
     def score(self, split: str | None = None) -> dict[str, Any]:
-        """Scores on the test rows, or on those of another split (`wrf_mi.runs.api.evaluate_run`)."""
-        return dict(resolve("wrf_mi.runs.api:evaluate_run")(self.folder, split, self.operator, self.record))
+        """Score the run again.
+
+        Args:
+            split: name of another split, whose test rows are scored except those used in training; nothing is written.
+                None: the run's own, and ``metrics.json`` and ``predictions.npz`` are written anew.
+
+        Returns:
+            The metrics.
+
+        Raises:
+            InputError: not a run folder, a stopped run, or no row of ``split`` that was not used in training.
+        """
+        folder, folders = self.folder, run_parts(self.folder)
+        # In the scene that it was fitted in, and for any device.
+        config, problem = self.config, replace(self, scene=None, own=None).problem
+        if split is not None and folders != [folder]:
+            raise InputError(f"{folder}: every row is held out in one of its folds; omit --split")
+        loaded = [(part, load_rows(part, problem.record), *load_fitted(config, problem, part)) for part in folders]
+        parts = list(starmap(FittedPart, loaded))
+        if split is not None:
+            return score_other(config, problem, parts[0], split)
+        scores = [score_part(folder, config, problem, part) for part in parts if len(part.split.test)]
+        return score_run(folder, config, parts, scores)
 
     @property
     def stages(self) -> list[dict[str, Any]]:
@@ -248,7 +265,10 @@ class Run:
 
     def plot(self) -> Any:
         """Matplotlib figure of test rows: truth, prediction and interpolation side by side."""
-        return resolve("wrf_mi.runs.compare:sample_figure")([self.folder])
+        from .results import read_runs
+        from .sample_figures import samples
+
+        return samples(read_runs([self.folder]))[1]
 
     def export(self, format: str, out: str | Path, **options: Any) -> dict[str, Any]:
         """Write a file for other programs; formats and options of `wrf_mi.apps.exports.export`."""
@@ -323,57 +343,6 @@ class Run:
             text = f"{len(inputs)} positions and {name} {values.shape}; give one {wanted} for each"
             raise InputError(f"{self.folder}: {text}")
 
-    def predict_to_file(
-        self, inputs: Inputs, out: Path, scheduler: Scheduler | None = None, progress: bool = False
-    ) -> dict[str, tuple[int, ...]]:
-        """Predict at all receivers and write a file; see the function `predict_to_file`."""
-        check_prediction_file(out, self.folder)
-        self.check_inputs(inputs)
-        shape, arrays = (len(self.receivers), len(inputs)), dict[str, NDArray[Any]]()
-
-        def collect(rows: slice, receiver: int, chunk: Prediction) -> None:
-            stated = ("prediction", chunk.mean), ("std", chunk.std), (STD_MEAN, chunk.std_mean)
-            for name, values in (*stated, (RECEPTION, chunk.reception)):
-                if values is not None:
-                    values = values if name == "prediction" else values.astype(np.float32)
-                    if name not in arrays:
-                        arrays[name] = spooled(out.parent, (*shape, *values.shape[1:]), values.dtype)
-                    arrays[name][receiver, rows] = values
-
-        if scheduler is None or not len(inputs):
-            self._collect(inputs, collect, progress)
-        else:
-            self._collect_parts(inputs, collect, scheduler)
-        written = write_prediction_file(out, inputs, [receiver.name for receiver in self.receivers], arrays)
-        return {key: value.shape for key, value in written.items()}
-
-    def _collect(self, inputs: Inputs, collect: Collect, progress: bool) -> None:
-        total = len(self.receivers) * len(inputs)
-        shown = PartsProgress("predicting", total, lines=total > MOST_PER_CHUNK) if progress else nullcontext()
-        with shown as bar:
-            for receiver in range(len(self.receivers)):
-                for rows, chunk in self.predicted_parts(inputs, receiver):
-                    collect(rows, receiver, chunk)
-                    if bar is not None:
-                        bar.add(rows.stop - rows.start, 1)
-
-    def _collect_parts(self, inputs: Inputs, collect: Collect, scheduler: Scheduler) -> None:
-        parts = row_parts(len(inputs), scheduler.workers, most=PREDICTED_PER_CHUNK)
-
-        def each(part: int, predictions: list[Prediction]) -> None:
-            for receiver, prediction in enumerate(predictions):
-                collect(parts[part], receiver, prediction)
-            predictions.clear()  # the scheduler keeps results to the end
-
-        opener = partial(open_run, self.folder, operator=self.operator, scene=self.scene, own=self.own)
-        sizes = [p.stop - p.start for p in parts]
-        chosen = [inputs.rows(rows) for rows in parts]
-        scheduler.map(_predict_part, chosen, opener, what="predicting", sizes=sizes, each=each, lines=True)
-
-
-Collect = Callable[[slice, int, Prediction], None]
-"""Takes the predictions of some rows at the receiver of an index."""
-
 
 def _joined(parts: Sequence[Prediction], join: Callable[[Sequence[Any]], Any]) -> dict[str, Any]:
     """Attributes of `Prediction` of joined predictions; None where one of them has none."""
@@ -385,10 +354,10 @@ def _joined(parts: Sequence[Prediction], join: Callable[[Sequence[Any]], Any]) -
     return {attribute.name: of(attribute.name) for attribute in fields(Prediction)}
 
 
-def _inputs(
+def known_inputs(
     tx_pos_m: ArrayLike | None, tx_heading_rad: ArrayLike | None, uplink: Any, carriers_hz: ArrayLike | None
 ) -> Inputs:
-    """Inputs of given quantities, as arrays; unknown positions are NaN, one for each uplink."""
+    """Inputs of known quantities, as arrays; unknown positions are NaN, one for each uplink."""
     channels = None if uplink is None else np.asarray(uplink)
     if tx_pos_m is None:
         tx_pos_m = np.full((0 if channels is None else len(channels), 3), np.nan)
@@ -425,47 +394,3 @@ def open_run(
     run = Run(Path(folder), record, operator, scene, own=own)
     _ = run.config
     return run
-
-
-def predict_to_file(
-    folder: str | Path,
-    tx_pos_m: np.ndarray,
-    out: str | Path,
-    tx_heading_rad: np.ndarray | None = None,
-    scheduler: Scheduler | None = None,
-    operator: bool = True,
-    uplink: NDArray[Any] | None = None,
-    carriers_hz: FloatArray | None = None,
-    progress: bool = False,
-) -> dict[str, tuple[int, ...]]:
-    """Predict at new transmitter positions and write an ``.npz`` or ``.csv`` file.
-
-    Memory is needed for a chunk of the positions at a time; a temporary file beside ``out`` holds the others.
-
-    Args:
-        folder: run folder with one fitted model.
-        tx_pos_m: positions [m, 3], metres; NaN where unknown.
-        out: file to write. ``.npz``: keys ``row`` (0..m-1), ``prediction`` ([m, H, W] for one receiver, else
-            [n_rx, m, H, W]), ``tx_pos`` [m, 3] and ``receiver_name``, as in ``predictions.npz``, and ``std`` of models
-            that state it. ``.csv``: signal strengths (`wrf_mi.runs.prediction_file.write_prediction_file`).
-        tx_heading_rad: as that of `Run.predict`, as are the next two.
-        scheduler: computes chunks of the positions; None: this process. Its workers must see the run folder, data set
-            and scene under the same names.
-        operator: learned fields predict by operator where they can.
-        uplink: uplink channels.
-        carriers_hz: carriers, stored as ``frequency_hz``.
-        progress: show progress on standard error.
-
-    Returns:
-        Shape of each array that ``.npz`` has.
-
-    Raises:
-        InputError: a run over several blocks, inputs that the model does not predict from, or a file name with another
-            suffix or of a format that cannot hold the predictions.
-    """
-    inputs = _inputs(tx_pos_m, tx_heading_rad, uplink, carriers_hz)
-    return open_run(folder, operator=operator).predict_to_file(inputs, Path(out), scheduler, progress)
-
-
-def _predict_part(run: Run, inputs: Inputs) -> list[Prediction]:
-    return [run.predict_inputs(inputs, index) for index in range(len(run.receivers))]

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from ..backend import init
 from ..core import AntennaOptions, InputError, Record, Split
 from ..core.antenna import AS_STATED
-from ..core.registry import resolve
 from ..core.settings import setting_texts, with_settings
 from ..datasets.splits import single_split
 from ..scene.correction_data import FILE
@@ -135,8 +134,9 @@ class Scene:
 
     def trace(self, data: str | Path | Record, out: str | Path | None = None, **options: Any) -> Run:
         """Ray tracing in the scene as a run, scored on the test rows of the data; options of `wrf_mi.train`."""
-        run: Run = resolve("wrf_mi.runs.api:train")(data, "ray-tracing", self, out=out, **options)
-        return run
+        from .api import train
+
+        return train(data, "ray-tracing", self, out=out, **options)
 
     def view(self, *more: Any, **options: Any) -> Any:
         """Interactive 3D view of the scene and of ``more``, such as runs; options of `wrf_mi.apps.viewer.view.view`."""

@@ -188,17 +188,15 @@ class Engine:
         seconds = float(stored_arrays(path)["seconds"])
         return OptionReport(stage.name, name, name == best, f"{why} on held-out rows", sign * mean, seconds)
 
-    def _unit(self, fold: Fold) -> IntArray:
-        """Unit of each held-out observation: errors are independent between rows, or between receivers."""
-        return fold.held_out.receiver if self._split.held_receivers else fold.held_out.row
-
     def _scores(self, fold: Fold, plan: Plan, stage: Stage) -> FloatArray:
         """Mean scores of the independent units of rows that judge a stage by a chain, the higher the better."""
         record, judging = self._problem.record, np.flatnonzero(stage.judging(self._split, fold.held_out.row))
         mean = self._predicted(fold, plan).mean
         observed = stage.judged(record, self._split, fold.held_out, mean)[judging]
         of_each = record.task.mixtures(mean[None, judging], observed)
-        return unit_means(of_each(np.ones((len(judging), 1)), np.arange(len(judging))), self._unit(fold)[judging])
+        # Errors are independent between rows, or between receivers.
+        unit = fold.held_out.receiver if self._split.held_receivers else fold.held_out.row
+        return unit_means(of_each(np.ones((len(judging), 1)), np.arange(len(judging))), unit[judging])
 
     def _path(self, plan: Plan, finish: bool = False) -> Path:
         return self._folder / f"{CHOSEN if finish else '+'.join(plan)}.npz"

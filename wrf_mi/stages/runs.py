@@ -28,7 +28,7 @@ class Runs(Stage):
         """Both, which held-out runs choose from; none without several runs."""
         if not LEAST_RUNS <= len(trained_runs(problem.record, split.all_train)) <= MOST_RUNS:
             return []
-        return [Option(POOLED, self._pooled), Option(OFFSETS, self._offsets, freedom=1)]
+        return [Option(POOLED, lambda state, split, session: state), Option(OFFSETS, self._offsets, freedom=1)]
 
     def judged(self, record: Record, split: Split, held_out: HeldOut, mean: NDArray[Any]) -> NDArray[Any]:
         """Observations; of runs that are held out without what predictions leave of each, which no option knows."""
@@ -38,9 +38,6 @@ class Runs(Stage):
         _, run = np.unique(record.runs[held_out.row], return_inverse=True)
         offset = np.bincount(run, observed - mean) / np.bincount(run)
         return np.asarray(observed - offset[run])
-
-    def _pooled(self, state: State, split: Split, session: Session) -> State:
-        return state
 
     def _offsets(self, state: State, split: Split, session: Session) -> State:
         return replace(state, kept={**state.kept, self.name: True})

@@ -10,7 +10,7 @@ has four fifths of the gain of paths with up to two reflections, whose search ta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cache, partial
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core import InputError, Receiver, Record, Split
+from ..core import InputError, Record, Split
 from ..core.types import FloatArray, IntArray
 from ..correction.options import STRENGTHS
 from ..estimators.interpolation.strength_settings import StrengthSettings
@@ -27,7 +27,7 @@ from ..estimators.model import Arrays, Model, PredictAll, Problem, Session
 from ..scene.correction_data import read_correction_data
 from ..tracing.options import MAX_DEPTH, TraceOptions
 from ..tracing.paths.solve import Prepared
-from ..tracing.power_map import PowerMap, Traced, TracedPower, Tracer, power_tracer, trace_map
+from ..tracing.power_map import Traced, TracedPower, Tracer, power_tracer, trace_map
 from ..tracing.search.chains import search_seconds
 from ..tracing.tracer import check_polarization, fit_offsets
 from .engine import Engine, OptionReport
@@ -43,9 +43,9 @@ SPACING_M, SMOOTH_M = 0.25, 0.3
 RAYS = 1 << 17  # from each receiver in the search for reflected paths
 TRACE = TraceOptions(transmission=True, depth=STRENGTHS.depth, reflections=STRENGTHS.reflections, rays=RAYS)
 """Paths of a local mean, as a correction has them."""
-DIRECT = TraceOptions(transmission=True, depth=MAX_DEPTH, reflections=0)  # through as many walls as can be traced
-ExactMean = Callable[[Sequence[Receiver]], TracedPower]
-"""Power at positions themselves for some receivers of a problem; fits share what was traced."""
+THROUGH = TraceOptions(transmission=True, depth=MAX_DEPTH, reflections=0)  # walls, as many as can be traced
+DIRECT, LOCAL, EXACT = "direct", "local", "exact"
+"""Options of the mean: local means of direct and of all paths, and power of all paths at positions themselves."""
 
 
 class FittedStrengths(FittedInScene):
@@ -76,9 +76,7 @@ class FittedStrengths(FittedInScene):
         """Power in a problem's scene, of the kind of the fit's mean."""
         mean = self.fitted.field.prior.traced
         assert mean is not None, "the scene's side is about traced power"
-        if mean.exact:
-            return _traced(problem)(problem.record.receivers)
-        return _local_mean(problem, TRACE if mean.reflections else DIRECT)
+        return _mean(problem, EXACT if mean.exact else LOCAL if mean.reflections else DIRECT)
 
     def refit(self, record: Record, rows: IntArray) -> FittedStrengths:
         """The kriging given some rows, see `Fitted`, about the power traced in the scene that all rows corrected."""
@@ -100,41 +98,31 @@ class Mean(Stage):
         Whoever turns carries the antenna beside the stated position, and receivers whose places are estimates are
         estimated anew by each hold-out.
         """
-        options = [Option("direct", partial(self._local, DIRECT))]
-        if not affordable(problem):
-            return options
-        options.append(Option("local", partial(self._local, TRACE)))
-        if problem.record.tx_heading_rad is None and all(each.is_surveyed for each in problem.record.receivers):
-            options.append(Option("exact", self._exact))
-        return options
+        names = [DIRECT]
+        if affordable(problem):
+            names.append(LOCAL)
+            if problem.record.tx_heading_rad is None and all(each.is_surveyed for each in problem.record.receivers):
+                names.append(EXACT)
+        return [Option(name, partial(self._fit, name)) for name in names]
 
-    def _local(self, paths: TraceOptions, state: State, split: Split, session: Session) -> State:
+    def _fit(self, name: str, state: State, split: Split, session: Session) -> State:
         session.report("tracing a map", 0.0)
-        return replace(state, mean=_local_mean(state.problem, paths))
+        return replace(state, mean=_mean(state.problem, name))
 
-    def _exact(self, state: State, split: Split, session: Session) -> State:
-        session.report("tracing a map", 0.0)
-        return replace(state, mean=_traced(state.problem)(state.problem.record.receivers))
+
+def _mean(problem: Problem, name: str) -> Traced:
+    """Traced power of an option by its name."""
+    scene, record = problem.opened_scene, problem.record
+    local = trace_map(scene, record, SPACING_M, SMOOTH_M, THROUGH if name == DIRECT else TRACE)
+    if name != EXACT:
+        return local
+    return TracedPower(local, power_tracer(scene, record, TRACE), np.arange(len(record.receivers)), {})
 
 
 def affordable(problem: Problem) -> bool:
     """Whether a search for reflected paths to all receivers takes no longer than the settings allow."""
     limit_s = problem.settings.search_seconds
     return limit_s is None or search_seconds(TRACE, RAYS, len(problem.record.receivers)) <= limit_s
-
-
-def _traced(problem: Problem) -> ExactMean:
-    trace, names = power_tracer(problem.opened_scene, problem.record, TRACE), _names(problem.record.receivers)
-    power = TracedPower(_local_mean(problem, TRACE), trace, np.arange(len(names)), {})
-    return lambda receivers: power.at(np.array([names.index(name) for name in _names(receivers)]))
-
-
-def _names(receivers: Sequence[Receiver]) -> list[str]:
-    return [receiver.name for receiver in receivers]
-
-
-def _local_mean(problem: Problem, paths: TraceOptions) -> PowerMap:
-    return trace_map(problem.opened_scene, problem.record, SPACING_M, SMOOTH_M, paths)
 
 
 class TracedStrengths(Model):

@@ -47,10 +47,10 @@ class Schedule:
         return replace(self, factor=factor), start
 
 
-def plan(
+def schedule_of(
     config: LoopConfig,
     train: Sequence[IntArray],
-    everything: Sequence[IntArray],
+    all_train: Sequence[IntArray],
     rng: np.random.Generator,
     density: frozenset[int] = frozenset(),
     falls_by_choice: bool = False,
@@ -59,7 +59,7 @@ def plan(
 
     Each epoch visits every row once at every receiver that observed it, in random order; a batch belongs to one
     receiver and is no larger than the rows of any. An epoch omits random rows that do not fill a batch. ``train`` are
-    rows (conditions) of each receiver that train while validation rows are held out, ``everything`` all of them;
+    rows (conditions) of each receiver that train while validation rows are held out, ``all_train`` all of them;
     ``density`` as in `Schedule`; ``falls_by_choice``: learning rates fall before validation rows join, and once more.
 
     Raises:
@@ -68,19 +68,19 @@ def plan(
     steps = config.steps
     joined = steps if config.holdout_steps_fraction >= 1 else round(config.holdout_steps_fraction * steps)
     # Batches have one size, as recorded kernels do.
-    batch = min(config.batch, *(len(rows) for rows in (train if joined else everything)))
+    batch = min(config.batch, *(len(rows) for rows in (train if joined else all_train)))
     if not batch:
-        beside = f" beside {max(map(len, everything))} validation rows" if joined else ""
+        beside = f" beside {max(map(len, all_train))} validation rows" if joined else ""
         raise InputError(f"no training row at one receiver{beside}: use more rows")
-    plans = _epochs(train, joined, batch, rng), _epochs(everything, steps - joined, batch, rng)
-    chosen, receiver = (np.concatenate(parts) for parts in zip(*plans, strict=True))
+    epochs = _epochs(train, joined, batch, rng), _epochs(all_train, steps - joined, batch, rng)
+    rows, receiver = (np.concatenate(parts) for parts in zip(*epochs, strict=True))
     t, o = np.arange(steps), config.optimiser
     factor = _falling(steps, o)
     if falls_by_choice:
         factor[:joined] = _falling(joined, o)
     # Shorten the window of the running mean early in training, or it would be mostly the starting values.
     decay = np.minimum(o.ema_decay, (t + 1) / (t + 10))
-    return Schedule(chosen, receiver, factor, decay, density, joined)
+    return Schedule(rows, receiver, factor, decay, density, joined)
 
 
 def _falling(steps: int, optimiser: AdamConfig) -> NDArray[np.float64]:
@@ -102,16 +102,16 @@ def density_rounds(config: DensityConfig, steps: int) -> frozenset[int]:
 def _epochs(rows: Sequence[IntArray], steps: int, batch: int, rng: np.random.Generator) -> tuple[IntArray, IntArray]:
     if steps == 0:
         return np.empty((0, batch), np.int64), np.empty(0, np.int64)
-    counts = [len(of_receiver) // batch for of_receiver in rows]
-    batches, owners = [], []
+    counts = [len(receiver_rows) // batch for receiver_rows in rows]
+    batches, receivers = [], []
     for _ in range(-(-steps // sum(counts))):
-        drawn = [rng.permutation(r)[: n * batch].reshape(n, batch) for r, n in zip(rows, counts, strict=True)]
-        chosen = np.concatenate(drawn)
+        permuted = map(rng.permutation, rows)
+        epoch = [each[: n * batch].reshape(n, batch) for each, n in zip(permuted, counts, strict=True)]
         # Batches of all receivers in turn: a receiver at a time would be forgotten while the others train.
-        order = rng.permutation(len(chosen))
-        batches.append(chosen[order])
-        owners.append(np.repeat(np.arange(len(rows)), counts)[order])
-    return np.concatenate(batches)[:steps], np.concatenate(owners)[:steps]
+        order = rng.permutation(sum(counts))
+        batches.append(np.concatenate(epoch)[order])
+        receivers.append(np.repeat(np.arange(len(rows)), counts)[order])
+    return np.concatenate(batches)[:steps], np.concatenate(receivers)[:steps]
 
 
 Params = dict[str, Any]

@@ -77,45 +77,29 @@ class Reach:
         weight = np.exp(-np.square(self.distance(tx_pos_m, receiver) / self.length_m))
         return np.where(weight < NEGLIGIBLE, 0, weight).astype(np.float32)
 
-    def of_ports(self, carriers: int) -> Reach:
-        """The reach by ports, as many for each receiver as there are carriers."""
-        return replace(self, known_m=tuple(positions_m for positions_m in self.known_m for _ in range(carriers)))
-
     def lengths(self, tx_pos_m: Sequence[FloatArray]) -> list[float]:
         """Candidate reaches from held-out transmitters [m, 3] of each receiver, from 0 upwards."""
         # With the longest reach w is 0.94 at the farthest held-out row: nothing tells longer ones apart.
-        away = [self.distance(tx, r) for r, tx in enumerate(tx_pos_m) if len(tx) and len(self.known_m[r])]
-        largest = float(np.max(np.concatenate(away), initial=0.0)) if away else 0.0
+        away_m = [self.distance(tx_pos_m[r], r) for r, known_m in enumerate(self.known_m) if len(known_m)]
+        largest = float(np.max(np.concatenate(away_m), initial=0.0)) if away_m else 0.0
         return [0.0, *(4 * largest * 0.5 ** np.arange(LENGTHS))[::-1]] if largest else [0.0, np.inf]
 
 
 def choose_reach(
-    reach: Reach,
-    lengths: Sequence[float],
-    tx_pos_m: Sequence[FloatArray],
-    score: Callable[[int, NDArray[np.float32]], FloatArray],
-    higher_is_better: bool,
+    reach: Reach, lengths: Sequence[float], score: Callable[[Reach], FloatArray], higher_is_better: bool
 ) -> tuple[float, FloatArray]:
     """The reach by scores of held-out transmitters.
 
     Args:
         reach: reach with the training transmitters.
         lengths: candidates in ascending order, metres.
-        tx_pos_m: held-out transmitters that each receiver observed, [m, 3] in metres.
-        score: ``score(receiver, weight)``: scores of a receiver's held-out transmitters with weights [m].
+        score: scores of the held-out transmitters of all receivers with a reach.
         higher_is_better: direction of the score.
 
     Returns:
-        The last reach that improves on the one kept before it (`improves`), metres, and its scores, all receivers
-        pooled. Without held-out transmitters, the given reach and no scores.
+        The last reach that improves on the one kept before it (`improves`), metres, and its scores.
     """
-    receivers = [r for r, tx in enumerate(tx_pos_m) if len(tx)]
-    if not receivers:
-        return reach.length_m, np.zeros(0)
-    scores = dict[float, FloatArray]()
-    for length in lengths:
-        weights = replace(reach, length_m=length).weight
-        scores[length] = np.concatenate([np.ravel(score(r, weights(tx_pos_m[r], r))) for r in receivers])
+    scores = {length_m: score(replace(reach, length_m=length_m)) for length_m in lengths}
     best = last_gain(scores.items(), higher_is_better)
     return best, scores[best]
 

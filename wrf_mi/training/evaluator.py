@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from ..backend.device import Recorded, to_float, to_tensor
+from ..backend.device import Recorded, to_tensor
+from ..backend.vectors import Complex
 from ..core.angles import FloatArray
 from ..core.array_files import stored_arrays, write_arrays
 from ..core.digest import content_digest
@@ -31,13 +32,13 @@ from ..gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from ..gaussians.operator import Images, PixelOperator, pixel_weights, static_signals
 from ..gaussians.parameters import CHUNK_SIZE
 from ..gaussians.tiles import perception_plane
-from ..graph.graph import Alone, Batch, Field, Graph, Report
+from ..graph.graph import Alone, Batch, Field, Graph
 from ..receivers.registry import PIXEL
 from ..receivers.reports import SQUARED_MAGNITUDE_EPS
 from ..tracing.paths.traced_field import TracedField
 from ..version import __version__
 from .adam import Params
-from .step import device_pose, evaluated, places_of
+from .step import batch_on_device, device_pose, evaluated, port_batches
 
 TOGETHER = 16  # transmitters whose Gaussians, or paths and Gaussians, are evaluated in one batch
 TRACED_NUMBERS = 512  # with paths, numbers in a batch of small observations
@@ -57,10 +58,10 @@ class Request:
     alone: Alone | None = None  # component reported alone (`Graph.report`); None: both together
     phase_error: float = 0.0  # see `Graph.report`
 
-    def rows(self, chosen: slice) -> Request:
+    def rows(self, rows: slice | IntArray) -> Request:
         """The request for some of the transmitters."""
-        weight = None if self.weight is None else self.weight[chosen]
-        return replace(self, condition=self.condition[chosen], slots=self.slots[chosen], weight=weight)
+        weight = None if self.weight is None else self.weight[rows]
+        return replace(self, condition=self.condition[rows], slots=self.slots[rows], weight=weight)
 
 
 class Evaluator(ABC):
@@ -84,7 +85,7 @@ class _InBatches(Evaluator):
 
     def __init__(self, graph: Graph) -> None:
         super().__init__(graph)
-        self._places, self._count = places_of(graph), 0
+        self._batches, self._count = port_batches(graph), 0
         self.recordings: dict[tuple[Hashable, int], Recorded] = {}  # by names and numbers of transmitters
 
     def update(self, params: Params) -> None:
@@ -114,9 +115,10 @@ class _InBatches(Evaluator):
     def _evaluated(self, request: Request) -> Any:
         """Flat report of a batch, a Dr.Jit array."""
 
-    def _not_recorded(self, report: Report, request: Request, **signal: Any) -> Any:
-        place = self._places[request.port]
-        return evaluated(report, self.params, request.condition.T, place, request.slots, request.weight, **signal)
+    def _batch(self, request: Request, signal: Complex | None = None) -> Batch:
+        """The transmitters of a request on the device, with the Gaussians' signal, if that is evaluated already."""
+        port_batch = self._batches[request.port]
+        return batch_on_device(port_batch, request.condition.T, request.slots, request.weight, signal)
 
     def _may_record(self, size: int) -> bool:
         # Networks of a recorded function are not evaluated in chunks, and lists of tiles, which it cannot count, have
@@ -135,7 +137,7 @@ class _InBatches(Evaluator):
 
         ``read`` returns the arrays that the function reads beside its arguments.
         """
-        condition, count, place = request.condition.T, len(request.condition), self._places[request.port]
+        count = len(request.condition)
         if (name, size) not in self.recordings:
 
             def recordable(params: Params, batch: Batch) -> Any:
@@ -143,14 +145,11 @@ class _InBatches(Evaluator):
                     return function(params, batch)
 
             # Arrays that are made from NumPy's memory at first use must exist before a recording.
-            evaluated(function, self.params, condition[:, :1], place)
+            evaluated(function, self.params, self._batch(request.rows(slice(1))))
             self.recordings[name, size] = Recorded(recordable, read)
         # The number of transmitters is a constant of the recorded kernels: copies of the last one fill a batch.
-        filled = np.minimum(np.arange(size), count - 1)
-        tx, slots = to_tensor(np.ascontiguousarray(condition[:, filled])), dr.zeros(mi.UInt32, size)
-        dr.make_opaque(slots)
-        weight = None if request.weight is None else to_float(request.weight[filled])
-        arrays = self.recordings[name, size](self.params, place.batch(tx, slots, weight))
+        batch = self._batch(request.rows(np.minimum(np.arange(size), count - 1)))
+        arrays = self.recordings[name, size](self.params, batch)
 
         def leading(values: Any) -> Any:
             return dr.gather(type(values), values, dr.arange(mi.UInt32, count * (dr.width(values) // size)))
@@ -170,7 +169,7 @@ class SplattedReports(_InBatches):
     def _evaluated(self, request: Request) -> Any:
         size, port = self._batch_size(1), request.port
         if not self._may_record(size):
-            return self._not_recorded(self.graph.report(port, None, chunked=True), request)
+            return evaluated(self.graph.report(port, None, chunked=True), self.params, self._batch(request))
         # One recording serves the pixels of all ports, whose poses are arguments.
         name, read = ("report", None if size == 1 else port), partial(self.graph.arrays, port, None)
         return self._recorded(name, size, self.graph.report(port, None), request, read)
@@ -187,7 +186,10 @@ class TracedReports(_InBatches):
         return max(TOGETHER, TRACED_NUMBERS // numbers)
 
     def _evaluated(self, request: Request) -> Any:
-        port, side, learned = request.port, request.side, self._evaluates_field(request)
+        port, side = request.port, request.side
+        # Gaussians are not evaluated beside paths where none has a weight.
+        learned = self.graph.field is not None and request.alone != "traced"
+        learned = learned and (side is None or request.weight is None or bool(np.any(request.weight)))
         if side is not None and len(side) == 1 and self._may_record(1):
             return self._of_one(request, side, learned)
         # Numbers of paths differ from batch to batch, and a recording serves one: only the Gaussians' signal, which
@@ -199,13 +201,7 @@ class TracedReports(_InBatches):
             name = "signal", port if self.graph.moves else None
             signal = self._recorded(name, TOGETHER, partial(self.graph.learned, port), replace(request, weight=None))
         report = self.graph.report(port, side, learned, alone=request.alone, phase_error=request.phase_error)
-        return self._not_recorded(report, request, signal=signal)
-
-    def _evaluates_field(self, request: Request) -> bool:
-        """Whether Gaussians are evaluated beside paths: not where none has a weight."""
-        if self.graph.field is None or request.alone == "traced":
-            return False
-        return request.side is None or request.weight is None or bool(np.any(request.weight))
+        return evaluated(report, self.params, self._batch(request, signal))
 
     def _of_one(self, request: Request, side: TracedField, learned: bool) -> Any:
         """Report of one transmitter, by a recording that serves others, whose traced sides are inputs."""

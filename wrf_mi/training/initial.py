@@ -8,7 +8,7 @@ that power. A mesh alone gives the surfaces that can scatter.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,12 +26,11 @@ from ..graph.graph import LEVEL, SHARE
 from ..scene.coordinates import require_near
 from ..scene.scan.points import read_points
 from ..tracing import open_scene, trace_paths
-from ..tracing.paths.traced_field import TracedField
 from ..tracing.search.surfaces import scene_surfaces
 from ..tracing.sionna.scenes import MESHES
 from .config import InitialConfig
 from .fit_plan import FitPlan
-from .step import Place, evaluated
+from .step import batch_on_device, evaluated, port_batches
 
 LEAST_SCALE_M = 0.02  # smallest starting scale, for a cluster of a single point
 LEAST_SHARE = 1e-3  # smallest starting power relative to the strongest cluster, so that weak Gaussians can grow
@@ -152,24 +151,10 @@ def initial_gaussians(
     return replace(start, opacity=config.opacity, signal=config.signal)
 
 
-def _gains(
-    plan: FitPlan, sides: Sequence[TracedField | None], values: Mapping[str, NDArray[np.float32]]
-) -> dict[str, NDArray[np.float32]]:
-    graph, gains = plan.graph, defaultdict[str, list[NDArray[np.float32]]](list)
-    for port, side in enumerate(sides):
-        if side is not None and side.gain_name in values and len(side):
-            observed = plan.targets.truth[port // graph.carriers, plan.known[port]]
-            # Ports of several carriers share the receiver's gain, which starts at their mean.
-            gains[side.gain_name].append(graph.match_gain(port, side, observed))
-    return {name: np.mean(of_ports, axis=0, dtype=np.float32) for name, of_ports in gains.items()}
-
-
-def starting_values(
-    plan: FitPlan, sides: Sequence[TracedField | None], places: Sequence[Place], initial: InitialGaussians | None
-) -> dict[str, NDArray[np.float32]]:
+def starting_values(plan: FitPlan, initial: InitialGaussians | None = None) -> dict[str, NDArray[np.float32]]:
     """Starting values of a fit: Gaussians, and gains and levels that match the observations on average.
 
-    ``sides`` and ``places`` are those of the ports; ``initial`` replaces the Gaussians of the settings.
+    ``initial`` replaces the Gaussians of the settings.
     """
     graph, config = plan.graph, plan.config
     rng = np.random.default_rng([config.seed, 0])
@@ -178,24 +163,36 @@ def starting_values(
         placed = replace(plan.record, receivers=graph.receivers)
         start = initial or initial_gaussians(config.initial, placed, plan.split.train, rng, graph.sphere)
         values = graph.field.init(start, rng)
-    values |= graph.parameters(sides) | graph.add_surface_gaussians(sides)
-    values |= _gains(plan, sides, values)
+    values |= graph.parameters(plan.sides) | graph.add_surface_gaussians(plan.sides)
+    values |= _gains(plan, values)
     if LEVEL in values:
-        # A receiver has one level for all of its carriers: that of the first.
-        ports = [plan.ports(receiver)[0] for receiver in range(len(plan.record.receivers))]
-        values[LEVEL][0] = [_level(plan, values, port, sides[port], places[port]) for port in ports]
+        values[LEVEL][0] = _levels(plan, values)
     return values
 
 
-def _level(
-    plan: FitPlan, values: Mapping[str, NDArray[np.float32]], port: int, side: TracedField | None, place: Place
-) -> float:
-    """Level at which Gaussians match a receiver's observations, or far below its paths' power, by one port."""
-    graph, targets = plan.graph, plan.targets
-    params = {name: to_tensor(value) for name, value in values.items()}
-    if side is not None:
-        return graph.power_level(side, params) + float(np.log(SHARE))
-    rows = targets.received(port, plan.known[port])[:LEVEL_ROWS]
-    reported = evaluated(graph.report(port, None), params, targets.condition[:, rows], place).numpy()
-    observed = targets.truth[port // graph.carriers, rows].astype(float)
-    return graph.models[port].missing_gain(reported.astype(float).reshape(observed.shape), observed)
+def _gains(plan: FitPlan, values: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+    gains = defaultdict[str, list[NDArray[np.float32]]](list)
+    for port, side in enumerate(plan.sides):
+        if side is not None and side.gain_name in values and len(side):
+            observed = plan.targets.observed[port // plan.graph.carriers, plan.port_rows[port]]
+            # Ports of several carriers share the receiver's gain, which starts at their mean.
+            gains[side.gain_name].append(plan.graph.match_gain(port, side, observed))
+    return {name: np.mean(of_ports, axis=0, dtype=np.float32) for name, of_ports in gains.items()}
+
+
+def _levels(plan: FitPlan, values: Mapping[str, NDArray[np.float32]]) -> list[float]:
+    """Level at which Gaussians match each receiver's observations, or far below its paths' power."""
+    graph, targets, levels = plan.graph, plan.targets, list[float]()
+    received = targets.received(plan.split.all_train)
+    params, batches = {name: to_tensor(value) for name, value in values.items()}, port_batches(graph)
+    # A receiver has one level for all of its carriers: that of the first.
+    for port in range(0, targets.ports, graph.carriers):
+        if (side := plan.sides[port]) is not None:
+            levels.append(graph.power_level(side, params) + float(np.log(SHARE)))
+            continue
+        rows = received[port][:LEVEL_ROWS]
+        batch = batch_on_device(batches[port], targets.condition[:, rows])
+        reported = evaluated(graph.report(port, None), params, batch).numpy()
+        observed = targets.observed[port // graph.carriers, rows].astype(float)
+        levels.append(graph.models[port].missing_gain(reported.astype(float).reshape(observed.shape), observed))
+    return levels

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from ..backend.device import to_float, to_tensor
 from ..core.array_files import keyed, under
 from ..core.files import listed
+from ..core.stored import Arrays
 from ..gaussians.initial import DensityChange
 from .adam import NonFiniteReport, NumericsError, Schedule, watched_groups
 from .config import LoopConfig
 
-Arrays = dict[str, NDArray[Any]]
 VIEW_GRADIENT = ("view_gradient_norm", "view_gradient_steps")
 OF_FIT = ("best_scores", "held_out")  # belong to a fit, not to one of its states
 KEPT = ("step", "chosen", *VIEW_GRADIENT, "reach_m", "searched_m", "phase_error", *OF_FIT)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -19,8 +19,7 @@ from ..core.carriers import carriers_text, rows_by_carrier
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
 from ..gaussians.parameters import Gaussians
-from ..graph.graph import Alone, Field, Graph
-from ..receivers.registry import PIXEL, ObservationSpec
+from ..graph.graph import Alone, Graph
 from ..receivers.spreads import PathStatistics, joined
 from ..tasks.conditions import known_headings, normalised_uplink
 from ..tracing.paths.traced_field import TracedField
@@ -68,19 +67,6 @@ class Predictor:
         self.evaluate = evaluator_of(graph, operator, store)
         self._others: dict[float, Predictor] = {}
         self.update({name: to_tensor(values) for name, values in params.items()})
-
-    @classmethod
-    def of_field(
-        cls,
-        field: Field,
-        params: Mapping[str, NDArray[np.float32]],
-        receivers: Sequence[Receiver],
-        height: int,
-        width: int,
-        operator: bool = False,
-    ) -> Predictor:
-        """Predictor of spectra of an image size by a field alone, with the papers' receiver."""
-        return cls(Graph(field, receivers, ObservationSpec(PIXEL, (height, width))), params, operator)
 
     @property
     def receivers(self) -> tuple[Receiver, ...]:

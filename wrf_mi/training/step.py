@@ -7,10 +7,10 @@ changing Python number would be traced anew each time.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,14 +22,14 @@ from ..backend.device import Recorded, on_device, to_float, to_tensor
 from ..backend.vectors import Complex, Pose
 from ..core import InputError, Receiver
 from ..gaussians.attributes import attributes_of
-from ..gaussians.tiles import TiledPlane, perception_plane
+from ..gaussians.tiles import perception_plane
 from ..graph.graph import LEVEL, Batch, Graph, Report
 from ..graph.settings import TRACED_NAMES
 from ..tasks import Loss
-from ..tracing.paths.traced_field import TracedField
 from .adam import NonFiniteReport, Params, Schedule, ScheduledStep, guarded_step, rated_params
-from .fit_plan import FIELD, FitPlan, Targets
+from .fit_plan import FIELD, FitPlan
 from .loop import FitState
+from .targets import Targets
 
 StepFunction = Callable[..., tuple[Params, NonFiniteReport, Any, Any]]
 """Takes a step of an optimiser in place, by `Steps._recorded`; returns running mean, report, loss of the batch before
@@ -44,28 +44,15 @@ def device_pose(receiver: Receiver, float_type: Any = None) -> Pose:
     return Pose(position, rows)
 
 
-class Place(NamedTuple):
-    """Constants of a batch at one port of a graph."""
-
-    receiver: int  # number of the receiver
-    pose: Pose  # its pose
-    plane: TiledPlane  # directions of the learned signal
-    log_carrier: float | None = None  # logarithm of the carrier over the middle one; None: rows have a single carrier
-
-    def batch(self, condition: Any, slots: Any, weight: Any = None, signal: Complex | None = None) -> Batch:
-        """A `Batch` at the port, of arrays on the device."""
-        carrier = None if self.log_carrier is None else dr.opaque(mi.Float, self.log_carrier)
-        receiver = dr.opaque(mi.UInt32, self.receiver)
-        return Batch(condition, slots, receiver, self.pose, self.plane, weight, carrier, signal)
-
-
-def places_of(graph: Graph) -> list[Place]:
-    """The places of a graph's ports."""
-    plane, receivers = perception_plane(*graph.form.size, mi.Float), np.arange(len(graph.models)) // graph.carriers
-    return [
-        Place(receiver, device_pose(graph.receivers[receiver]), plane, graph.log_carrier(port))
-        for port, receiver in enumerate(receivers.tolist())
-    ]
+def port_batches(graph: Graph) -> list[Batch]:
+    """A batch without transmitters at each port of a graph."""
+    plane, batches = perception_plane(*graph.form.size, mi.Float), list[Batch]()
+    for port in range(len(graph.models)):
+        receiver, log_carrier = port // graph.carriers, graph.log_carrier(port)
+        carrier = None if log_carrier is None else dr.opaque(mi.Float, log_carrier)
+        pose = device_pose(graph.receivers[receiver])
+        batches.append(Batch(None, None, dr.opaque(mi.UInt32, receiver), pose, plane, carrier=carrier))
+    return batches
 
 
 @dataclass
@@ -73,58 +60,56 @@ class TrainingData:
     """Conditions and observations on the device (`Targets`)."""
 
     condition: Any  # conditions of all rows, tensor [3, c] in metres or [features, c]
-    truth: Any  # observations of all receivers and conditions, flat
+    observed: Any  # observations of all receivers and conditions, flat
     scale: Any  # inverse unit of each receiver, [n_rx]
-    weight: Any = None  # factors of the observations' differences in the loss, in the order of ``truth``; None: 1
+    weight: Any = None  # factors of the observations' differences in the loss, in the order of ``observed``; None: 1
 
     @classmethod
     def of(cls, targets: Targets) -> TrainingData:
         """The targets of a fit on the device."""
         weight = None if targets.weight is None else to_float(targets.weight)
-        return cls(to_tensor(targets.condition), to_float(targets.truth), to_float(1 / targets.unit), weight)
+        return cls(to_tensor(targets.condition), to_float(targets.observed), to_float(1 / targets.unit), weight)
 
-    def select(self, rows: Any, receiver: Any, values: int) -> tuple[Any, Any, Any]:
+    def select(self, conditions: Any, receiver: Any, values: int) -> tuple[Any, Any, Any]:
         """Some conditions [3 or features, batch] and their observations [batch * values] at one receiver, and the
         factor of differences in the loss: one value, or [batch * values] with ``weight``.
         """
-        k, n = self.condition.shape
-        batch, index_type = dr.width(rows), type(rows)
-        flat = self.condition.array
-        tx = type(self.condition)(dr.concat([dr.gather(type(flat), flat, rows + i * n) for i in range(k)]), (k, batch))
-        # Truth is [receiver, condition, value], flat.
-        slot = dr.arange(index_type, batch * values)
-        row = dr.gather(index_type, rows, slot // values) + receiver * n
-        factor = dr.gather(type(self.truth), self.scale, receiver)
+        features, count = self.condition.shape
+        batch, index_type = dr.width(conditions), type(conditions)
+        flat, observed_type = self.condition.array, type(self.observed)
+        columns = [dr.gather(type(flat), flat, conditions + i * count) for i in range(features)]
+        # Observations are [receiver, condition, value], flat.
+        value = dr.arange(index_type, batch * values)
+        pair = dr.gather(index_type, conditions, value // values) + receiver * count
+        factor = dr.gather(observed_type, self.scale, receiver)
         if self.weight is not None:
-            factor *= dr.gather(type(self.truth), self.weight, row)
-        return tx, dr.gather(type(self.truth), self.truth, row * values + slot % values), factor
+            factor *= dr.gather(observed_type, self.weight, pair)
+        observed = dr.gather(observed_type, self.observed, pair * values + value % values)
+        return type(self.condition)(dr.concat(columns), (features, batch)), observed, factor
 
 
 class Steps:
     """Optimiser steps of a fit, recorded by port where the evaluation of the Gaussians allows it.
 
-    ``sides`` are the traced sides of the ports, None without a scene; ``loss`` is that of a batch.
-
     Attributes:
-        places: places of the ports.
+        loss: loss of a batch.
         recorded: functions that take a step, by what they depend on beside their arguments.
     """
 
-    def __init__(self, plan: FitPlan, sides: Sequence[TracedField | None], loss: Loss) -> None:
-        self._plan, self._sides, self.loss = plan, sides, loss
-        self._data, self.places = TrainingData.of(plan.targets), places_of(plan.graph)
+    def __init__(self, plan: FitPlan, loss: Loss) -> None:
+        self._plan, self.loss = plan, loss
+        self._data, self._batches = TrainingData.of(plan.targets), port_batches(plan.graph)
         self.recorded: dict[Any, StepFunction] = {}
 
     def take(self, state: FitState, schedule: Schedule, non_finite: NonFiniteReport) -> tuple[Any, NonFiniteReport]:
         """Take the step of a schedule that follows the steps of a state; returns its loss and report."""
-        # Slots are rows of the traced side, of which each row has one, however many conditions it has.
-        t, targets = state.step, self._plan.targets
-        port, rows = int(schedule.receiver[t]), schedule.rows[t]
-        slots = mi.UInt32(np.searchsorted(self._plan.known[port], rows // targets.per_row).tolist())
+        t = state.step
+        port, conditions = int(schedule.receiver[t]), schedule.rows[t]
         function = self._function(port, state)
-        batch, step = self.places[port].batch(None, slots), ScheduledStep.of(schedule, t, non_finite)
+        batch = replace(self._batches[port], slots=mi.UInt32(self._plan.slots(port, conditions).tolist()))
+        step = ScheduledStep.of(schedule, t, non_finite)
         state.mean, non_finite, loss, view_gradient_norm = function(
-            state.adam, state.mean, self._data, mi.UInt32(rows.tolist()), batch, step
+            state.adam, state.mean, self._data, mi.UInt32(conditions.tolist()), batch, step
         )
         state.view_gradient_norm += view_gradient_norm
         state.view_gradient_steps += 1
@@ -133,7 +118,7 @@ class Steps:
 
     def _function(self, port: int, state: FitState) -> StepFunction:
         """Recorded step of a port; without paths one serves all, else each search for paths needs another."""
-        plan, side = self._plan, self._sides[port]
+        plan, side = self._plan, self._plan.sides[port]
         graph, params = plan.graph, dict(state.adam.items())
         if side is not None and side.refresh(params):
             state.searched_m[port] = side.searched_at_m
@@ -147,8 +132,8 @@ class Steps:
             report, read = graph.report(port, side, learned, surface=surface), None
             if key != (None,):
                 # Arrays that are made from NumPy's memory at first use must exist before a recording.
-                first = plan.targets.condition[:, plan.targets.conditions(plan.known[port][:1])]
-                evaluated(report, params, first, self.places[port])
+                condition = plan.targets.condition[:, plan.port_rows[port][:1] * plan.targets.per_row]
+                evaluated(report, params, batch_on_device(self._batches[port], condition))
                 read = partial(graph.arrays, port, side)
             self.recorded[key] = self._recorded(report, self._rates(params), read)
         return self.recorded[key]
@@ -170,19 +155,19 @@ class Steps:
     def _recorded(self, report: Report, rates: Mapping[str, float], read: Callable[[], Any] | None) -> StepFunction:
         """A step by a report; ``read`` returns arrays that the report reads beside its arguments."""
         evaluation, loss_of = self._plan.graph.evaluation, self.loss
-        shape = self._plan.targets.truth.shape[2:]
+        shape = self._plan.targets.observed.shape[2:]
 
-        # ``batch`` is the port of ``rows``, without conditions, which are drawn from ``data``.
-        def step(adam: Adam, mean: Params, data: TrainingData, rows: Any, batch: Batch, at: ScheduledStep) -> Any:
+        # ``conditions`` are numbers of those of the batch, which are drawn from ``data``.
+        def step(adam: Adam, mean: Params, data: TrainingData, conditions: Any, batch: Batch, at: ScheduledStep) -> Any:
             params = rated_params(adam, rates, at.factor)
-            condition, truth, scale = data.select(rows, batch.receiver, math.prod(shape))
-            truth = truth * scale
+            condition, observed, scale = data.select(conditions, batch.receiver, math.prod(shape))
+            observed = observed * scale
             # Evaluated with the report's first kernels, so that those of the loss and its reverse pass do not gather
             # again.
-            dr.schedule(truth, scale)
+            dr.schedule(observed, scale)
             # In the receiver's unit, so that learning rates suit observations of any scale.
             prediction = report(params, replace(batch, condition=condition))
-            loss = loss_of(prediction * scale, truth, dr.width(rows), *shape)
+            loss = loss_of(prediction * scale, observed, dr.width(conditions), *shape)
             mean, non_finite, finite = guarded_step(adam, params, loss, mean, at)
             result = mean, non_finite, dr.detach(loss), _view_gradient_norm(params, batch.pose, finite)
             dr.eval(adam, result)
@@ -211,23 +196,26 @@ def _view_gradient_norm(params: Params, pose: Pose, finite: Any) -> Any:
     return dr.select(finite, dr.sqrt(sum(c * c for c in pull)) * distance, 0)
 
 
-def evaluated(
-    report: Report,
-    params: Mapping[str, Any],
+def batch_on_device(
+    port_batch: Batch,
     condition: NDArray[Any],
-    place: Place,
     slots: NDArray[Any] | None = None,
     weight: NDArray[Any] | None = None,
     signal: Complex | None = None,
-) -> Any:
-    """A report of conditions [3 or features, m], evaluated without gradients.
+) -> Batch:
+    """The batch of a port (`port_batches`) with conditions [3 or features, m].
 
     ``slots`` are rows of the traced side [m], by default the first m; ``weight`` [m] scales the Gaussians' signal.
     """
+    slots = on_device(np.arange(condition.shape[1]) if slots is None else slots, mi.UInt32)
+    weight = None if weight is None else to_float(weight)
+    tensor = to_tensor(np.ascontiguousarray(condition))
+    return replace(port_batch, condition=tensor, slots=slots, weight=weight, signal=signal)
+
+
+def evaluated(report: Report, params: Mapping[str, Any], batch: Batch) -> Any:
+    """A report, evaluated without gradients."""
     with dr.suspend_grad():
-        rows = on_device(np.arange(condition.shape[1]) if slots is None else slots, mi.UInt32)
-        weights = None if weight is None else to_float(weight)
-        tx = to_tensor(np.ascontiguousarray(condition))
-        reported = report(params, place.batch(tx, rows, weights, signal))
+        reported = report(params, batch)
         dr.eval(reported)
     return reported

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from ..gaussians.initial import adapt, reset_opacity
 from ..graph.graph import Field, Graph
 from ..tasks import Loss
 from ..tracing.options import DISC, FACTOR
-from ..tracing.paths.traced_field import TracedField
 from .adam import NonFiniteReport
 from .by_distance import Reach
 from .config import TrainConfig
@@ -26,7 +25,6 @@ from .fit_plan import FitPlan
 from .initial import starting_values
 from .loop import OF_FIT, FitState, TrainingLoop
 from .predictor import Predictor
-from .selection import last_gain
 from .step import Steps
 from .validation import Validation
 
@@ -52,7 +50,6 @@ class Trainer(TrainingLoop):
 
     Attributes:
         plan: data, graph and schedule of the fit.
-        sides: traced side of each port; None without a scene.
         validation: scores of held-out rows.
         steps: recorded optimiser steps.
 
@@ -84,22 +81,19 @@ class Trainer(TrainingLoop):
         if config.deterministic:
             # Sums over threads, and on a GPU, add in the order in which parts finish.
             init("llvm", threads=1)
-        # Traced once: the positions of training rows do not change, only what the paths meet.
-        self.sides: list[TracedField | None] = plan.traced() if before is None else before.sides
-        self.validation = Validation(plan, self.sides)
-        self.steps = Steps(plan, self.sides, loss or plan.loss)
+        self.validation, self.steps = Validation(plan), Steps(plan, loss or plan.loss)
         self._predictor: Predictor | None = None
         if state is None and before is not None:
             state, self.seconds = before.state.restarted(), before.seconds
         elif state is None:
+            state = FitState(starting_values(plan, initial))
             plan.graph.check_polarization(record.tx_pos_m[split.all_train])
-            state = FitState(starting_values(plan, self.sides, self.steps.places, initial))
             if plan.unjudged:
                 logger.warning("%d training rows do not suffice to choose a reach: no Gaussians", len(split.train))
                 state.reach_m = 0.0
         else:
             check_params(plan.graph.field, state.params(), "checkpoint.npz")
-            plan.graph.add_surface_gaussians(self.sides, state.params())
+            plan.graph.add_surface_gaussians(plan.sides, state.params())
         self.state = state
         # A resumed fit whose state was chosen has the shortened schedule that followed.
         if state.chosen:
@@ -113,16 +107,16 @@ class Trainer(TrainingLoop):
         keep their starting values, but for Gaussians on surfaces, which have places of their own.
         """
         start, chosen = self.state.params(), before.state
-        there, here = (trainer.graph.parameters(trainer.sides) for trainer in (before, self))
-        same = {name: values for name, values in params.items() if name in start and values.shape == start[name].shape}
-        for name, stated in here.items():
-            if name in same and name in there and there[name].shape == stated.shape:
-                same[name] = stated + (same[name] - there[name])
+        stated, stated_before = (trainer.graph.parameters(trainer.plan.sides) for trainer in (self, before))
+        fitted = {name: v for name, v in params.items() if name in start and v.shape == start[name].shape}
+        for name, values in stated.items():
+            if name in fitted and name in stated_before and stated_before[name].shape == values.shape:
+                fitted[name] = values + (fitted[name] - stated_before[name])
         discs = {name: values for name, values in params.items() if name in (DISC, FACTOR)}
-        self.state = FitState(start | same | discs, self.state.adam.beta_1)
+        self.state = FitState(start | fitted | discs, self.state.adam.beta_1)
         for name in ("chosen", "reach_m", "phase_error", *OF_FIT):
             setattr(self.state, name, getattr(chosen, name))
-        self.plan.graph.add_surface_gaussians(self.sides, self.state.params())
+        self.graph.add_surface_gaussians(self.plan.sides, self.state.params())
         self.schedule, self.state.step = self.schedule.after(chosen.chosen)
 
     @property
@@ -144,7 +138,7 @@ class Trainer(TrainingLoop):
 
     def _restore_paths(self) -> None:
         # A receiver that training moves is searched from its position at the last search.
-        sides = [side for side in self.sides if side is not None]
+        sides = [side for side in self.plan.sides if side is not None]
         if sides and not len(self.state.searched_m):
             self.state.searched_m = np.stack([side.searched_at_m for side in sides])
         for side, searched_m in zip(sides, self.state.searched_m, strict=True):
@@ -225,37 +219,3 @@ class Trainer(TrainingLoop):
         rounds, every = sorted(self.schedule.density), density.reset_every
         if every and "opacity" in names and (rounds.index(state.step) + 1) % every == 0:
             state.set_param("opacity", reset_opacity(change.parameters["opacity"]))
-
-
-def _trainer_of(plan: FitPlan, before: Trainer | None) -> Trainer:
-    return Trainer(plan.record, plan.split, plan.config, plan=plan, before=before)
-
-
-def fit_curriculum(
-    plan: FitPlan,
-    trainer_of: Callable[[FitPlan, Trainer | None], Trainer] = _trainer_of,
-    run: Callable[[Trainer], object] = Trainer.run,
-) -> Trainer:
-    """Run the trainings of a plan's curriculum, and the chosen one to its last step with all rows.
-
-    Args:
-        plan: plan of the first training.
-        trainer_of: the trainer of a plan, given that of the training before.
-        run: runs a trainer.
-
-    Returns:
-        The last training whose scores of held-out rows improve on those of the one kept before it.
-    """
-    trainers = list[Trainer]()
-    for number in range(len(plan.curriculum)):
-        trainer = trainer_of(plan.part(number) if number else plan, trainers[-1] if trainers else None)
-        trainer.until_chosen = plan.chooses and len(plan.curriculum) > 1
-        run(trainer)
-        trainers.append(trainer)
-    chosen = trainers[-1]
-    if chosen.until_chosen:
-        scores = ((trainer, trainer.state.best_scores) for trainer in trainers)
-        chosen, seconds = last_gain(scores, chosen.higher_is_better), chosen.seconds
-        chosen.until_chosen, chosen.seconds = False, seconds
-        run(chosen)
-    return chosen

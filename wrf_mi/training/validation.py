@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..core import Split
-from ..core.types import IntArray
-from ..tracing.paths.traced_field import TracedField
+from ..core.types import FloatArray, IntArray
 from .by_distance import Reach, choose_reach
 from .evaluator import Request
 from .fit_plan import FIELD, FitPlan
@@ -20,7 +20,7 @@ from .loop import FitState
 from .predictor import Predictor
 from .selection import improves
 
-PHASE_ERRORS = (0.5, 1.0, 1.5)  # phase errors that are tried, rad: beyond, a reflection knows nothing of its phase
+PHASE_ERRORS = (0.5, 1.0, 1.5)  # phase errors that are tried, rad: beyond, phases are uniform
 
 
 @dataclass(frozen=True)
@@ -33,15 +33,14 @@ class HeldOutReports:
 
 
 class Validation:
-    """Scores and reports of held-out rows; ``sides`` are the traced sides of the ports, None without a scene.
+    """Scores and reports of held-out rows.
 
     Attributes:
         scores: scores of the held-out rows at the last validation, port by port.
     """
 
-    def __init__(self, plan: FitPlan, sides: Sequence[TracedField | None]) -> None:
-        self.plan, self._sides, self.scores = plan, sides, np.zeros(0)
-        self._higher = plan.task.higher_is_better
+    def __init__(self, plan: FitPlan) -> None:
+        self.plan, self.scores = plan, np.zeros(0)
 
     def reach(self, chosen: bool, length_m: float) -> Reach | None:
         """Reach around the rows that train before or after a state is ``chosen``; None: Gaussians count everywhere."""
@@ -50,27 +49,32 @@ class Validation:
             return None
         # Once a state is chosen, the held-out rows train, too, unless they stay out to the end.
         joined = chosen and plan.schedule.joined < plan.loop.steps
-        rows = plan.split.all_train if joined else plan.choosing.train
-        positions_m = [plan.record.tx_pos_m[plan.targets.received(port, rows)] for port in range(plan.targets.ports)]
-        receivers = range(len(plan.record.receivers))
-        return Reach(tuple(np.concatenate([positions_m[port] for port in plan.ports(r)]) for r in receivers), length_m)
+        rows = plan.split.all_train if joined else plan.selection.train
+        return Reach(self._positions(plan.targets.received(rows)), length_m)
 
     def score(self, predict: Predictor, state: FitState) -> float:
         """Median of `scores` by a state, all receivers pooled; NaN without held-out rows.
 
         Where Gaussians correct paths, it chooses the reach of the state.
         """
-        plan, rows = self.plan, self._held_out(bool(state.chosen))
-        if plan.graph.corrects:
-            each = [self._corrected_scores(predict, state, rows)]
+        plan, rows, reach = self.plan, self._held_out(bool(state.chosen)), self.reach(bool(state.chosen), state.reach_m)
+        if not any(map(len, rows)):
+            self.scores = np.zeros(0)
+        elif reach is not None:
+            lengths = [state.reach_m]
+            if plan.chooses and not state.chosen:
+                lengths = reach.lengths(self._positions(rows)) if plan.trains == FIELD and state.step else [0.0]
+            # The state keeps the reach with which it is scored, so that the best state has the best reach.
+            state.reach_m, self.scores = choose_reach(
+                reach, lengths, partial(self._scores, predict, rows), plan.task.higher_is_better
+            )
         elif plan.graph.scene is not None:
-            each = [self._scores(predict, port, port_rows) for port, port_rows in enumerate(rows) if len(port_rows)]
+            self.scores = self._scores(predict, rows)
         else:
-            record, score, validation = plan.record, plan.task.training_score, self._split(state.chosen).validation
-            receivers = range(len(record.receivers)) if len(validation) else ()
-            reports = [predict.of_rows(record, validation, r) for r in receivers]
-            each = [np.ravel(score(reports[r], record.observation[r, validation])) for r in receivers]
-        self.scores = np.concatenate([np.zeros(0), *each])
+            record, validation = plan.record, self._split(state.chosen).validation
+            reports = [predict.of_rows(record, validation, r) for r in range(len(record.receivers))]
+            scored = zip(reports, record.observation[:, validation], strict=True)
+            self.scores = np.concatenate([np.ravel(plan.task.training_score(*pair)) for pair in scored])
         return float(np.nanmedian(self.scores)) if len(self.scores) else float("nan")
 
     def choosing_score(self, score: float) -> float:
@@ -81,19 +85,24 @@ class Validation:
 
     def _split(self, chosen: bool | int) -> Split:
         """Split whose validation rows are scored before or after a state is ``chosen``."""
-        return self.plan.split if chosen else self.plan.choosing
+        return self.plan.split if chosen else self.plan.selection
 
     def _held_out(self, chosen: bool) -> list[IntArray]:
         """Conditions of each port that are held out before or after a state is ``chosen``."""
-        split = self._split(chosen)
-        return [self.plan.targets.received(port, split.validation) for port in range(self.plan.targets.ports)]
+        return self.plan.targets.received(self._split(chosen).validation)
+
+    def _positions(self, rows: Sequence[IntArray]) -> tuple[FloatArray, ...]:
+        """Positions [n, 3] in metres of the rows of each receiver, from those of each port."""
+        plan = self.plan
+        receivers = range(len(plan.record.receivers))
+        return tuple(plan.record.tx_pos_m[np.concatenate([rows[port] for port in plan.ports(r)])] for r in receivers)
 
     def facts(self, chosen: bool) -> dict[str, Any]:
         """Fields of `Progress` on the rows of `scores`, before or after a state is ``chosen``."""
         plan, split = self.plan, self._split(chosen)
         record, test = plan.record, plan.split.test
         facts: dict[str, Any] = {"validation_rows": len(split.validation)}
-        if not record.has_positions or not len(split.validation):
+        if not record.has_positions or not len(self.scores):
             return facts
         trained = cKDTree(record.tx_pos_m[split.train])
         by_port = plan.graph.corrects or plan.graph.scene is not None  # the order of `score`
@@ -111,33 +120,23 @@ class Validation:
         rows = len(np.unique(np.concatenate(scored)[far]))
         return facts | {"far_score": float(np.median(self.scores[far])), "far_rows": rows}
 
-    def _reports(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[Any]:
-        """Reports of known rows of a port, whose paths need no search; ``weight`` is that of the Gaussians [rows]."""
-        # Sides hold all training rows, held-out ones too: scores need no further search for paths.
-        slots = np.searchsorted(self.plan.known[port], rows)
-        return predict.of_side(Request(self.plan.record.tx_pos_m[rows], port, self._sides[port], slots, weight))
+    def _reports(self, predict: Predictor, rows: Sequence[IntArray], reach: Reach | None = None) -> NDArray[Any]:
+        """Reports of known rows of each port, port by port, whose paths need no search."""
+        plan, reports = self.plan, list[NDArray[Any]]()
+        for port, port_rows in enumerate(rows):
+            tx_pos_m = plan.record.tx_pos_m[port_rows]
+            weight = None if reach is None else reach.weight(tx_pos_m, port // plan.graph.carriers)
+            # Sides hold all training rows, held-out ones too: scores need no further search for paths.
+            request = Request(tx_pos_m, port, plan.sides[port], plan.slots(port, port_rows), weight)
+            reports.append(predict.of_side(request))
+        return np.concatenate(reports)
 
-    def _observed(self, port: int, rows: IntArray) -> NDArray[Any]:
-        return np.asarray(self.plan.record.observation[port // self.plan.graph.carriers, rows])
+    def _observed(self, rows: Sequence[IntArray]) -> NDArray[Any]:
+        observed, carriers = self.plan.record.observation, self.plan.graph.carriers
+        return np.concatenate([observed[port // carriers, port_rows] for port, port_rows in enumerate(rows)])
 
-    def _scores(self, predict: Predictor, port: int, rows: IntArray, weight: Any = None) -> NDArray[np.float64]:
-        reports = self._reports(predict, port, rows, weight)
-        return np.ravel(self.plan.task.training_score(reports, self._observed(port, rows)))
-
-    def _corrected_scores(self, predict: Predictor, state: FitState, rows: list[IntArray]) -> NDArray[np.float64]:
-        """Scores of held-out rows where Gaussians correct paths; the best reach is used until one is chosen."""
-        plan, reach = self.plan, self.reach(bool(state.chosen), state.reach_m)
-        assert reach is not None
-        reach = reach.of_ports(plan.graph.carriers)
-        positions_m = [plan.record.tx_pos_m[port_rows] for port_rows in rows]
-        lengths = [reach.length_m]
-        if plan.chooses and not state.chosen:
-            lengths = reach.lengths(positions_m) if plan.trains == FIELD and state.step else [0.0]
-        # The state keeps the reach with which it is scored, so that the best state has the best reach.
-        state.reach_m, scores = choose_reach(
-            reach, lengths, positions_m, lambda port, w: self._scores(predict, port, rows[port], w), self._higher
-        )
-        return scores
+    def _scores(self, predict: Predictor, rows: Sequence[IntArray], reach: Reach | None = None) -> FloatArray:
+        return np.ravel(self.plan.task.training_score(self._reports(predict, rows, reach), self._observed(rows)))
 
     def choose_phase_error(self, predict: Predictor, state: FitState) -> NDArray[Any]:
         """Reports of all rows on which a state was chosen, port by port, by the phase error that predicts them best.
@@ -145,30 +144,22 @@ class Validation:
         Planes that are centimetres off leave phases uncertain, and the expectation of a spectrum is then nearer to what
         is measured than the spectrum of any phases (`Graph.report`). Other reports have no such expectation.
         """
-        plan, rows = self.plan, self._held_out(False)
-        best = self._held_out_reports(predict, state, rows)
+        plan, rows, reach = self.plan, self._held_out(False), self.reach(False, state.reach_m)
+        best = self._reports(predict, rows, reach)
         if plan.graph.scene is None or not plan.task.averages_phases:
             return best
-        observed = np.concatenate([self._observed(port, port_rows) for port, port_rows in enumerate(rows)])
-        before = np.ravel(plan.task.training_score(best, observed))
+        observed = self._observed(rows)
+        best_scores = np.ravel(plan.task.training_score(best, observed))
         for phase_error in PHASE_ERRORS:
             predict.phase_error = phase_error
-            reports = self._held_out_reports(predict, state, rows)
+            reports = self._reports(predict, rows, reach)
             scores = np.ravel(plan.task.training_score(reports, observed))
             # Scores are taken to rise to one maximum, as each try costs a prediction of all held-out rows.
-            if not improves(scores, before, self._higher):
+            if not improves(scores, best_scores, plan.task.higher_is_better):
                 break
-            state.phase_error, best, before = phase_error, reports, scores
+            state.phase_error, best, best_scores = phase_error, reports, scores
         predict.phase_error = state.phase_error
         return best
-
-    def _held_out_reports(self, predict: Predictor, state: FitState, rows: list[IntArray]) -> NDArray[Any]:
-        reach, reports = self.reach(False, state.reach_m), list[NDArray[Any]]()
-        for port, port_rows in enumerate(rows):
-            receiver = port // self.plan.graph.carriers
-            weight = None if reach is None else reach.weight(self.plan.record.tx_pos_m[port_rows], receiver)
-            reports.append(self._reports(predict, port, port_rows, weight))
-        return np.concatenate(reports)
 
     def reports(self, state: FitState) -> HeldOutReports | None:
         """Reports of held-out rows by the state that was chosen on them; None: none was chosen in groups."""

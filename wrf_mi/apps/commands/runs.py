@@ -134,6 +134,7 @@ def _add_predict(commands: Any) -> None:
 def predict_command(a: Arguments) -> int:
     """Write predictions to a file."""
     from ...parallel import open_scheduler
+    from ...runs.predict_to_file import write_run_predictions
     from ...runs.prediction_file import read_inputs
     from ...runs.run import open_run
     from ..maps.locate_file import device_text, read_own
@@ -144,7 +145,7 @@ def predict_command(a: Arguments) -> int:
         run = open_run(a.run, operator=not a.no_operator, scene=a.scene)
         if a.own is not None:
             run = read_own(run, a.own)
-        shapes = run.predict_to_file(inputs, Path(a.out), scheduler if a.scheduler else None, progress=True)
+        shapes = write_run_predictions(run, inputs, Path(a.out), scheduler if a.scheduler else None, progress=True)
     value = {"out": str(a.out), "arrays": {key: list(shape) for key, shape in shapes.items()}}
     return show(a.json, value, f"{device_text(run)}{shapes['tx_pos'][0]} predictions: {a.out}")
 

@@ -34,9 +34,10 @@ from ...training.fit_plan import FitPlan
 from ...training.initial import initial_gaussians, starting_values
 from ...training.loop import FitState, Progress
 from ...training.predictor import Predictor
-from ...training.trainer import Trainer, fit_curriculum
+from ...training.trainer import Trainer
 from ...training.validation import HeldOutReports
 from ..model import Decomposition, Fitted, Inputs, Model, Problem, Session
+from .curriculum import fit_curriculum
 from .new_receivers import Params, of_all_receivers, trained_part, without_rows
 
 SOURCE = "Wen, Tong, Hu, Lin and Zhang, 'Neural representation for wireless radiation field reconstruction' (WRF-GS+)"
@@ -255,7 +256,7 @@ class GaussianField(Model):
         plan = self._plan(problem, split)
         trainer = fit_curriculum(plan, partial(self._trainer, session), partial(self._run, session))
         fitted = self._finished(trainer, problem, split, session)
-        del trainer
+        del trainer, plan
         release_memory()
         return fitted
 
@@ -288,6 +289,7 @@ class GaussianField(Model):
         placed = placed_receivers(record, by_uplink=False)
         if problem.scene == scene and [each.name for each in placed] == [each.name for each in before]:
             if stopped:
+                del trainer.plan.sides  # traced anew, as paths are searched where the stopped training searched last
                 trainer = self._trainer(session, trainer.plan, None)
             trainer.until_chosen = False
         else:
@@ -308,7 +310,7 @@ class GaussianField(Model):
         """The paths of a scene without any training, with the gains that training would start from."""
         plan = self._plan(problem, split)
         # Without a gain no row has to be traced.
-        params = starting_values(plan, plan.traced(), (), None) if plan.task.has_gain else {}
+        params = starting_values(plan) if plan.task.has_gain else {}
         return _fitted(plan, params, problem, session.folder)
 
     def _trainer(self, session: Session, plan: FitPlan, before: Trainer | None) -> Trainer:

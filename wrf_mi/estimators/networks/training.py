@@ -20,7 +20,7 @@ from ...backend.device import Recorded
 from ...core import InputError
 from ...core.array_files import keyed, under
 from ...core.types import IntArray
-from ...training.adam import NonFiniteReport, Params, ScheduledStep, guarded_step, plan, rated_params
+from ...training.adam import NonFiniteReport, Params, ScheduledStep, guarded_step, rated_params, schedule_of
 from ...training.checkpoint import CHECKPOINT, read_checkpoint, write_checkpoint
 from ...training.config import AdamConfig, LoopConfig
 from ...training.loop import FitState, Progress, TrainingLoop
@@ -80,7 +80,7 @@ class NetworkTrainer(TrainingLoop):
     ) -> None:
         self.network, self.config, self._seed = network, config, tuple(seed)
         self.label, self.higher_is_better = network.label, network.higher_is_better
-        self.schedule = plan(config, network.train, network.everything, np.random.default_rng([*seed, 1]))
+        self.schedule = schedule_of(config, network.train, network.everything, np.random.default_rng([*seed, 1]))
         self.state = state or FitState(network.module.state(), network.momentum)
         if self.state.chosen:
             self.schedule, _ = self.schedule.after(self.state.chosen)
