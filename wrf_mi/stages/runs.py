@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import Record, Split
-from ..datasets.observations import LEAST_RUNS, predicts_new_runs, trained_runs
+from ..datasets.observations import predicts_new_runs, trained_runs
 from ..estimators.model import Problem, Session
 from ..training.selection import HeldOut
 from .stage import Option, Stage, State
@@ -26,7 +26,7 @@ class Runs(Stage):
 
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
         """Both, which held-out runs choose from; none without several runs."""
-        if not LEAST_RUNS <= len(trained_runs(problem.record, split.all_train)) <= MOST_RUNS:
+        if not 2 <= len(trained_runs(problem.record, split.all_train)) <= MOST_RUNS:
             return []
         return [Option(POOLED, lambda state, split, session: state), Option(OFFSETS, self._offsets, freedom=1)]
 

@@ -37,7 +37,7 @@ from .sionna.scattering import scattering_of
 FOLDER, POWER = "powers", "power_dbm"
 PACKAGES = ("mitsuba", "drjit", "sionna-rt", "numpy")
 MOST_POINTS = 6000  # most traced positions; the grid becomes wider for larger scenes
-PAIRS_TOGETHER = 1 << 17  # pairs of a position and a receiver whose paths are traced together
+PAIRS_TOGETHER = 1 << 16  # pairs of a position and a receiver whose paths are traced together
 LAYER_M = 0.5  # greatest distance of the grid's layers over the transmitter's heights
 SAME_HEIGHT_M = 0.02  # range of heights that one layer serves: survey of a mast or trolley on a floor
 LEAST_SHARE = 1e-3  # least share of a neighbourhood outside of solids; below, the nearest point with more is used

@@ -70,10 +70,6 @@ def readings(**columns: Any) -> Any:
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        (
-            {"TxPower": [-8, -8, 0, 0] * 5},
-            r"TxPower is -8 \(10\), 0 \(10\): these are not pooled; .*--where TxPower=-8",
-        ),
         ({"Type": ["WIFI", "BLE"] * 10}, r"Type is WIFI \(10\), BLE \(10\): .*--where Type=WIFI"),
         ({"rssi": ["85%"] * 20}, r"rssi \(%\) is in per cent; give dBm"),
     ],
@@ -91,13 +87,20 @@ def test_each_beacon_may_send_its_own_power(tmp_path: Path) -> None:
     assert len(imported(tmp_path, readings(TxPower=[-8, 0] * 10)).receivers) == 2
 
 
-def test_files_named_by_the_power_sent_are_not_pooled(tmp_path: Path) -> None:
+def test_files_named_by_the_power_sent_are_runs(tmp_path: Path) -> None:
     files = [tmp_path / f"scan_{power}dBm.csv" for power in (-8, -4, 0)]
     for file in files:
         readings().to_csv(file, index=False)
-    error_line(
-        import_measurements, files, tmp_path / "data", r"files at -8, -4, 0 dBm sent, by their names, are not pooled"
-    )
+    report = import_measurements(files, tmp_path / "data")
+    assert sorted(set(report.record.runs)) == ["-4 dBm", "-8 dBm", "0 dBm"]
+    assert "files at -8, -4, 0 dBm sent, by their names: a run for each, with its offset" in report.notes
+
+
+def test_powers_sent_in_turn_are_runs_of_each_walk(tmp_path: Path) -> None:
+    table = pandas.concat([readings(TxPower=power, walk=walk) for power, walk in ((-8, "a"), (0, "a"), (0, "b"))])
+    record = imported(tmp_path, table)
+    assert sorted(set(record.runs)) == ["a -8 dBm", "a 0 dBm", "b 0 dBm"]
+    assert len(record.tx_pos_m) == 30
 
 
 @pytest.mark.parametrize("offset_db", [0.0, 4.0])

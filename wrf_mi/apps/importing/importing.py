@@ -140,7 +140,7 @@ class _Import:
         self.notes += notes
         if not len(readings.dbm):
             raise DataFault(self.table.files[0][0], "no reading was heard; correct --columns or --not-heard")
-        self._check_sent(readings)
+        self._check_radios(readings)
 
         # Rows of one position, heading, carrier, run and part of the split are averaged.
         conditions = self._conditions(readings)
@@ -262,25 +262,35 @@ class _Import:
                 text = f"{one_line(name)} is in per cent; give dBm (in Windows dBm = quality / 2 - 100)"
                 raise DataFault(self.table.files[0][0], f"{text}, or name another column by --columns rssi=...")
 
-    def _check_sent(self, readings: Readings) -> None:
-        """Refuse strengths of one receiver at several powers that were sent, or several kinds of radio."""
-        frame = self.table.frame
-        for name in frame.columns:
-            words, stated = name_words(name), frame[name].notna().to_numpy()[readings.row]
-            values = frame[name].iloc[readings.row[stated]].astype(str).str.strip()
-            if words & SENT and self.table.is_numeric(name):
-                several = values.groupby(readings.receiver[stated]).nunique().max() > 1
-            else:
-                several = values.nunique() > 1 and set(values.str.lower()) <= RADIOS
-            if several:
+    def _check_radios(self, readings: Readings) -> None:
+        """Refuse strengths of several kinds of radio."""
+        for name in self.table.frame.columns:
+            values = self._of_readings(name, readings)
+            if values.nunique() > 1 and set(values.str.lower()) <= RADIOS:
                 counts = listed([f"{one_line(text)} ({rows})" for text, rows in values.value_counts().items()])
                 text = f"{one_line(name)} is {counts}: these are not pooled"
                 remedy = f"choose one by --where {shlex.quote(f'{name}={values.value_counts().index[0]}')}"
                 raise DataFault(self.table.files[0][0], f"{text}; {remedy}")
-        powers = {match[1] for path, _ in self.table.files if (match := SENT_IN_NAME.search(path.stem))}
-        if len(powers) > 1:
-            text = f"files at {', '.join(sorted(powers, key=float))} dBm sent, by their names, are not pooled"
-            raise InputError(f"{self.table.files[0][0].parent}: {text}; import each into a folder of its own")
+
+    def _of_readings(self, name: str, readings: Readings) -> Any:
+        """Texts of a column where it is stated, by the number of the reading."""
+        values = self.table.frame[name].iloc[readings.row].reset_index(drop=True)
+        return values[values.notna()].astype(str).str.strip()
+
+    def _sent(self, readings: Readings) -> NDArray[np.str_] | None:
+        """Sent power of each row as a text, where one receiver has several: by a column, or by names of files."""
+        for name in self.table.frame.columns:
+            values = self._of_readings(name, readings)
+            several = values.groupby(readings.receiver[values.index]).nunique().max() > 1
+            if name_words(name) & SENT and self.table.is_numeric(name) and several:
+                self.notes.append(f"{one_line(name)} is {listed(values.unique())}: a run for each, with its offset")
+                return np.asarray(self.table.frame[name].astype(str).str.strip().to_numpy(str))
+        powers = [SENT_IN_NAME.search(path.stem) for path, _ in self.table.files]
+        texts = np.array([match[1] if match else "" for match in powers])
+        if len(distinct := sorted({*texts} - {""}, key=float)) < 2:
+            return None
+        self.notes.append(f"files at {', '.join(distinct)} dBm sent, by their names: a run for each, with its offset")
+        return np.asarray(texts[self._file])
 
     def _conditions(self, readings: Readings) -> dict[str, Any]:
         """Heading, carrier and run of each row where stated; rows that differ in them are not averaged."""
@@ -296,6 +306,9 @@ class _Import:
             conditions["heading"], self.units["heading"] = headings_rad(headings, of["heading"], self.options.heading)
         if "run" in of:
             conditions["run"] = table.frame[of["run"]].astype(str).str.strip().to_numpy(str)
+        if (sent := self._sent(readings)) is not None:
+            runs = conditions.get("run", np.full(len(sent), ""))
+            conditions["run"] = np.array([f"{run} {power} dBm".strip() for run, power in zip(runs, sent, strict=True)])
         if "frequency" in of and not self.options.frequency_hz:
             self.units["frequency"] = "-> Hz"
             conditions |= self._carriers(_hertz(table, of["frequency"]), readings)

@@ -191,7 +191,7 @@ def file_offsets(readings: Readings, place: IntArray, file: IntArray, names: Seq
         error = 1.2533 * 1.4826 * float(np.median(np.abs(difference - offset))) / np.sqrt(len(difference))
         if abs(offset) > max(LEAST_OFFSET_DB, OFFSET_STANDARD_ERRORS * error):
             text = f"{name}: strengths are {offset:+.1f} dB from those of the other files at {len(shared)} equal places"
-            notes.append(f"{text}: another sent power or device, pooled here; import it into a folder of its own")
+            notes.append(f"{text}: another sent power or device, pooled here; a column device gives each an offset")
     return notes
 
 
