@@ -27,7 +27,7 @@ from ..estimators.model import Arrays, Model, PredictAll, Problem, Session
 from ..scene.correction_data import read_correction_data
 from ..tracing.options import MAX_DEPTH, TraceOptions
 from ..tracing.paths.solve import Prepared
-from ..tracing.power_map import Traced, TracedPower, Tracer, power_tracer, trace_map
+from ..tracing.power_map import OnShare, Traced, TracedPower, Tracer, power_tracer, trace_map
 from ..tracing.search.chains import search_seconds
 from ..tracing.tracer import check_polarization, fit_offsets
 from .engine import Engine, OptionReport
@@ -106,14 +106,13 @@ class Mean(Stage):
         return [Option(name, partial(self._fit, name)) for name in names]
 
     def _fit(self, name: str, state: State, split: Split, session: Session) -> State:
-        session.report("tracing a map", 0.0)
-        return replace(state, mean=_mean(state.problem, name))
+        return replace(state, mean=_mean(state.problem, name, partial(session.report, "tracing a map")))
 
 
-def _mean(problem: Problem, name: str) -> Traced:
+def _mean(problem: Problem, name: str, on_share: OnShare = lambda share: None) -> Traced:
     """Traced power of an option by its name."""
     scene, record = problem.opened_scene, problem.record
-    local = trace_map(scene, record, SPACING_M, SMOOTH_M, THROUGH if name == DIRECT else TRACE)
+    local = trace_map(scene, record, SPACING_M, SMOOTH_M, THROUGH if name == DIRECT else TRACE, on_share)
     if name != EXACT:
         return local
     return TracedPower(local, power_tracer(scene, record, TRACE), np.arange(len(record.receivers)), {})

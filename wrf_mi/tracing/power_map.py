@@ -41,6 +41,12 @@ PAIRS_TOGETHER = 1 << 16  # pairs of a position and a receiver whose paths are t
 LAYER_M = 0.5  # greatest distance of the grid's layers over the transmitter's heights
 SAME_HEIGHT_M = 0.02  # range of heights that one layer serves: survey of a mast or trolley on a floor
 LEAST_SHARE = 1e-3  # least share of a neighbourhood outside of solids; below, the nearest point with more is used
+OnShare = Callable[[float], object]
+"""Called with the share of a trace that is done, 0 to 1."""
+
+
+def _quiet(share: float) -> None:
+    """Show no progress."""
 
 
 @dataclass(frozen=True)
@@ -152,12 +158,15 @@ def power_tracer(scene: Any, record: Record, options: TraceOptions) -> Tracer:
     return trace
 
 
-def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, options: TraceOptions) -> PowerMap:
+def trace_map(
+    scene: Any, record: Record, spacing_m: float, smooth_m: float, options: TraceOptions, on_share: OnShare = _quiet
+) -> PowerMap:
     """Trace a scene on a grid over its extent and all of a record's positions, at heights of its transmitter.
 
     Points of the grid inside closed solids (`wrf_mi.tracing.search.devices.solid_around`) are not traced: they take the
     mean of the points around them that are outside, or the nearest such mean. Means are over a Gaussian of the standard
-    deviation ``smooth_m``; 0: none. `InputError` for a receiver that no path reaches, or a scene filled by a solid.
+    deviation ``smooth_m``; 0: none. ``on_share`` is called with the share that is traced. `InputError` for a receiver
+    that no path reaches, or a scene filled by a solid.
     """
     # The grid covers the scene and all positions; storeys of the transmitter's heights are layers of it.
     box = scene.mi_scene.bbox()
@@ -175,7 +184,8 @@ def trace_map(scene: Any, record: Record, spacing_m: float, smooth_m: float, opt
     if not outside.any():
         raise InputError("the scene: a solid fills it at all heights of the transmitter; check the mesh and positions")
     traced = np.full((len(record.receivers), len(points)), np.nan)
-    traced[:, outside] = traced_powers(prepared, points[outside], record.receivers, options, record.tx_antenna)
+    how = record.receivers, options, record.tx_antenna, on_share
+    traced[:, outside] = traced_powers(prepared, points[outside], *how)
     power = np.where(np.isnan(traced), 0, 10 ** (traced / 10)).reshape(len(record.receivers), *grid.shape[:3])
     steps = [(axis[1] - axis[0]) if len(axis) > 1 else np.inf for axis in (x_m, y_m, z_m)]
     # Not across layers, which lie further apart than the neighbourhood and may be on different floors.
@@ -200,18 +210,31 @@ def _means_outside(
 
 
 def _power_dbm(
-    prepared: Prepared, tx_pos_m: FloatArray, receivers: Sequence[Receiver], options: TraceOptions, tx_antenna: Antenna
+    prepared: Prepared,
+    tx_pos_m: FloatArray,
+    receivers: Sequence[Receiver],
+    options: TraceOptions,
+    tx_antenna: Antenna,
+    on_share: OnShare = _quiet,
 ) -> FloatArray:
     """Received power [n_rx, m] in dBm for 0 dBm sent from points [m, 3] outside of solids, NaN without a path."""
     how: dict[str, Any] = {"prepared": prepared, "tx_antenna": tx_antenna, "check": False}
     # In chunks: a path takes a kilobyte, and what is kept of it here is its power. Chains of reflections are kept.
     chunks = np.array_split(tx_pos_m, max(1, len(tx_pos_m) * len(receivers) // PAIRS_TOGETHER))
-    traced = (trace_paths(prepared.scene, chunk, receivers, options, **how).paths for chunk in chunks)
-    return np.concatenate([np.asarray(rssi_dbm(paths), float) for paths in traced], axis=1)
+    powers = list[FloatArray]()
+    for number, chunk in enumerate(chunks):
+        on_share(number / len(chunks))
+        powers.append(np.asarray(rssi_dbm(trace_paths(prepared.scene, chunk, receivers, options, **how).paths), float))
+    return np.concatenate(powers, axis=1)
 
 
 def traced_powers(
-    prepared: Prepared, tx_pos_m: FloatArray, receivers: Sequence[Receiver], options: TraceOptions, tx_antenna: Antenna
+    prepared: Prepared,
+    tx_pos_m: FloatArray,
+    receivers: Sequence[Receiver],
+    options: TraceOptions,
+    tx_antenna: Antenna,
+    on_share: OnShare = _quiet,
 ) -> FloatArray:
     """Received powers of `_power_dbm`, kept in the user's cache."""
     # The key holds all that determines the powers, code and versions included; a stale file is never read.
@@ -229,7 +252,7 @@ def traced_powers(
         path = user_cache() / FOLDER / f"{content_digest(code, versions, faces, asked)}.npz"
         if path.exists():
             return np.asarray(stored_arrays(path)[POWER], float)
-    power = _power_dbm(prepared, tx_pos_m, receivers, options, tx_antenna)
+    power = _power_dbm(prepared, tx_pos_m, receivers, options, tx_antenna, on_share)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_arrays(path, {POWER: power})
