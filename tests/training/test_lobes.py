@@ -1,7 +1,5 @@
 """Short fits to spectra of few lobes: predictions follow the transmitter, and are no constant."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
