@@ -1,7 +1,5 @@
 """Calls of the command within this process, and the run folders that it writes."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Changes of a data set's folder, what its reader then says, and data sets that the machine may have."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The command within this process, as the fixture ``command`` gives it, and the files that it reads and writes."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -66,12 +66,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Set Dr.Jit's threads to this process's share of the cores, or to all cores where a test is marked so.
 
-    This precedes each test and its fixtures, as deterministic fits leave the process on one thread. Runs time two
-    single predictions instead of twenty.
+    This precedes each test and its fixtures, as deterministic fits leave the process on one thread. Runs time one
+    single prediction instead of twenty.
     """
     evaluate: Any = sys.modules.get("wrf_mi.runs.evaluate")
     if evaluate:
-        evaluate.REPEATS = 2
+        evaluate.REPEATS = 1
     if "drjit" in sys.modules:
         from wrf_mi.backend import set_threads
 

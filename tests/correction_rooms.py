@@ -1,7 +1,5 @@
 """A room of six walls and a board with known errors of its planes, and channels in it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

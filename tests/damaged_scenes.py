@@ -1,7 +1,5 @@
 """Random rooms with one fault of a kind that ``wrf-mi check`` names, and scenes without a fault."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass

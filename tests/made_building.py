@@ -1,7 +1,5 @@
 """Signal strengths in a building of which each receiver covers a part, so that some received few rows or none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -46,14 +46,7 @@ def fields(seed: int) -> Gaussians:
     )
 
 
-def oracle_image(
-    gaussians: Gaussians,
-    receiver: Receiver,
-    size: tuple[int, int],
-    chosen: Any = None,
-    transmitter: int = 0,
-    **more: Any,
-) -> np.ndarray:
+def oracle_image(gaussians, receiver, size, chosen=None, transmitter=0, **more):
     """The image of a transmitter's Gaussians, of all or the chosen ones; ``more`` replaces their opacities."""
     chosen = np.arange(gaussians.count) if chosen is None else chosen
     start = transmitter * gaussians.count

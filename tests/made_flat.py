@@ -1,7 +1,5 @@
 """A flat of one room in the layout of flat-ble: walls, two anchors, strengths that fall with distance."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

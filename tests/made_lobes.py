@@ -1,7 +1,5 @@
 """Spectra of a few lobes on a dark ground, which move with the transmitter."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wrf_mi.core import Receiver, Record
@@ -10,16 +8,7 @@ from wrf_mi.core.angles import pixel_directions
 EXTENT_M = 0.6  # side of the square that transmitters are in, a metre above the receiver
 
 
-def lobes(
-    size: tuple[int, int],
-    *,
-    rows: int = 60,
-    width_deg: float = 25.0,
-    peak: float = 1.0,
-    ground: float = 0.0,
-    noise: float = 0.0,
-    reflected: bool = False,
-) -> Record:
+def lobes(size, *, rows=60, width_deg=25.0, peak=1.0, ground=0.0, noise=0.0, reflected=False):
     """A record of spectra with one lobe in the direction of the transmitter; its last fifth is the test set.
 
     Args:

@@ -60,9 +60,7 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
     return mesh
 
 
-def sampled(
-    parts: list[Mesh], count: int = 150_000, noise_m: float = 0.01, strays: float = 0.01, seed: int = 1
-) -> np.ndarray:
+def sampled(parts, count=150000, noise_m=0.01, strays=0.01, seed=1):
     """Points [n, 3] spread evenly over all surfaces, with noise across them, and strays all over the room."""
     rng = np.random.default_rng(seed)
     mesh = joined(parts)
@@ -82,9 +80,7 @@ def scene_file(folder: Path, parts: list[Mesh]) -> Path:
     return folder / "room.xml"
 
 
-def write_las(
-    file: Path, points: np.ndarray, scale: float = 1e-3, vlrs: Any = (), mark: Any = None, **version: Any
-) -> Path:
+def write_las(file, points, scale=0.001, vlrs=(), mark=None, **version):
     """Points in steps of a scale, with records on their coordinates; ``mark`` sets their classes and flags."""
     header = laspy.LasHeader(**({"point_format": 0, "version": "1.2"} | version))
     header.scales, header.offsets = np.full(3, scale), np.floor(points.min(axis=0))

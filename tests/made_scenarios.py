@@ -1,7 +1,5 @@
 """Scenarios of DeepMIMO 4 made of random paths, and the package's own channels of them."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -69,9 +67,7 @@ def matrices(rng: np.random.Generator, users: int, paths: int, station: np.ndarr
     return {key: values.astype(np.float32) for key, values in made.items()}
 
 
-def write_scenario(
-    folder: Path, stations: int = 1, users: tuple[int, ...] = (10,), paths: int = 5, suffix: str = ".npz"
-) -> Path:
+def write_scenario(folder, stations=1, users=(10,), paths=5, suffix=".npz"):
     """A scenario of base stations with the same sets of users."""
     rng = np.random.default_rng(7)
     folder.mkdir(parents=True)

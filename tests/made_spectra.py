@@ -1,7 +1,5 @@
 """Small spectra made by a field of known parameters: what training is tested on."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -46,14 +44,12 @@ def true_field(model: str, count: int = 8, seed: int = 0, width: int = WIDTH) ->
     return field, params
 
 
-def spectra_predictor(field: Any, params: Any, receivers: Any, height: int, width: int, operator: bool = False) -> Any:
+def spectra_predictor(field, params, receivers, height, width, operator=False):
     """Predictor of spectra of an image size by a field alone, with the papers' receiver."""
     return Predictor(Graph(field, receivers, ObservationSpec(PIXEL, (height, width))), params, operator)
 
 
-def spectra(
-    model: str = "wrf-gs+", rows: int = 24, receivers: int = 1, size: tuple[int, int] = SIZE, **field: Any
-) -> tuple[Record, Any, dict[str, np.ndarray]]:
+def spectra(model="wrf-gs+", rows=24, receivers=1, size=SIZE, **field):
     """A record of ``rows`` transmitters within a cube of 2 m, and the field and parameters that made it.
 
     Signals are scaled such that the largest grey is one. The last fifth of the rows is the official test set, and

@@ -1,7 +1,5 @@
 """A view of everything, made by hand: every layer, with names that contain markup."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A made building, walked several times by phones of different offsets."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wrf_mi.core import Receiver, Record

@@ -1,7 +1,5 @@
 """Signal strengths at receivers in buildings of many rooms, whose walls each take some decibels."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -27,9 +27,7 @@ def positions(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng([seed, 1]).uniform(-0.2, 0.2, (count, 3)) * [1, 1, 0.35]
 
 
-def signals(
-    tx_pos_m: np.ndarray, towards: np.ndarray, elements_m: np.ndarray = ELEMENTS_M, seed: int = 0, count: int = 40
-) -> np.ndarray:
+def signals(tx_pos_m, towards, elements_m=ELEMENTS_M, seed=0, count=40):
     """Element signals [n, m] of waves of random directions and complex amplitudes, without the line of sight's phase.
     They leave at most `CONE_DEG` from ``towards``, the direction of the receiver.
     """

@@ -1,7 +1,5 @@
 """Pages in a browser: Chromium without a window, driven by Playwright."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Programs that some tests need, which ``.ci/test_programs.sh`` installs."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Short fits of few Gaussians to the spectra of `made_spectra`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Examples in the docstrings of the public names run and print what they state."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 

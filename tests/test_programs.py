@@ -5,9 +5,7 @@ from programs import installed
 
 
 @pytest.mark.parametrize(("ci", "outcome"), [("true", pytest.fail.Exception), ("", pytest.skip.Exception)])
-def test_missing_program_fails_in_continuous_integration_alone(
-    monkeypatch: pytest.MonkeyPatch, ci: str, outcome: type[BaseException]
-) -> None:
+def test_missing_program_fails_in_continuous_integration_alone(monkeypatch, ci, outcome):
     monkeypatch.setenv("CI", ci)
     with pytest.raises(outcome, match=r"none of no-such-program is installed; install it: \.ci/test_programs\.sh"):
         installed("no-such-program")

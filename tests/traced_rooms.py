@@ -1,7 +1,5 @@
 """Small scenes of sheets for the tests of the tracer."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,14 +1,12 @@
 """What tests let workers compute, and a scheduler that loses one of its workers half-way."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from wrf_mi.core import InputError
 from wrf_mi.parallel import Scheduler
@@ -84,7 +82,7 @@ class Lossy:
         assert sorted(map(int, counts)) == list(range(self.parts))
         assert counts[str(self.parts // 2)] == 2
 
-    def __enter__(self) -> Lossy:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: Any) -> None:

@@ -1,7 +1,5 @@
 """Times on a GPU and on the CPU: the jobs of both, and the refusal without a GPU."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

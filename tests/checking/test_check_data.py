@@ -100,18 +100,6 @@ def test_suspicions_have_names_and_can_be_ignored():
     assert re.findall(r"^\| `([a-z-]+)` \|", section, re.MULTILINE) == list(SUSPICIONS)
 
 
-def test_data_sets_that_do_not_exist_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setenv("WRF_MI_DATA", str(tmp_path / "nothing"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "nothing"))
-    for name, message in (
-        ("nowhere", "data set 'nowhere': neither a folder nor known"),
-        (tmp_path / "nowhere", "no such folder"),
-        ("rfid-lab", "not on this machine; run `wrf-mi data fetch rfid-lab`"),
-    ):
-        with pytest.raises(InputError, match=message):
-            check_data(name)
-
-
 def odd_records() -> dict[str, Record]:
     """Records at the edges of what readers give."""
     rng = np.random.default_rng(0)

@@ -1,7 +1,5 @@
 """``wrf-mi data check`` and ``data import``: lines, JSON and exit statuses, and public data sets by single commands."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -68,6 +66,7 @@ def test_data_sets_that_do_not_exist(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("WRF_MI_DATA", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     command.refused(["data", "check", "nowhere"], "neither a folder nor known")
+    command.refused(["data", "check", tmp_path / "nowhere"], "no such folder")
     command.refused(["data", "check", "rfid-lab"], "wrf-mi data fetch rfid-lab")
     (tmp_path / "empty").mkdir()
     status, out, _ = command(["data", "check", tmp_path / "empty"])
@@ -90,9 +89,7 @@ def importing(tmp_path: Path) -> list[object]:
     return ["data", "import", tmp_path / "drive.csv", "--out", tmp_path / "campus"]
 
 
-def test_import_states_columns_assumptions_and_the_next_command(
-    importing: list[object], tmp_path: Path, command: Command
-) -> None:
+def test_import_states_columns_assumptions_and_the_next_command(importing, tmp_path, command):
     folder = tmp_path / "campus"
     status, out, err = command(importing)
     assert (status, err) == (0, "")

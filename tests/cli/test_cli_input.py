@@ -1,7 +1,5 @@
 """Bad input to the command: exit status 2, one line that says what is wrong, nothing half written."""
 
-from __future__ import annotations
-
 import errno
 import re
 import subprocess
@@ -46,9 +44,7 @@ def test_unknown_arguments_name_the_help_of_their_command(words: str, asked: str
     command.refused(words.split(), f"^{asked}: unrecognized arguments: .*; see {asked} --help$")
 
 
-def test_bad_data_and_folders_are_refused(
-    folder: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
-) -> None:
+def test_bad_data_and_folders_are_refused(folder, run, tmp_path, monkeypatch, command):
     monkeypatch.setenv("WRF_MI_DATA", str(tmp_path / "nothing"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "nothing"))
     file, empty, out = tmp_path / "file", tmp_path / "empty", tmp_path / "out"
@@ -123,9 +119,7 @@ def test_bad_positions_are_refused(name: str, run: Path, tmp_path: Path, command
         (OSError("a damaged\nfile"), "a damaged file"),
     ],
 )
-def test_system_errors_are_one_line_with_a_remedy(
-    error: OSError, line: str, monkeypatch: pytest.MonkeyPatch, command: Command
-) -> None:
+def test_system_errors_are_one_line_with_a_remedy(error, line, monkeypatch, command):
     def fails(_: object) -> int:
         raise error
 

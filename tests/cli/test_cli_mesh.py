@@ -1,7 +1,5 @@
 """The command ``wrf-mi mesh``: from points, plans and meshes to a folder that the other commands open."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -50,9 +48,7 @@ def test_registration_moves_the_scene(tmp_path: Path, command: Command) -> None:
         ("millimetres.xyz --out scene", "--units mm"),
     ],
 )
-def test_bad_input_is_one_line_and_nothing_is_written(
-    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
-) -> None:
+def test_bad_input_is_one_line_and_nothing_is_written(words, message, tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     Path("plan.csv").write_text("x,y\n0,0\n5,0\n5,4\n0,4\n0,0\n")
     Path("materials.yml").write_text("rules: {wall: itu_cheese}\n")

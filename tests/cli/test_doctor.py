@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -195,9 +193,7 @@ def test_a_named_library_is_not_replaced(system: System, monkeypatch: pytest.Mon
     assert system.calls() == []
 
 
-def test_command_prints_the_report_and_the_error_of_an_installation(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_prints_the_report_and_the_error_of_an_installation(monkeypatch, capsys):
     assert main(["doctor", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ok"]
 

@@ -1,13 +1,11 @@
 """Options that are wrong, or that change nothing beside the others: refused in one line, or named in a warning."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from commands import Command, positions_file
+from commands import positions_file
 from made_channels import channels
 
 from wrf_mi.datasets import write_nerf2_csi
@@ -118,9 +116,7 @@ def data_sets(folder: Path, flat_folder: Path, tmp_path_factory: pytest.TempPath
 
 
 @pytest.mark.parametrize(("data", "words", "message"), REFUSED)
-def test_options_that_are_wrong_or_without_effect_are_refused(
-    data: str, words: str, message: str, data_sets: dict[str, Path], room: Path, tmp_path: Path, command: Command
-) -> None:
+def test_options_that_are_wrong_or_without_effect_are_refused(data, words, message, data_sets, room, tmp_path, command):
     verb, *options = words.format(room=room).split()
     command.refused([verb, data_sets[data], *options, "--out", tmp_path / "out"], message)
     assert not (tmp_path / "out").exists()
@@ -159,9 +155,7 @@ def test_seed_of_a_trace_without_rays_is_that_of_a_drawn_split(flat_folder: Path
     plan_run(flat_folder, RunRequest("ray-tracing", scene=room, seed=3, settings=settings, split="random"))
 
 
-def test_other_commands_refuse_or_name_options_without_effect(
-    flat_folder: Path, room: Path, tmp_path: Path, command: Command, caplog: Any
-) -> None:
+def test_other_commands_refuse_or_name_options_without_effect(flat_folder, room, tmp_path, command, caplog):
     run = train(flat_folder, "kriging", out=tmp_path / "run", settings=("generic=true",)).folder
     positions = positions_file(tmp_path / "positions.csv", [[1, 1, 1]])
     predict = ["predict", run, "--tx", positions, "--out", tmp_path / "new.csv"]

@@ -1,7 +1,5 @@
 """Dataclasses in files of arrays."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass

@@ -1,7 +1,5 @@
 """Damaged and hostile files of every reader: refused in one line, or read as finite numbers, in 3 GiB."""
 
-from __future__ import annotations
-
 import io
 import re
 import resource

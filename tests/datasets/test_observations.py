@@ -131,9 +131,7 @@ def silent(flat_folder: Path) -> Record:
 
 
 @pytest.mark.parametrize("model", ["ray-tracing", "kriging", "mri"])
-def test_a_gateway_without_training_rows_is_left_out_where_asked(
-    model: str, silent: Record, room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_gateway_without_training_rows_is_left_out_where_asked(model, silent, room, tmp_path, caplog):
     settings, scene = (DIRECT, room) if model == "ray-tracing" else ((), None)
     left_out, alone = (
         train(data, model, out=tmp_path / name, scene=scene, settings=settings, min_rows=2)
@@ -159,9 +157,7 @@ def test_data_without_a_received_training_row_are_refused_first(silent: Record, 
 
 
 @pytest.mark.parametrize("split", ["official", "blocked"])
-def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(
-    split: str, flat_folder: Path, room: Path, tmp_path: Path
-) -> None:
+def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(split, flat_folder, room, tmp_path):
     """It is known only from the paths."""
     nothing = TraceOptions(line_of_sight=False, reflection=False, transmission=True, depth=1)
     (tmp_path / "run").mkdir()
@@ -170,9 +166,7 @@ def test_a_gateway_that_no_path_reaches_leaves_nothing_behind(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_fold_that_is_refused_leaves_the_paths_of_fitted_folds(
-    flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fold_that_is_refused_leaves_the_paths_of_fitted_folds(flat_folder, room, tmp_path, monkeypatch):
     def refused_later(*values: Any) -> Any:
         if (tmp_path / "run" / "fold0" / "model.npz").exists():
             raise InputError("a fault; a remedy")

@@ -1,7 +1,5 @@
 """Splatting against the oracle, its invariances and gradients, and the kernels of a loop of gradient descent."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

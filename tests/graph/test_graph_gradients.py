@@ -1,7 +1,6 @@
 """Gradients of Gaussians and paths in one graph by every kind of parameter, against differences in float64."""
 
 from fnmatch import fnmatchcase
-from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -40,7 +39,6 @@ MODELS = {
 }
 
 
-Both = tuple[TracedField, WrfGsPlus, dict[str, Any]]
 KINDS = (
     *("material.*.permittivity", "material.*.conductivity", "plane.shift", "plane.tilt", "receiver.array.gain"),
     *("receiver.array.position", "receiver.array.turn", "receiver.array.pattern", "pattern.transmitter"),

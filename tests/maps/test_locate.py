@@ -1,7 +1,5 @@
 """Positions of transmitters from signal strengths."""
 
-from __future__ import annotations
-
 import errno
 import re
 from pathlib import Path
@@ -241,9 +239,7 @@ def test_offset_of_the_power_widens_regions(fitted: tuple[Path, Record]) -> None
         ("rssi_0,rssi_1,rssi_2\n", "no rows below the header"),
     ],
 )
-def test_bad_observations_are_refused_in_one_line(
-    fitted: tuple[Path, Record], tmp_path: Path, text: str, words: str, command: Command
-) -> None:
+def test_bad_observations_are_refused_in_one_line(fitted, tmp_path, text, words, command):
     file = tmp_path / "in.csv"
     file.write_text(text)
     message = f"{re.escape(str(file))}.*{re.escape(words)}"

@@ -1,7 +1,5 @@
 """Positions of transmitters and maps by runs that trace a scene: what is traced, fitted, reported and left behind."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -114,9 +112,7 @@ def test_no_stage_is_fitted_anew_to_choose_the_likelihood(anew: Run, monkeypatch
     assert locate(anew, observed_of(anew), step_m=STEP_M).calibration.rows > 0
 
 
-def test_estimates_of_chunks_are_those_of_predictions_one_by_one(
-    anew: Run, traced: list, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_estimates_of_chunks_are_those_of_predictions_one_by_one(anew, traced, monkeypatch):
     monkeypatch.setattr(locate_calibration, "TOGETHER", 7)
     observed = observed_of(anew)
     located = locate(anew, observed, step_m=STEP_M)

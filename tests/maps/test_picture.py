@@ -1,7 +1,5 @@
 """Pictures of maps by the command: spectra, channels, several carriers, surfaces."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -72,9 +70,7 @@ def heading(figure: Figure) -> str:
     return " ".join(figure.get_suptitle().split())
 
 
-def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
-    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(tmp_path, command, monkeypatch):
     data = write_spectrum_folder(tmp_path / "data", wave_record(receivers=1))
     dataset, figure, run = mapped(data, tmp_path, command, "--threshold", "-10")
     assert dataset["power_dbm"].attrs["units"] == "dB"
@@ -103,9 +99,7 @@ def test_picture_of_spectra_states_a_relative_level_and_thins_training_rows(
         assert shown == {"trained": trained, "other": len(split.test)}
 
 
-def test_picture_leaves_estimated_receivers_far_outside_out(
-    two_bands: Record, tmp_path: Path, command: Command
-) -> None:
+def test_picture_leaves_estimated_receivers_far_outside_out(two_bands, tmp_path, command):
     """Their cross or ellipse would shrink the map to a dot."""
     data = write_ble_folder(tmp_path / "data", two_bands)
     dataset, near, run = mapped(data, tmp_path, command, "--frequency", BANDS_HZ[1])
@@ -171,9 +165,7 @@ def test_picture_of_a_carrier_has_the_rows_of_that_carrier(two_bands: Record, tm
     assert "no measured row at this carrier" in heading(between)
 
 
-def test_picture_of_a_surface_shows_the_mesh(
-    flat_folder: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_picture_of_a_surface_shows_the_mesh(flat_folder, tmp_path, command, monkeypatch):
     trimesh.creation.box((2.0, 1.0, 0.5)).export(tmp_path / "table.ply")
     more = ("--surface", tmp_path / "table.ply", "--receiver", "anchor1")
     dataset, figure, run = mapped(flat_folder, tmp_path, command, *more)

@@ -1,7 +1,5 @@
 """Planned measurements: farthest positions, walls, files and refusals."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path
@@ -83,9 +81,7 @@ def test_positions_are_half_a_metre_from_walls_of_the_scene(flat_folder: Path, r
     assert plan_figure(planned, in_scene).axes
 
 
-def test_command_writes_positions_and_a_picture(
-    run: wrf_mi.Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_positions_and_a_picture(run, tmp_path, capsys):
     (tmp_path / "able.csv").write_text("x,y,z\n1,1,1.3\n4,3,1.3\n8,3,1.3\n")
     out = tmp_path / "plan.csv"
     call = ["plan", str(run.folder), "--candidates", str(tmp_path / "able.csv"), "--out", str(out)]

@@ -1,7 +1,5 @@
 """Positions of maps: grids, and the faces of meshes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

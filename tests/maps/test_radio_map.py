@@ -1,7 +1,5 @@
 """Radio maps: closed forms, files that other readers open, chunks, sides and paths, coverage, what is refused."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any
@@ -118,9 +116,7 @@ def test_table_has_a_row_for_each_receiver_and_position(mapped: xr.Dataset, tmp_
     assert set(table["best_receiver"]) == {"hall $_$", "kitchen"}
 
 
-def test_chunks_and_choices_of_receivers_do_not_change_values(
-    law: Run, mapped: xr.Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_and_choices_of_receivers_do_not_change_values(law, mapped, monkeypatch):
     given: dict[str, Any] = {"step_m": 0.5, "transmit_dbm": TRANSMIT_DBM, "threshold_dbm": -32.0}
     kitchen = radio_map(law, receivers=["kitchen"], **given)
     np.testing.assert_array_equal(kitchen["power_dbm"][0], mapped["power_dbm"][1])
@@ -187,9 +183,7 @@ def test_traced_paths_have_statistics_and_solids_are_left_out(traced: Run) -> No
     assert "power_std_db" not in parts
 
 
-def test_map_outside_of_a_closed_room_is_refused_and_outside_of_the_data_told(
-    traced: Run, law: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_map_outside_of_a_closed_room_is_refused_and_outside_of_the_data_told(traced, law, tmp_path, caplog):
     bounds = traced.problem.opened_scene.mi_scene.bbox()
     low, high = float(bounds.min.z), float(bounds.max.z)
     for height in (high + 2, low - 0.5, high + 0.01):
@@ -210,9 +204,7 @@ def test_map_outside_of_a_closed_room_is_refused_and_outside_of_the_data_told(
     assert "height 5 m: the data's transmitters were at 1.30 to 1.30 m, so values are extrapolated" in caplog.text
 
 
-def test_map_above_a_scene_without_a_ceiling_is_told(
-    room: tuple[Path, Record], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_map_above_a_scene_without_a_ceiling_is_told(room, tmp_path, caplog):
     _, record = room
     parts = {name: part for name, part in SHOEBOX.items() if name != "ceiling"}
     known: dict[str, Any] = {"scene": write_xml(tmp_path / "open", parts), "settings": ["depth=0"]}
@@ -301,9 +293,7 @@ def test_bad_input_is_one_line(law: Run, tmp_path: Path, command: Command) -> No
     ("suffix", "package"),
     [(".nc", "xarray"), (".nc", "h5netcdf"), (".nc", "h5py"), (".zarr", "zarr"), (".csv", "pandas")],
 )
-def test_missing_package_is_named(
-    suffix: str, package: str, mapped: xr.Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_package_is_named(suffix, package, mapped, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(InputError, match=rf"need {package}: pip install '\.\[maps\]'"):
         write_map(mapped, tmp_path / f"map{suffix}")

@@ -1,7 +1,5 @@
 """Stated settings hold, whatever a fit chooses for others, or are refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re
@@ -237,9 +235,7 @@ def test_accepted_setting_changes_the_fit(model: str, name: str, tmp_path: Any) 
     [{"shadow_m": 2.0}, {"shadow_m": 10.0, "shadow_db": 5.0}, {"noise_db": 2.8}, dict.fromkeys(NOISE, 1.0)],
 )
 @pytest.mark.parametrize("extent_m", [6.0, 200.0])
-def test_stated_hyperparameters_hold_beside_those_that_are_chosen(
-    stated: dict[str, float], extent_m: float, tmp_path: Any
-) -> None:
+def test_stated_hyperparameters_hold_beside_those_that_are_chosen(stated, extent_m, tmp_path):
     record, likely = strengths(extent_m), {"shadowing": "likelihood"}
     run = train(record, "kriging", settings=stated | likely, out=tmp_path / "run", split="official")
     fitted = run.metrics["fitted"]

@@ -1,7 +1,5 @@
 """Parts on workers: order, what is opened once, lost workers, errors, what is refused."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal
@@ -15,7 +13,7 @@ from typing import Any
 
 import pytest
 import worker_tasks
-from commands import Command, positions_file
+from commands import positions_file
 from worker_tasks import Lossy
 
 from wrf_mi.backend import init
@@ -37,9 +35,7 @@ def test_parts_cover_all_rows_once(count: int, workers: int, least: int, most: i
     assert all(least <= size <= most for size in sizes[:-1])
 
 
-def test_a_folder_with_the_name_of_the_package_does_not_hide_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_with_the_name_of_the_package_does_not_hide_it(tmp_path, monkeypatch):
     """As where the project is cloned."""
     (tmp_path / "wrf_mi").mkdir()
     monkeypatch.chdir(tmp_path)
@@ -70,9 +66,7 @@ def test_scheduler_without_workers_computes_in_this_process() -> None:
     assert received == [(0, 6), (1, 2)]
 
 
-def test_workers_adopt_folder_variables_and_backend_and_open_once(
-    two: Scheduler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_workers_adopt_folder_variables_and_backend_and_open_once(two, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WRF_MI_DATA", "elsewhere")
     found = two.map(worker_tasks.place_of, range(12), partial(worker_tasks.opened, tmp_path))
@@ -103,9 +97,7 @@ def test_errors_of_parts_are_raised_unchanged(two: Scheduler) -> None:
     assert two.map(worker_tasks.refuse_negative, [4]) == [4]
 
 
-def test_other_versions_and_folders_are_refused(
-    two: Scheduler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_versions_and_folders_are_refused(two, tmp_path, monkeypatch):
     environment = worker_environment()
     monkeypatch.chdir(tmp_path)  # is put back after the worker's own change of folder
     other = WorkerEnvironment(environment.folder, (), environment.backend, (("drjit", "0.1"),))
@@ -116,9 +108,7 @@ def test_other_versions_and_folders_are_refused(
         worker.run_part(gone, "", None, worker_tasks.double, 1)
 
 
-def test_invalid_scheduler_ends_with_one_line(
-    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_invalid_scheduler_ends_with_one_line(tmp_path, command, monkeypatch):
     monkeypatch.setattr(scheduler, "CONNECT_S", 0.2)
     positions = positions_file(tmp_path / "tx.csv", [[1, 1, 1]])
     words = ["predict", tmp_path, "--tx", positions, "--out", tmp_path / "p.npz", "--scheduler"]

@@ -1,7 +1,5 @@
 """`predict` and `trace` on two workers of which one is lost: the same files as of one process."""
 
-from __future__ import annotations
-
 import re
 from contextlib import nullcontext
 from pathlib import Path
@@ -11,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 import xarray
-from commands import Command, arrays_in
+from commands import arrays_in
 from made_flat import write_flat
 from made_waves import wave_record
 from small_fits import official, settings
@@ -77,9 +75,7 @@ def assert_close(one: Arrays, other: Arrays, *keys: str) -> None:
 
 
 @pytest.mark.parametrize("model", ["wrf-gs+", "wrf-gs"])
-def test_parallel_prediction_of_a_field_equals_serial(
-    model: str, two_gateways: Record, two: Scheduler, tmp_path: Path
-) -> None:
+def test_parallel_prediction_of_a_field_equals_serial(model, two_gateways, two, tmp_path):
     """One is splatted; the other is a product of matrices."""
     folder = write_spectrum_folder(tmp_path / "made-here", two_gateways, bits=16)
     record, fit = load(folder), settings("steps=4", model=model)
@@ -108,9 +104,7 @@ def test_parallel_trace_and_its_prediction_equal_serial(flat: Path, room: Path, 
 
 
 @pytest.mark.slow
-def test_parallel_trace_of_random_paths_equals_serial(
-    flat: Path, room: Path, two: Scheduler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parallel_trace_of_random_paths_equals_serial(flat, room, two, tmp_path, monkeypatch):
     """Diffuse reflections and diffraction, both searched for from transmitters."""
     monkeypatch.setattr(ray_tracing, "TRACED_AT_LEAST", 4)  # one part for each worker
     for kind, code in (("scattering", 2), ("diffraction", 8)):
@@ -139,9 +133,7 @@ def test_parallel_prediction_of_kriging_equals_serial(flat: Path, two: Scheduler
             xarray.testing.assert_allclose(alone, spread)
 
 
-def test_errors_of_parts_name_the_row_of_the_whole_input(
-    flat: Path, two: Scheduler, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_errors_of_parts_name_the_row_of_the_whole_input(flat, two, tmp_path, command, monkeypatch):
     """A cabinet stands where the last transmitter is."""
     box = trimesh.creation.box((0.3, 0.3, 0.3))
     box.apply_translation((50.0, 50.0, 1.0))
@@ -162,17 +154,8 @@ def test_errors_of_parts_name_the_row_of_the_whole_input(
     assert status == 0
     assert re.fullmatch("predicting: 3 of 3, [12] workers?", err.splitlines()[-1])
     assert out.startswith("3 predictions: ")
-    traced_again = [
-        "trace",
-        flat,
-        "--scene",
-        tmp_path / "box.ply",
-        "--material",
-        "concrete",
-        "--paths",
-        "line-of-sight",
-    ]
-    status, _, err = command([*traced_again, "--out", tmp_path / "again", "--scheduler", "local"])
+    scene = ["--scene", tmp_path / "box.ply", "--material", "concrete", "--paths", "line-of-sight"]
+    status, _, err = command(["trace", flat, *scene, "--out", tmp_path / "again", "--scheduler", "local"])
     assert status == 0
     assert re.fullmatch("tracing: 8 of 8, [12] workers?", err.splitlines()[-1])
     assert_same_bits(arrays_in(run / "predictions.npz"), arrays_in(tmp_path / "again" / "predictions.npz"))

@@ -202,14 +202,6 @@ def test_rows_of_the_sphere():
     np.testing.assert_allclose(np.degrees(azimuth[3]), 10 * np.arange(36), atol=1e-6)
 
 
-def test_crop_is_part_of_the_film():
-    crop = {"crop_width": 10, "crop_height": 4, "crop_offset_x": 7, "crop_offset_y": 3}
-    sensor = mi.load_dict(plane(9, 36, crop))
-    expected = pixel_directions(9, 36)[3:7, 7:17]
-    np.testing.assert_allclose(rays(sensor, 4, 10), expected @ RECEIVER.to_world.T, atol=FLOAT32)
-    np.testing.assert_allclose(np.array(sensor.crop_directions(), float).T.reshape(4, 10, 3), expected, atol=FLOAT32)
-
-
 def test_parameters():
     """What ``mi.traverse`` lists, and that a new pose and a new size are taken over, with derivatives."""
     sensor = mi.load_dict(plane())

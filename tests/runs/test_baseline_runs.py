@@ -1,7 +1,5 @@
 """Runs of baselines: what is in their folders, the command, folds, resuming, and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -118,9 +116,7 @@ def assert_same_model(whole: Path, resumed: Path) -> None:
             np.testing.assert_array_equal(found[key], expected[key], err_msg=key)
 
 
-def test_sweep_and_comparison_show_baselines_and_the_reference(
-    flat_folder: Path, run: Path, tmp_path: Path, command: Command
-) -> None:
+def test_sweep_and_comparison_show_baselines_and_the_reference(flat_folder, run, tmp_path, command):
     """The sweep starts a process for its run."""
     out = tmp_path / "sweep"
     (row,) = command.json(["sweep", flat_folder, "--vary", "model=idw", "--out", out])
@@ -134,9 +130,7 @@ def test_sweep_and_comparison_show_baselines_and_the_reference(
     assert not (tmp_path / "no").exists()
 
 
-def test_damaged_runs_are_refused(
-    run: Path, tmp_path: Path, command: Command, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_runs_are_refused(run, tmp_path, command, capsys):
     damaged = copied(run, tmp_path / "run")
     damaged_models_refused(damaged, "models/1/law", capsys)
     (damaged / "model.npz").unlink()

@@ -1,7 +1,5 @@
 """The comparison of runs, on run folders made here."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -1,7 +1,5 @@
 """The page of a comparison: differences on common rows, what sorts, commands that repeat the runs."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

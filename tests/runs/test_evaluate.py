@@ -1,7 +1,5 @@
 """Scores of signal strengths and channels: metrics, predictions, pooling, and gains over a constant prediction."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable
@@ -11,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import SET
 from commands import Command
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -297,21 +294,6 @@ def test_a_gain_counts_beyond_its_standard_error(task: str, gain: float, seed: i
     assert block["beaten"] == (block["gain"] > max(block["gain_error"], 0.01) and better)
 
 
-@pytest.mark.parametrize("task", ["rssi", "csi", "spectrum"])
-def test_a_prediction_as_good_as_the_constant_does_not_beat_it(task: str) -> None:
-    scores = np.random.default_rng(0).uniform(0, 1, (1, 20))
-    sign = 1 if TASKS[task].higher_is_better else -1
-    for gain in (0.0, 1e-4):
-        assert not against(TASKS[task], scores + sign * gain, scores)["beaten"]
-
-
-def test_folds_are_scored_together() -> None:
-    record = building()
-    for split in make_splits(record, "blocked"):
-        metrics, _ = evaluate(record, split, lambda rows, receiver: record.observation[receiver, rows])
-        assert metrics[CONSTANT]["beaten"]
-
-
 def test_constant_of_smallest_rmse_is_the_mean_of_each_receiver() -> None:
     record = building()
     (split,) = make_splits(record, "official")
@@ -354,7 +336,7 @@ def test_the_best_reference_is_compared_with() -> None:
     assert results.reference_name == "one path-loss law of all receivers"
 
 
-@pytest.mark.parametrize("model", ["idw", "kriging", "mri", "trees"])
+@pytest.mark.parametrize("model", ["kriging", "mri"])
 @pytest.mark.parametrize("beaten", [True, False], ids=["office", "noise"])
 def test_a_model_of_strengths_without_place_says_so(beaten: bool, model: str, tmp_path: Path, command: Command) -> None:
     record, run = building(), tmp_path / "run"
@@ -366,16 +348,13 @@ def test_a_model_of_strengths_without_place_says_so(beaten: bool, model: str, tm
     assert (LINE in command.done(["evaluate", run])) != beaten
 
 
-@pytest.mark.parametrize("model", ["wrf-gs", "wrf-gs+", "idw"])
-def test_a_model_of_channels_that_predicts_no_more_than_zero_says_so(
-    model: str, tmp_path: Path, command: Command
-) -> None:
+def test_a_model_of_channels_that_predicts_no_more_than_zero_says_so(tmp_path: Path, command: Command) -> None:
     record = channels()
     turned = np.exp(2j * np.pi * np.random.default_rng(0).random(len(record)))  # a phase that no position tells
     record = replace(record, observation=record.observation * turned[:, None, None].astype(np.complex64))
-    folder, few = write_nerf2_csi(tmp_path / "data", record), SET if model != "idw" else []
-    out = command.done(["train", folder, "--model", model, "--out", tmp_path / "run", *few])
-    assert f"{model} {LINE}zero: CEA (dB), median " in out
+    folder = write_nerf2_csi(tmp_path / "data", record)
+    out = command.done(["train", folder, "--model", "idw", "--out", tmp_path / "run"])
+    assert f"idw {LINE}zero: CEA (dB), median " in out
 
 
 def test_a_run_of_an_earlier_version_has_no_such_line() -> None:

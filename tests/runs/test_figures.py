@@ -1,7 +1,5 @@
 """Footprints drawn on the sky."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from matplotlib.figure import Figure

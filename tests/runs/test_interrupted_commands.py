@@ -1,7 +1,5 @@
 """Trainings that end at a change of files and go on: killed, on a full disk, without permission, by Ctrl-C twice."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -72,9 +70,7 @@ def results(run: Path) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of files that a killed process leaves open
 @pytest.mark.parametrize("model", ["kriging", "wrf-gs+"])
-def test_training_goes_on_after_a_fault_with_equal_results(
-    model: str, folder: Path, flat_folder: Path, changes: Changes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_training_goes_on_after_a_fault_with_equal_results(model, folder, flat_folder, changes, tmp_path, capsys):
     data, more = (flat_folder, []) if model == "kriging" else (folder, [*SET, "--set", "checkpoint_every=2"])
     fit, out = ["train", data, "--model", model, "--deterministic", *more, "--out"], tmp_path / "run"
     changes.folder, changes.number, changes.fault = str(tmp_path), 0, lambda number: None

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import wrf_mi
+from wrf_mi.runs.api import plan_run
+from wrf_mi.runs.folder import RunRequest
 
 
 def test_a_run_without_a_folder_lives_as_long_as_its_object(flat_folder):
@@ -57,12 +59,12 @@ def test_settings_by_name_and_presets(flat_folder):
     nested = wrf_mi.train(flat_folder, "wrf-gs+", settings={"steps": 3, "initial": {"gaussians": 5}})
     texts = wrf_mi.train(flat_folder, "wrf-gs+", settings=["steps=3", "initial.gaussians=5"])
     assert nested.config.settings == texts.config.settings
-    fast = wrf_mi.train(flat_folder, preset="fast")
-    assert "field" not in fast.config.settings.stages
+    _, fast, _ = plan_run(flat_folder, RunRequest(preset="fast"))
+    assert "field" not in fast.settings.stages
     with pytest.raises(wrf_mi.InputError, match=r"idw .* has no presets"):
         wrf_mi.train(flat_folder, "idw", preset="fast")
     with pytest.raises(wrf_mi.InputError, match="give one of both"):
-        wrf_mi.train(flat_folder, preset="fast", settings=fast.config.settings)
+        wrf_mi.train(flat_folder, preset="fast", settings=fast.settings)
 
 
 def test_what_is_refused_leaves_no_temporary_folder(flat_folder, tmp_path, monkeypatch):

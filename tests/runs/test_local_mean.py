@@ -1,7 +1,5 @@
 """Scores of local mean powers over some wavelengths."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Predictions of trained fields by operator: those of splatting, stored with the run, built anew when they must be."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Predictions of other programs: scored and compared like runs of this package, and refused in one line."""
 
-from __future__ import annotations
-
 import shlex
 from html import unescape
 from pathlib import Path
@@ -122,9 +120,7 @@ def damaged(**changes: Any) -> Any:
         (lambda a: a | {"receiver_name": np.array(["a", "b"])}, "receivers a, b"),
     ],
 )
-def test_unusable_predictions_are_refused_in_one_line(
-    change: Any, message: str, flat: tuple[Record, Path], tmp_path: Path
-) -> None:
+def test_unusable_predictions_are_refused_in_one_line(change, message, flat, tmp_path):
     record, run = flat
     np.savez(tmp_path / "bad.npz", **change(predicted(run)))
     with pytest.raises(InputError, match=message) as refused:
@@ -133,9 +129,7 @@ def test_unusable_predictions_are_refused_in_one_line(
     assert not (tmp_path / "run").exists()
 
 
-def test_command_scores_and_refuses(
-    flat: tuple[Record, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_scores_and_refuses(flat, tmp_path, capsys):
     record, run = flat
     call = ["evaluate", "--predictions", str(run / "predictions.npz"), "--dataset", str(record.source)]
     assert main([*call, "--name", "mine", "--out", str(tmp_path / "run")]) == 0

@@ -1,8 +1,5 @@
 """Outputs in the form of NeRF2's and WRF-GS+'s test scripts, made here as their code writes them."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -62,9 +59,7 @@ def plots(spectra: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_plots_are_read_as_the_spectra_drawn(
-    spectra: Record, plots: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_plots_are_read_as_the_spectra_drawn(spectra, plots, tmp_path, caplog):
     run = score_predictions(spectra, plots, tmp_path / "run", "theirs")
     rows, prediction = stored(run)
     error = prediction - minmax_scale(spectra.observation[0, rows - 1])
@@ -73,9 +68,7 @@ def test_plots_are_read_as_the_spectra_drawn(
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_grey_pictures_are_numbered_like_plots_or_named_like_the_data(
-    first: int, spectra: Record, tmp_path: Path
-) -> None:
+def test_grey_pictures_are_numbered_like_plots_or_named_like_the_data(first, spectra, tmp_path):
     folder = tmp_path / "grey"
     folder.mkdir()
     grey = np.round(255 * spectra.observation[0] * 0.9).astype(np.uint8)
@@ -133,9 +126,7 @@ def test_channels_are_read(tmp_path: Path) -> None:
         (lambda folder: recolour(folder / "3.png"), "colours of neither viridis nor jet"),
     ],
 )
-def test_unusable_pictures_are_refused(
-    damage: Callable[[Path], Any], message: str, spectra: Record, plots: Path, tmp_path: Path
-) -> None:
+def test_unusable_pictures_are_refused(damage, message, spectra, plots, tmp_path):
     folder = tmp_path / "copied"
     folder.mkdir()
     for file in plots.iterdir():

@@ -1,7 +1,5 @@
 """Run folders under faults: locks, damaged files, leftovers of killed processes, and chunks of predictions."""
 
-from __future__ import annotations
-
 import gc
 import re
 from collections.abc import Callable
@@ -70,9 +68,7 @@ def test_the_lock_of_a_process_that_was_killed_at_the_end_of_a_run_is_removed(kr
         assert (run / LOCK).exists()
 
 
-def test_a_run_that_ctrl_c_ends_before_its_configuration_is_begun_again(
-    flat_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_ctrl_c_ends_before_its_configuration_is_begun_again(flat_folder, tmp_path, monkeypatch):
     def pressed(*arguments: object) -> None:
         raise KeyboardInterrupt
 
@@ -131,9 +127,7 @@ def test_arrays_that_are_not_finite_are_refused(name: str, tmp_path: Path) -> No
     ],
     ids=["changed", "not finite"],
 )
-def test_a_run_whose_arrays_were_changed_is_not_opened(
-    factor: float, checksum: bool, message: str, kriging: Path, tmp_path: Path, command: Command
-) -> None:
+def test_a_run_whose_arrays_were_changed_is_not_opened(factor, checksum, message, kriging, tmp_path, command):
     file = copied(kriging, tmp_path / "run") / "model.npz"
     arrays: dict[str, Any] = stored_arrays(file) if checksum else arrays_in(file)
     name = next(key for key in arrays if key.endswith("weights"))
@@ -181,9 +175,7 @@ def test_too_many_gaussians_are_refused_at_once(folder: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("largest", [3, 100], ids=["several", "rest at once"])
-def test_chunks_give_the_predictions_of_all_at_once(
-    largest: int, kriging: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_give_the_predictions_of_all_at_once(largest, kriging, tmp_path, monkeypatch):
     positions = np.random.default_rng(0).uniform(0, 3, (7, 3))
     whole = open_run(kriging).predict(positions, 1).mean
     monkeypatch.setattr(run_module, "PREDICTED_PER_CHUNK", 2)

@@ -1,7 +1,5 @@
 """Run folders: whole runs, stopped and resumed ones, damaged ones, and their scores."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -18,7 +16,7 @@ from small_fits import official, settings, stop_after
 
 from wrf_mi.apps.commands.main import main
 from wrf_mi.backend import set_threads
-from wrf_mi.core import InputError, Record, Split
+from wrf_mi.core import InputError, Record
 from wrf_mi.datasets import load, load_split, make_splits, save_split, write_spectrum_folder
 from wrf_mi.runs.api import Interrupted, Run, evaluate_run, open_run, resume, train
 from wrf_mi.runs.folder import FORMAT
@@ -143,9 +141,7 @@ def test_killed_run_goes_on_from_its_last_checkpoint(folder: Path, whole: Path, 
     assert_same_arrays(arrays_of(killed), arrays_of(whole))
 
 
-def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(
-    folder: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(folder, whole, tmp_path, monkeypatch):
     """The loss of one row is NaN; with finite losses the resumed run equals an uninterrupted run."""
     paper = Spectrum.loss
 
@@ -350,16 +346,6 @@ def test_folders_with_content_are_refused(folder: Path, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="exists and is not empty"):
             train(folder, "wrf-gs+", out=out, settings=settings("steps=5"), split=split)
     assert contents(run) == {"mine.txt"}
-
-
-def test_custom_split_is_trained(one_gateway: Record, tmp_path: Path) -> None:
-    """A record in memory and a split by hand, without validation rows."""
-    split = Split("mine", 0, np.arange(10), np.arange(0), np.arange(20, 24))
-    run = train(one_gateway, "wrf-gs+", out=tmp_path / "run", settings=settings("steps=5"), split=split)
-    assert (run.metrics["split"], run.metrics["n_train"], run.metrics["n_test"]) == ("mine", 10, 4)
-    # Standard JSON knows no NaN.
-    for name in ("log.jsonl", "metrics.json"):
-        assert "NaN" not in (run.folder / name).read_text()
 
 
 def test_positions_where_predictions_are_wanted_are_kept_with_the_split(flat_folder: Path, tmp_path: Path) -> None:

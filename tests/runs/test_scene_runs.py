@@ -1,11 +1,7 @@
 """Runs in scenes: Gaussians trained jointly with traced paths, and predictions in edited scenes."""
 
-from __future__ import annotations
-
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -115,9 +111,7 @@ def median(run: Path) -> float:
     return float(json.loads((run / "metrics.json").read_text())["ssim"]["median"])
 
 
-def test_joint_training_predicts_better_than_paths_or_gaussians_alone(
-    rooms: dict[str, Path], data: Path, run: Path, tmp_path: Path, command: Command
-) -> None:
+def test_joint_training_predicts_better_than_paths_or_gaussians_alone(rooms, data, run, tmp_path, command):
     train(str(data), "wrf-gs+", out=tmp_path / "field", settings=config(with_scene=False))
     command.done(
         ["trace", data, "--scene", rooms["known"], "--depth", "1", "--rays", "4096", "--out", tmp_path / "traced"]
@@ -155,14 +149,6 @@ def test_resumed_run_is_bit_identical(fit: Fit, run: Path, tmp_path: Path) -> No
         np.testing.assert_array_equal(whole[key], resumed[key], err_msg=key)
 
 
-def test_receivers_poses_are_trained_where_a_rate_is_given(fit: Fit, tmp_path: Path) -> None:
-    rates = ("traced.position=0.001", "traced.turn=0.001", "traced.pattern_degree=1")
-    params = fit(tmp_path / "run", "steps=20", *rates, "receiver=pixel").field.params
-    for name in ("receiver.gateway1.position", "receiver.gateway1.turn", "receiver.gateway1.pattern"):
-        assert np.abs(params[name]).max() > 0, name
-    assert np.abs(params["pattern.transmitter"]).max() > 0
-
-
 def test_run_that_validated_no_step_opens_with_an_infinite_reach(fit: Fit, tmp_path: Path) -> None:
     run = fit(tmp_path / "run", "steps=20", "validate_every=1000", "patience=0", "optimiser.warm_up=5")
     assert np.isinf(run.field.reach.length_m)
@@ -189,11 +175,6 @@ def test_a_scene_needs_array_and_carrier(rooms: dict[str, Path], data: Path) -> 
     scene = open_scene(rooms["known"], HZ)
     with pytest.raises(InputError, match="a scene needs the antenna array and the carrier"):
         Trainer(record, make_splits(record, "official")[0], config(), scene=scene)
-
-
-def test_fields_alone_import_no_tracer() -> None:
-    code = "import sys, wrf_mi.training.trainer; sys.exit(any(name.startswith('sionna') for name in sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 CARRIER_HZ = np.array([920e6])
@@ -236,10 +217,8 @@ def spectra(scene: Path) -> tuple[Record, Split]:
     return replace(record, observation=record.observation.astype(np.float32)), split
 
 
-@pytest.mark.parametrize("model", ["ray-tracing", "wrf-gs+", "hybrid"])
-def test_predictions_in_a_copy_of_the_scene_are_equal_and_in_an_edited_one_are_not(
-    model: str, scene: Path, spectra: tuple[Record, Split], tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("model", ["ray-tracing", "hybrid"])
+def test_predictions_in_a_copy_of_the_scene_are_equal_and_in_an_edited_one_are_not(model, scene, spectra, tmp_path):
     record, split = spectra
     run = wrf_mi.train(record, model, scene, split=split, settings=QUICK[model])
     shutil.copytree(scene, tmp_path / "copy")
@@ -307,17 +286,19 @@ def test_gaussians_on_surfaces_move_with_these_and_go_with_them(scene: Path, tmp
     np.testing.assert_allclose(np.abs(result[DISC][3:, 1] @ normal), 1, atol=EXACT_M)
 
 
-def test_command_predicts_in_the_edited_scene_and_refuses_others(
-    scene: Path, spectra: tuple[Record, Split], tmp_path: Path, command: Command
-) -> None:
+def test_command_predicts_in_the_edited_scene_and_refuses_others(scene, spectra, tmp_path, command):
     record, split = spectra
     data = write_spectrum_folder(tmp_path / "data", replace(record, official=(split.train, split.test)))
     run = wrf_mi.train(str(data), "wrf-gs+", scene, settings=QUICK["wrf-gs+"], out=tmp_path / "run")
+    shutil.copytree(scene, tmp_path / "copy")
+    before = run.predict(TX[:2]).mean
+    np.testing.assert_array_equal(run.in_scene(tmp_path / "copy").predict(TX[:2]).mean, before)
     edited, tx = edit_scene(scene, tmp_path / "edited", MOVES), positions_file(tmp_path / "tx.csv", TX[:2])
     predict = ["predict", run.folder, "--tx", tx, "--out", tmp_path / "out.npz", "--scene"]
     command.done([*predict, edited])
     want = wrf_mi.open_run(run.folder, scene=edited).predict(TX[:2]).mean
     np.testing.assert_allclose(np.load(tmp_path / "out.npz")["prediction"], want, atol=ROUNDED)
+    assert np.abs(want - before).max() > ROUNDED
     command.refused([*predict, "laboratory"], f"not one of the scene of the fit; edit that scene; trained in {scene}")
     idw = wrf_mi.train(record, "idw", split=split)
     with pytest.raises(wrf_mi.InputError, match="its predictions use no scene"):

@@ -1,7 +1,5 @@
 """A sweep: which runs, their names and table, going on, a lost worker, what is refused, and digests of its data."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -18,7 +16,7 @@ import numpy as np
 import psutil
 import pytest
 from calling import SET
-from commands import Command, rows_of
+from commands import rows_of
 
 from wrf_mi.apps.commands.main import build_parser, main
 from wrf_mi.apps.commands.train import TRACING, training_names, training_request
@@ -104,9 +102,7 @@ ACTIONS = [
 
 
 @pytest.mark.parametrize("action", ACTIONS, ids=lambda action: action.dest)
-def test_each_run_has_every_option_of_the_sweep(
-    action: argparse.Action, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_run_has_every_option_of_the_sweep(action, tmp_path, monkeypatch):
     """Options that a sweep shares with train are those of its runs, alone and varied."""
     planned: list[Sweep] = []
 
@@ -134,9 +130,7 @@ def test_each_run_has_every_option_of_the_sweep(
     assert training_request(plain) != training_request(optioned)
 
 
-def test_bad_input_is_refused_before_anything_starts(
-    folder: Path, flat_folder: Path, tmp_path: Path, command: Command
-) -> None:
+def test_bad_input_is_refused_before_anything_starts(folder, flat_folder, tmp_path, command):
     out = tmp_path / "sweep"
     for data, varied, message in (
         (folder, "seed=0,x", "--seed: invalid int value: 'x'"),
@@ -192,9 +186,7 @@ def test_table_contains_the_scores_of_the_runs(swept: Path) -> None:
 
 
 @pytest.mark.slow
-def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
-    folder: Path, swept: Path, tmp_path: Path, command: Command
-) -> None:
+def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(folder, swept, tmp_path, command):
     """The command on two workers, one of which is killed while it trains."""
     out, killed = tmp_path / "sweep", list[int]()
 
@@ -232,9 +224,7 @@ def test_lost_worker_loses_no_run_and_results_are_those_of_one_process(
         assert steps == [2, 4]
 
 
-def test_finished_runs_are_kept_and_others_done_again(
-    folder: Path, swept: Path, tmp_path: Path, command: Command
-) -> None:
+def test_finished_runs_are_kept_and_others_done_again(folder, swept, tmp_path, command):
     out = shutil.copytree(swept, tmp_path / "sweep")
     for file in ("metrics.json", "predictions.npz"):  # as if stopped while it was scored
         (out / NAMES[0] / file).unlink()
@@ -279,9 +269,7 @@ def test_sweep_refuses_other_data_and_versions(folder: Path, tmp_path: Path, mon
         again()
 
 
-def test_failed_run_is_reported_and_the_others_go_on(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
-) -> None:
+def test_failed_run_is_reported_and_the_others_go_on(folder, tmp_path, monkeypatch, command):
     plan = plan_sweep(tmp_path / "sweep", ["seed=0,1"], {"dataset": str(folder)})
     seen = []
 

@@ -1,7 +1,5 @@
 """The ray-tracing baseline as a run folder: scores, offsets, saved paths, prediction, the command."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -76,9 +74,7 @@ def test_line_of_sight_in_a_room_is_free_space_with_one_offset_each(record: Reco
     np.testing.assert_allclose(tracer(record.tx_pos_m[:4]), loss[:, :4], atol=FLOAT32_DB)
 
 
-def test_evaluation_reproduces_the_scores_from_stored_paths(
-    record: Record, run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluation_reproduces_the_scores_from_stored_paths(record, run, capsys):
     scored_again_as_before(run, capsys)
     assert evaluate_run(run, "trajectory")["split"] == "trajectory (rows unseen by official)"
     assert json.loads((run / "metrics.json").read_text())["split"] == "official"
@@ -87,9 +83,7 @@ def test_evaluation_reproduces_the_scores_from_stored_paths(
     assert (stored.paths.n_rx, stored.options) == (len(record.receivers), DIRECT)
 
 
-def test_calibration_takes_the_seed_of_rows_and_of_training(
-    flat_folder: Path, room: Path, tmp_path: Path, command: Command
-) -> None:
+def test_calibration_takes_the_seed_of_rows_and_of_training(flat_folder, room, tmp_path, command):
     paths = ["--paths", "line-of-sight", "--depth", "0", "--calibrate", "gain", "--set", "steps=2"]
     asked = ["train", flat_folder, "--model", "ray-tracing", "--scene", room, *paths, "--seed", "2"]
     assert command.json([*asked, "--out", tmp_path / "run"])["seed"] == 2
@@ -109,9 +103,7 @@ def test_calibrated_run_reproduces_its_predictions_from_positions_and_headings(
     assert not np.allclose(arrays_in(tmp_path / "turned.npz")["prediction"], read.prediction, atol=0.1)
 
 
-def test_headings_are_refused_where_unused_and_required_where_used(
-    record: Record, run: Path, calibrated: Path, tmp_path: Path, command: Command
-) -> None:
+def test_headings_are_refused_where_unused_and_required_where_used(record, run, calibrated, tmp_path, command):
     for folder, heading, message in (
         (calibrated, None, "the model needs headings; give heading_rad"),
         (run, np.zeros(6), "does not know how the transmitter is turned; omit heading_rad"),
@@ -123,9 +115,7 @@ def test_headings_are_refused_where_unused_and_required_where_used(
         predict_to_file(calibrated, record.tx_pos_m[:6], tmp_path / "p.npz", np.zeros(5))
 
 
-def test_calibrated_run_of_data_without_headings_predicts_without(
-    record: Record, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_calibrated_run_of_data_without_headings_predicts_without(record, room, tmp_path, monkeypatch):
     """The pattern is fitted in the world frame."""
     unturned = replace(record, tx_heading_rad=None)
     monkeypatch.setattr("wrf_mi.synthetic.load_record", lambda name: unturned)
@@ -156,9 +146,7 @@ def test_calibrated_planes_are_stored_as_a_scene(flat_folder: Path, room: Path, 
     traced(flat_folder, run / "corrected", tmp_path / "traced")
 
 
-def test_number_of_rays_is_searched_once_for_a_run(
-    flat_folder: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_number_of_rays_is_searched_once_for_a_run(flat_folder, room, tmp_path, monkeypatch):
     """Timed samples, evaluation and predictions at new positions use the stored number."""
     calls, converged = [], solve.converged_rays
 
@@ -174,9 +162,7 @@ def test_number_of_rays_is_searched_once_for_a_run(
     assert len(calls) == 1
 
 
-def test_command_traces_predicts_and_compares(
-    flat_folder: Path, room: Path, record: Record, run: Path, tmp_path: Path, command: Command
-) -> None:
+def test_command_traces_and_predicts(flat_folder, room, record, run, tmp_path, command):
     out = tmp_path / "run"
     asked = ["--paths", "line-of-sight, reflection", "--depth", "1", "--rays", "1000", "--seed", "3"]
     metrics = command.json(["trace", flat_folder, "--scene", room, "--out", out, *asked])
@@ -186,21 +172,15 @@ def test_command_traces_predicts_and_compares(
     predicted = command.predicted(out, positions_file(tmp_path / "tx.csv", record.tx_pos_m[read.row]))
     assert predicted["prediction"] == pytest.approx(read.prediction, abs=FLOAT32_DB)
     assert predicted["receiver_name"].tolist() == ["anchor1", "anchor2"]
-    page = compare([run, out], tmp_path / "compare").read_text()
-    assert all(name in page for name in (run.name, out.name, "idw"))
 
 
-def test_train_and_trace_give_equal_scores(
-    flat_folder: Path, room: Path, run: Path, tmp_path: Path, command: Command
-) -> None:
+def test_train_and_trace_give_equal_scores(flat_folder, room, run, tmp_path, command):
     named = ["train", flat_folder, "--model", "ray-tracing", "--out", tmp_path / "run", "--scene", room]
     metrics = command.json([*named, "--paths", "line-of-sight", "--depth", "0"])
     assert metrics["abs_error_db"] == read_run(run).metrics["abs_error_db"]
 
 
-def test_comparison_shows_the_scene_while_it_exists(
-    flat_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_comparison_shows_the_scene_while_it_exists(flat_folder, tmp_path, capsys):
     scene = make_scene(flat_folder / "layout.csv", tmp_path / "scene", height_m=2.7).folder
     run = traced(flat_folder, scene, tmp_path / "run")
     assert "Mesh, traced paths" in compare([run], tmp_path / "with").read_text()
@@ -230,9 +210,7 @@ def test_kinds_of_path_are_switched_one_by_one() -> None:
     assert options == TraceOptions(line_of_sight=False, reflection=False, transmission=True, diffraction=True)
 
 
-def test_reflections_bound_the_paths_of_the_command(
-    flat_folder: Path, room: Path, tmp_path: Path, command: Command
-) -> None:
+def test_reflections_bound_the_paths_of_the_command(flat_folder, room, tmp_path, command):
     for bound in (0, 1):
         out = tmp_path / str(bound)
         limits = ["--depth", "2", "--reflections", bound, *(["--rays", "1024"] if bound else [])]
@@ -240,9 +218,7 @@ def test_reflections_bound_the_paths_of_the_command(
         assert (load_trace(out / "paths.npz").paths.interactions == 1).sum(axis=1).max() == bound
 
 
-def test_walls_that_nothing_passes_are_suspected(
-    flat_folder: Path, room: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_walls_that_nothing_passes_are_suspected(flat_folder, room, tmp_path, caplog):
     """A wall through the room hides half of it; the log names the setting, unless it is given or nothing is hidden."""
     (tmp_path / "walls.csv").write_text("x,y\n0,0\n2.5,0\n2.5,4\n2.5,0\n5,0\n5,4\n0,4\n0,0\n")
     divided = make_scene(tmp_path / "walls.csv", tmp_path / "divided", height_m=2.7).folder
@@ -253,9 +229,7 @@ def test_walls_that_nothing_passes_are_suspected(
         assert ("transmission=true" in caplog.text) == (name == "off")
 
 
-def test_calibrated_strength_without_a_path_is_that_of_the_weakest_training_row(
-    record: Record, calibrated: Path
-) -> None:
+def test_calibrated_strength_without_a_path_is_that_of_the_weakest_training_row(record, calibrated):
     """Below the floor, which nothing passes here."""
     assert record.official is not None
     below = record.tx_pos_m[:2] - np.array([0, 0, 9.0])

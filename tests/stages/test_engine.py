@@ -162,9 +162,7 @@ def test_few_rows_keep_the_defaults_and_say_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("level", "trusted", "taken"), [(-52.0, True, "first"), (-90.0, True, "right"), (-52.0, False, "right")]
 )
-def test_few_rows_doubt_options_beside_a_trusted_default(
-    level: float, trusted: bool, taken: str, tmp_path: Path
-) -> None:
+def test_few_rows_doubt_options_beside_a_trusted_default(level, trusted, taken, tmp_path):
     engine = engine_of(tmp_path, [Levels([("first", level, 0), ("right", -50.2, 0)], [], trusted)], rows=20)
     engine.fit()
     assert engine.unseen is not None

@@ -48,9 +48,7 @@ def flat(flat_folder: Path) -> tuple[Problem, Split]:
     return Problem(record, None), make_splits(record, "official")[0]
 
 
-def mixture_of(
-    flat: tuple[Problem, Split], weights: Mixture, parts: dict[str, Fitted], *deviations: str
-) -> FittedMixture:
+def mixture_of(flat, weights, parts, *deviations):
     problem, split = flat
     intervals = Intervals(np.ones(1), np.ones(1), np.zeros(1), np.full(1, FACTOR))
     return FittedMixture("made", problem, split.all_train, parts, weights, None, intervals, deviations, {})
@@ -98,9 +96,7 @@ def fit_of(names: Sequence[str], flat: tuple[Problem, Split], folder: Path) -> M
     return fit
 
 
-def test_fit_of_parts_with_and_without_deviations_states_those_of_the_former(
-    flat: tuple[Problem, Split], tmp_path: Path
-) -> None:
+def test_fit_of_parts_with_and_without_deviations_states_those_of_the_former(flat, tmp_path):
     fit = fit_of(["kriging", "idw"], flat, tmp_path)
     assert fit.rows is not None
     count = len(fit.rows.held_out)
@@ -119,9 +115,7 @@ def test_fit_of_parts_with_and_without_deviations_states_those_of_the_former(
     assert np.ptp(alone.predict(inputs, 0).stated_std) < 1e-6
 
 
-def test_rows_are_held_out_once_in_a_fit(
-    flat: tuple[Problem, Split], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_are_held_out_once_in_a_fit(flat, tmp_path, monkeypatch):
     """By the mixture, and for the choices of the kriging in it; the fit without these rows holds out others."""
     splits = list[Split]()
 

@@ -1,7 +1,5 @@
 """Short fits to strengths and channels of any level: predictions follow the transmitter, and are no constant."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from made_spectra import RECEIVERS, SIZE, small_field, spectra, spectra_predictor, true_field
 from small_fits import official, settings, stop_after
 
-from wrf_mi.backend.device import to_float
 from wrf_mi.core import InputError, Split
 from wrf_mi.core.settings import with_settings
 from wrf_mi.estimators.interpolation.idw import InverseDistance
@@ -131,10 +130,9 @@ def test_gradient_that_is_nan_leaves_parameters_unchanged_and_raises_before_the_
     assert not trainer.state.view_gradient_norm.numpy().any()
 
 
-@pytest.mark.parametrize("model", FIELDS)
-def test_parameters_that_are_nan_are_named(model, one_gateway):
+def test_parameters_that_are_nan_are_named(one_gateway):
     """In each group, at the first step; a Gaussian without a place or shape is not seen, and the loss stays finite."""
-    trainer = trainer_of(one_gateway, "steps=5", model=model)
+    trainer = trainer_of(one_gateway, "steps=5")
     good = trainer.state.params()
     names = (*trainer.field.per_gaussian, next(n for n in good if n.endswith(".bias")))
     for k, name in enumerate(names):
@@ -181,14 +179,6 @@ def test_garbage_collector_is_off_during_recording(one_gateway):
         gc.callbacks.remove(watch)
     assert len(seen) > 100
     assert not any(seen)
-
-
-def test_device_arrays_do_not_share_memory_with_numpy():
-    """What is wrapped instead of copied changes with its source."""
-    values = np.arange(6, dtype=np.float32)
-    own = to_float(values)
-    values[:] = 7
-    np.testing.assert_array_equal(own.numpy(), np.arange(6))
 
 
 def test_field_initial_values_and_loss_can_be_replaced(one_gateway):
@@ -241,12 +231,11 @@ def test_gaussians_start_on_a_point_cloud(one_gateway, tmp_path):
     np.testing.assert_allclose(1 / (1 + np.exp(-params["opacity"])), 0.3, rtol=1e-6)
 
 
-@pytest.mark.parametrize("model", FIELDS)
-def test_non_finite_parameter_group_is_named(model, one_gateway):
+def test_non_finite_parameter_group_is_named(one_gateway):
     """The loss is finite; one group's gradient alone is not, from the third step on."""
-    trainer = trainer_of(one_gateway, "steps=20", "log_every=20", model=model)
+    trainer = trainer_of(one_gateway, "steps=20", "log_every=20")
     trainer.run(stop=stop_after(2))
-    name = "position" if model == "factorised" else next(n for n in trainer.state.params() if n.endswith(".bias"))
+    name = next(n for n in trainer.state.params() if n.endswith(".bias"))
     _break_gradient_of(trainer, name)
     before = trainer.state.params(), trainer.state.mean_params()
     with pytest.raises(NumericsError, match=f"^step 3: not finite: {name};"):
@@ -276,14 +265,6 @@ def test_squares_of_gradients_that_overflow_are_reported(one_gateway):
     with pytest.raises(NumericsError, match=r"^step 1: not finite: .*signal"):
         trainer.run()
     assert not any(m.any() for group in trainer.state.moments()[:2] for m in group.values())
-
-
-def test_checkpoints_hold_finite_values_only(one_gateway):
-    saved, own = [], ("steps=30", "checkpoint_every=3", "log_every=30", "validate_every=30")
-    trainer = trainer_of(one_gateway, *own, "optimiser.network=1e38", "optimiser.warm_up=0")
-    with pytest.raises(NumericsError, match=r"step [0-9]+: "):
-        trainer.run(save=lambda: saved.append(trainer.state.params()))
-    assert all(np.isfinite(values).all() for params in saved for values in params.values())
 
 
 SHORT = ("steps=25", "log_every=25", "validate_every=25", "checkpoint_every=6", "optimiser.warm_up=0")
@@ -397,7 +378,7 @@ def recover(model, steps, rows, **size):
     return before, score(), float(np.median(ssim(blend, truth)))
 
 
-@pytest.mark.parametrize(("model", "steps"), [("wrf-gs", 500), ("wrf-gs+", 1200)])
+@pytest.mark.parametrize(("model", "steps"), [("wrf-gs", 500), pytest.param("wrf-gs+", 1200, marks=pytest.mark.slow)])
 def test_field_is_recovered_from_its_spectra(model, steps):
     """The parameters are recovered where interpolation of spectra does not suffice."""
     before, after, blend = recover(model, steps=steps, rows=94)

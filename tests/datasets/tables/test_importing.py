@@ -228,9 +228,7 @@ def test_sectors_keep_orientation_antenna_and_carrier(tmp_path: Path) -> None:
     refusal(imported, tmp_path, wide(), message, anchors=tmp_path / "anchors.csv")
 
 
-def test_picture_names_receivers_at_known_and_at_unknown_places(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_picture_names_receivers_at_known_and_at_unknown_places(tmp_path, monkeypatch):
     figures = list[Figure]()
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     (tmp_path / "aps.csv").write_text("id,x,y,z\nkitchen,1,1,2.5\n7,1,7,2.5\n")

@@ -1,7 +1,5 @@
 """The number of neighbours of inverse-distance weighting, chosen on held-out training rows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

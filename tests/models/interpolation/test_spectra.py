@@ -31,7 +31,7 @@ from wrf_mi.estimators.model import Inputs, Session
 from wrf_mi.models import MODELS, Problem
 from wrf_mi.receivers import retrieve
 from wrf_mi.tasks.scores import inside_interval, ssim
-from wrf_mi.training.session import OnProgress, quiet
+from wrf_mi.training.session import quiet
 
 RECEIVER_M = np.array([3.0, 1.0, -0.5])
 UP_M = np.array([0.0, 0.0, 4.0])
@@ -42,9 +42,7 @@ KRIGING = MODELS["kriging"].serving("spectrum", False)
 SINGLE = 2e-5  # observations are float32 and of size one; weights of some tens of rows go with them
 
 
-def fit(
-    record: Record, rows: np.ndarray, settings: SpectrumKrigingSettings = QUICK, on_progress: OnProgress = quiet
-) -> ByReceiver:
+def fit(record, rows, settings=QUICK, on_progress=quiet):
     """The model ``kriging`` of some rows."""
     split = Split("rows", 0, rows, rows[:0], rows)
     fitted: Any = KRIGING.fit(Problem(record, settings), split, Session(None, None, on_progress))

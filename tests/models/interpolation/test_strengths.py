@@ -114,9 +114,7 @@ def test_reweighting_is_robust_to_outliers() -> None:
     assert abs(robust) < 0.3
 
 
-def test_predictions_and_refits_use_one_blas_thread(
-    turning: tuple[Record, Strengths], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_predictions_and_refits_use_one_blas_thread(turning, monkeypatch):
     """Threads that wait for each other by spinning took a hundred times as long where another process was busy."""
     record, fitted = turning
     counts: list[int] = []
