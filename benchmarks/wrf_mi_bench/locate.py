@@ -16,7 +16,7 @@ import numpy as np
 
 from wrf_mi.apps.maps.locate import locate
 from wrf_mi.apps.maps.locate_file import test_observations
-from wrf_mi.apps.maps.locate_likelihood import COUNTS, METRICS, Neighbours
+from wrf_mi.apps.maps.locate_neighbours import COUNTS, METRICS, Neighbours
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.folder import METRICS as FINISHED
