@@ -105,6 +105,7 @@ def test_reception_is_shifted_where_own_readings_lack_weak_signals(loses_weak: b
     assert set(block["runs"]) == {"g", "h"}
     assert block["runs"]["h"]["received"] == pytest.approx(received.mean())
     assert block["runs"]["h"]["log_loss"] == pytest.approx(losses[0], rel=1e-4)
+    assert sum(count for *_, count in block["runs"]["h"]["bins"]) == received.size
     held_out = run.metrics["sensitivity"]["held_out"]
     assert held_out["mixture"]["log_loss"] < held_out["rate"]["log_loss"]
 

@@ -40,9 +40,7 @@ def reception_block(arrays: Mapping[str, Any]) -> dict[str, Any]:
     Where test rows are of several runs of the measurement, ``runs`` has the same scores of each.
     """
     known = np.isfinite(arrays[RECEPTION])
-    received = np.isfinite(arrays["truth"])
-    bins = calibration_bins(arrays[RECEPTION][known].astype(float), received[known])
-    block = _scores(arrays, known) | {"bins": [list(map(float, row)) for row in zip(*bins, strict=True) if row[2]]}
+    block = _scores(arrays, known)
     runs = arrays.get(RUN, np.zeros(known.shape[1], str))
     if len(names := np.unique(runs)) > 1:
         of_runs = {str(name): known & (runs == name) for name in names}
@@ -51,9 +49,15 @@ def reception_block(arrays: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _scores(arrays: Mapping[str, Any], pairs: NDArray[np.bool_]) -> dict[str, Any]:
-    """Share of some pairs of a receiver and a row [n_rx, m] that was received, and scores of its probabilities."""
+    """Block of some pairs of a receiver and a row [n_rx, m]; see `reception_block`."""
     received = np.isfinite(arrays["truth"][pairs])
-    scores, *others = (
-        probability_scores(arrays[key][pairs].astype(float), received) for key in (RECEPTION, *REFERENCES)
-    )
-    return {"received": float(received.mean()), **scores, "reference": dict(zip(REFERENCES, others, strict=True))}
+    probability, *others = (arrays[key][pairs].astype(float) for key in (RECEPTION, *REFERENCES))
+    bins = zip(*calibration_bins(probability, received), strict=True)
+    return {
+        "received": float(received.mean()),
+        **probability_scores(probability, received),
+        "reference": {
+            key: probability_scores(values, received) for key, values in zip(REFERENCES, others, strict=True)
+        },
+        "bins": [list(map(float, row)) for row in bins if row[2]],
+    }
