@@ -1,8 +1,9 @@
 """Positions of the transmitter from signal strengths: likelihood over predictions beside k nearest neighbours.
 
-Every cell is a run of ``wrf-mi train`` on ``flat-ble``'s first run, whose second run is located. The form of the
-likelihood and k are chosen by training rows held out in space (`wrf_mi.apps.maps.locate_calibration`). Consecutive rows
-of a run share their errors, so that intervals resample stretches of the run.
+Every cell is a run of ``wrf-mi train`` on ``flat-ble``'s first run, whose second run is located, or on other measured
+sets, at whose test places or along whose test walks transmitters are located. The form of the likelihood, k and the
+mass of regions are chosen by held-out training rows (`wrf_mi.apps.maps.locate_calibration`). Consecutive rows of a run
+share their errors, so that intervals resample stretches of the run.
 """
 
 import shutil
@@ -16,7 +17,7 @@ import numpy as np
 
 from wrf_mi.apps.maps.locate import locate
 from wrf_mi.apps.maps.locate_file import test_observations
-from wrf_mi.apps.maps.locate_likelihood import COUNTS, METRICS, Neighbours
+from wrf_mi.apps.maps.locate_neighbours import COUNTS, METRICS, Neighbours
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.runs.folder import METRICS as FINISHED
@@ -24,6 +25,7 @@ from wrf_mi.runs.folder import load_rows
 from wrf_mi.tasks.scores import bootstrap
 
 from .bench import FLAT
+from .buildings import FLOOR, MALL, measured_set
 from .comparison import data_folder, kept, line, say
 from .declared import lined
 from .sources import fit_key, source_files
@@ -45,16 +47,22 @@ class Cell:
     scene: bool = True  # whether the model knows the walls
     settings: tuple[str, ...] = ()  # ``key=value`` of the model
     intervals: bool = False  # whether its standard deviations are calibrated by held-out rows, as it states none
+    dataset: str = FLAT  # measured data
 
     @property
     def name(self) -> str:
-        return f"{self.model}-{'all' if self.n_train is None else self.n_train}-seed{self.seed}"
+        name = f"{self.model}-{'all' if self.n_train is None else self.n_train}-seed{self.seed}"
+        return name if self.dataset == FLAT else f"{self.dataset}-{name}"
 
 
 HYBRID = partial(Cell, "hybrid, knows walls", "hybrid")
 KRIGING = partial(Cell, "kriging", "kriging", scene=False, intervals=True)
 SEEDS = (0, 1, 2)
-CELLS = (*(kind(ROWS, seed) for kind in (HYBRID, KRIGING) for seed in SEEDS), HYBRID(None))
+CELLS = (
+    *(kind(ROWS, seed) for kind in (HYBRID, KRIGING) for seed in SEEDS),
+    HYBRID(None),
+    *(KRIGING(None, dataset=dataset) for dataset in (FLOOR, MALL)),
+)
 
 
 def measure(cell: Cell, scene: str | None, folder: Path) -> dict[str, Any]:
@@ -63,7 +71,8 @@ def measure(cell: Cell, scene: str | None, folder: Path) -> dict[str, Any]:
         shutil.rmtree(folder, ignore_errors=True)
         more: dict[str, Any] = {"scene": scene if cell.scene else None, "settings": cell.settings}
         options: dict[str, Any] = {"n_train": cell.n_train, "seed": cell.seed, "intervals": cell.intervals}
-        train(FLAT, cell.model, out=folder, **options, **more)
+        data = FLAT if cell.dataset == FLAT else measured_set(folder.parent, cell.dataset)
+        train(data, cell.model, out=folder, **options, **more)
     run = open_run(folder)
     strengths_dbm, true_m = test_observations(run)
     located = locate(run, strengths_dbm, on_progress=_show(cell.name))
@@ -81,8 +90,13 @@ def measure(cell: Cell, scene: str | None, folder: Path) -> dict[str, Any]:
 
 
 def stretches(values: FloatArray) -> FloatArray:
-    """Means of stretches of `STRETCH` consecutive rows of values [draws, rows]; the last has up to twice as many."""
+    """Means of stretches of `STRETCH` consecutive rows of values [draws, rows]; the last has up to twice as many.
+
+    Fewer than two stretches of rows are places that were measured one by one.
+    """
     every = values.mean(axis=0)
+    if len(every) < 2 * STRETCH:
+        return np.asarray(every)
     return np.array([part.mean() for part in np.split(every, range(STRETCH, len(every) - STRETCH + 1, STRETCH))])
 
 
@@ -111,7 +125,8 @@ def row_of(cell: Cell, draws: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "radius_m": float(np.median(of("radius_m"))),
     }
     which = f"seed {cell.seed}" if len(draws) == 1 else f"{len(draws)} {POOLED}"
-    what = f"{'all' if cell.n_train is None else cell.n_train} rows, {cell.title}, {which}"
+    data = "" if cell.dataset == FLAT else f"{cell.dataset}, "
+    what = f"{data}{'all' if cell.n_train is None else cell.n_train} rows, {cell.title}, {which}"
     value = f"error {figures['median_m']:.2f} m (mean {figures['mean_m']:.2f}), kNN "
     value += f"{figures['neighbours_median_m']:.2f} m (mean {figures['neighbours_mean_m']:.2f}), "
     value += f"{inside[0]:.0%} inside"
@@ -174,6 +189,6 @@ table = lined(
     "| {what} | **{median_m:.2f}** ({mean_m:.2f}) | {neighbours_median_m:.2f} ({neighbours_mean_m:.2f}) "
     "| {gain_m[0]:.2f} ({gain_m[1]:.2f} to {gain_m[2]:.2f}) | {inside[0]:.0%} ({inside[1]:.0%} to {inside[2]:.0%}) "
     "| {radius_m:.1f} |",
-    lambda row: row if row["what"].endswith(POOLED) or row["what"].startswith("all") else None,
+    lambda row: row if row["what"].endswith(POOLED) or "all rows" in row["what"] else None,
 )
 """Pooled draws: error, gain over nearest neighbours with its 95 % interval, and regions."""

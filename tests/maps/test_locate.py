@@ -19,10 +19,11 @@ from sklearn.neighbors import KNeighborsRegressor
 from wrf_mi.apps.maps import locate_calibration
 from wrf_mi.apps.maps.grid import Candidates, candidates_of, grid_over
 from wrf_mi.apps.maps.locate import locate
-from wrf_mi.apps.maps.locate_calibration import FILE, Located, choose, fit_silence, widest
+from wrf_mi.apps.maps.locate_calibration import FILE, Located, choose, fit_silence, folds_of, widest
 from wrf_mi.apps.maps.locate_file import read_observations
-from wrf_mi.apps.maps.locate_likelihood import Likelihood, Neighbours, Silence, densest, region_of
-from wrf_mi.core import InputError, Receiver, Record
+from wrf_mi.apps.maps.locate_likelihood import Likelihood, Silence, densest, mass_of, ranks_of, region_of
+from wrf_mi.apps.maps.locate_neighbours import Neighbours
+from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.datasets import write_ble_folder
 from wrf_mi.runs.api import train
 
@@ -124,7 +125,7 @@ def test_receivers_that_received_nothing_count_where_strength_decides_reception(
     places = candidates.positions_m[truth[keep]]
     record = record_of(places, value[:, keep], len(places) - 1)
     rows = np.array_split(np.arange(len(places)), 3)
-    parts = [Located(predicted, np.arange(3), part, candidates.nearest(places[part])) for part in rows]
+    parts = [Located(predicted, np.arange(3), part, candidates.nearest(places[part]), places[part]) for part in rows]
     silence = choose(record, parts, candidates, lambda share: None).likelihood.silence
     assert silence is not None
     assert abs(silence.middle_dbm + 54) < 3
@@ -141,7 +142,7 @@ def test_probability_of_silence_is_one_half_in_the_middle() -> None:
     assert np.exp(silence.log_probability(np.array(-80.0), True)) == pytest.approx(0.5)
     total = sum(np.exp(silence.log_probability(np.array([-90.0, -70]), received)) for received in (True, False))
     np.testing.assert_allclose(total, 1, atol=ROUNDING)
-    parts = [Located(law(room(), 3.0), np.arange(3), np.arange(2), np.arange(2))]
+    parts = [Located(law(room(), 3.0), np.arange(3), np.arange(2), np.arange(2), np.zeros((2, 3)))]
     assert fit_silence(record_of(np.ones((2, 3)), np.full((3, 2), -50.0), 1), parts) is None
 
 
@@ -153,6 +154,60 @@ def test_densest_candidates_hold_the_level_and_no_fewer_do(weights: list[float],
     assert probability[inside].sum() >= level - ROUNDING
     assert probability[inside].sum() - probability[inside].min() < level + ROUNDING
     assert inside.all() or probability[inside].min() >= probability[~inside].max()
+
+
+def test_mass_of_regions_covers_where_stated_deviations_are_too_large() -> None:
+    """Deviations of twice the noise: regions of 90 % of the probability hold nearly all positions."""
+    candidates, rng, form = room(), np.random.default_rng(8), Likelihood(None)
+    predicted, ranks = law(candidates, 4.0), list[tuple[float, float]]()
+    for truth in rng.integers(len(candidates.positions_m), size=DRAWS):
+        probability = softmax(form.log(predicted[0, 0, :, truth] + rng.normal(0, 2, 3), *predicted))
+        best = region_of(probability, candidates.distance_m, 0.9)[0]
+        ranks.append(ranks_of(probability, candidates.distance_m, best, int(truth)))
+        region = densest(probability, 0.7)
+        assert region[truth] == (ranks[-1][0] < 0.7)  # a region holds the truth if it holds more than its rank
+    for by_density in np.array(ranks).T:
+        known, further = by_density[: DRAWS // 2], by_density[DRAWS // 2 :]
+        assert np.mean(further < 0.9) > 0.97
+        # The ranks of a posterior that is right join them: a little more is held than stated.
+        assert abs(np.mean(further <= mass_of(known, 0.9)) - 0.92) < COVERED
+
+
+def test_few_ranks_leave_the_mass_near_the_level() -> None:
+    assert mass_of([0.2], 0.9) == pytest.approx(0.9, abs=0.02)
+    assert mass_of(np.zeros(10_000), 0.9) == 0.0
+    assert mass_of(np.ones(10_000), 0.9) == 1.0
+    assert mass_of(np.linspace(0, 1, 99), 0.999) == 1.0
+
+
+@pytest.mark.parametrize("noise_m", [0.5, 50.0])
+def test_density_around_the_neighbours_is_used_where_it_tells_more_than_the_field(noise_m: float) -> None:
+    candidates, rng = room(), np.random.default_rng(9)
+    predicted, truth = law(candidates, 6.0), rng.integers(len(candidates.positions_m), size=120)
+    places = candidates.positions_m[truth]
+    record = record_of(places, predicted[0, 0][:, truth] + rng.normal(0, 6, (3, 120)), 119)
+    near_m = places + rng.normal(0, noise_m, places.shape)
+    parts = [Located(predicted, np.arange(3), np.arange(120), candidates.nearest(places), near_m)]
+    chosen = choose(record, parts, candidates, lambda share: None)
+    assert (chosen.spread_m is not None) == (noise_m < 1)
+    if chosen.spread_m is not None:
+        assert chosen.error_m < chosen.neighbours_error_m
+
+
+def test_stretches_of_a_path_are_held_out_where_they_are_harder_to_locate() -> None:
+    """Along the path errors are alike; another visit of the same places has others."""
+    rng, angle = np.random.default_rng(10), np.linspace(0, 20 * np.pi, 400)
+    places = np.column_stack([3 + 2 * np.cos(angle), 3 + 2 * np.sin(0.93 * angle), np.ones(400)])
+    drift = np.repeat(rng.normal(0, 8, (3, 40)), 10, axis=1)
+    everything, none = np.arange(400), np.zeros(0, np.int64)
+    split = Split("all", 0, everything, none, none)
+    folds, _, words = folds_of(record_of(places, strengths(places) + drift, 399), split)
+    assert "stretches" in words
+    held_out = [fold.test for fold in folds]
+    assert len(np.unique(np.concatenate(held_out))) == sum(map(len, held_out))  # each row once
+    order = rng.permutation(400)
+    shuffled = record_of(places[order], (strengths(places) + drift)[:, order], 399)
+    assert "far" in folds_of(shuffled, split)[2]
 
 
 def test_nearest_neighbours_are_those_of_scikit_learn() -> None:

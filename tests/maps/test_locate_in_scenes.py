@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import Command
-from scipy.special import softmax
 from traced_rooms import LENGTH, SHOEBOX, WIDTH, receiver
 from wrf_mi_scenes.build_laboratory import sheet
 
@@ -122,7 +121,9 @@ def test_estimates_of_chunks_are_those_of_predictions_one_by_one(anew, traced, m
     predictions = [fitted.predict(Inputs(places), number) for number in range(3)]
     mean, std = (np.stack(values)[None] for values in zip(*((p.mean, p.std) for p in predictions), strict=True))
     for row, strengths in enumerate(observed.T):
-        probability = softmax(located.calibration.likelihood.log(strengths, mean, std))
+        near_m = None if located.neighbours_m is None else located.neighbours_m[row]
+        of_field = located.calibration.likelihood.log(strengths, mean, std)
+        probability = located.calibration.probabilities(of_field, near_m, located.candidates)
         np.testing.assert_allclose(located.probability[row], probability, atol=SINGLE_DB)
         expected_m = np.linalg.norm(places[:, None] - places, axis=2) @ probability
         np.testing.assert_allclose(located.tx_pos_m[row], places[expected_m.argmin()])

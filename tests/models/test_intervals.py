@@ -293,6 +293,10 @@ def test_losses_by_chance_have_the_rate_of_each_receiver(tmp_path: Path) -> None
         assert np.mean(stated) == pytest.approx(rate[receiver], abs=2 * SHARE)
     gained = run.metrics["reception"]["reference"]["reception_rate"]["log_loss"] - run.metrics["reception"]["log_loss"]
     assert gained > -SHARE  # of 60 held-out rows
+    # Neither strength nor neighbours tell of losses by chance.
+    sensitivity = run.metrics["sensitivity"]
+    assert sensitivity["weights"]["rate"] == pytest.approx(1)
+    assert set(sensitivity["held_out"]) == {"mixture", "rate", "neighbours"}
 
 
 def test_nothing_is_stated_where_everything_was_received(tmp_path: Path) -> None:

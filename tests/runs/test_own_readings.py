@@ -1,5 +1,6 @@
 """Predictions, maps and positions for a device whose own readings tell its offset."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,9 @@ from wrf_mi.core import InputError
 from wrf_mi.datasets import write_ble_folder
 from wrf_mi.runs.api import train
 from wrf_mi.runs.run import Run
+from wrf_mi.tasks.scores import probability_scores
 
-OFFSET_DB = -9.0
+OFFSET_DB, WEAK_DBM = -9.0, -68.0
 OFFSETS = dict(zip("abcdefgh", (3.0, -3.0, 2.0, -2.0, 1.0, -1.0, OFFSET_DB, OFFSET_DB), strict=True))
 
 
@@ -72,6 +74,38 @@ def test_command_reads_own_readings(run: Run, tmp_path: Path, command: Command) 
         found = np.array([[float(row["x"]), float(row["y"])] for row in rows_of(out)])
         located[name] = np.linalg.norm(found - record.tx_pos_m[test, :2], axis=1).mean()
     assert located["with"] < located["without"] + 0.5
+
+
+@pytest.mark.parametrize("loses_weak", [True, False])
+def test_reception_is_shifted_where_own_readings_lack_weak_signals(loses_weak: bool, tmp_path: Path) -> None:
+    """Phones with worse antennas lose weak signals; those that merely state less receive what others do."""
+    record = walked(OFFSETS)
+    offset_db = np.repeat(list(OFFSETS.values()), STEPS)
+    arriving_dbm = record.observation - (0 if loses_weak else offset_db)
+    lossy = replace(record, observation=np.where(arriving_dbm < WEAK_DBM, np.nan, record.observation))
+    run = train(lossy, "hybrid", split="official", out=tmp_path / "run")
+    rows, test = np.arange(6 * STEPS, 7 * STEPS, 4), np.arange(7 * STEPS, 8 * STEPS)
+    test = test[np.isfinite(lossy.observation[:, test]).any(axis=0)]  # others are in no split
+    adapted = run.with_readings(lossy.tx_pos_m[rows], lossy.observation[:, rows])
+    assert adapted.device.loses_weak == loses_weak
+    before, after = (each.predict(lossy.tx_pos_m[test]) for each in (run, adapted))
+    assert before.reception is not None
+    assert after.reception is not None
+    if not loses_weak:
+        np.testing.assert_array_equal(after.reception, before.reception)
+        return
+    assert after.reception.mean() < before.reception.mean()
+    received = np.isfinite(lossy.observation[:, test])
+    losses = [probability_scores(each.reception.ravel(), received.ravel())["log_loss"] for each in (before, after)]
+    assert losses[1] < losses[0]
+    # Scores of reception by run, and of held-out rows.
+    block = run.metrics["reception"]
+    assert set(block["runs"]) == {"g", "h"}
+    assert block["runs"]["h"]["received"] == pytest.approx(received.mean())
+    assert block["runs"]["h"]["log_loss"] == pytest.approx(losses[0], rel=1e-4)
+    assert sum(count for *_, count in block["runs"]["h"]["bins"]) == received.size
+    held_out = run.metrics["sensitivity"]["held_out"]
+    assert held_out["mixture"]["log_loss"] < held_out["rate"]["log_loss"]
 
 
 def test_readings_that_tell_nothing_are_refused(run: Run, tmp_path: Path, command: Command) -> None:

@@ -142,6 +142,12 @@ class FittedWithFew(Fitted):
             self._states_std = self.fitted.predict(inputs.rows(slice(0, 1)), 0).std is not None
         return prediction if self._states_std else Prediction(prediction.mean)
 
+    def with_reception(self, prediction: Prediction, inputs: Inputs, receiver: int) -> Prediction:
+        """As of the model; that of receivers with few rows is not stated."""
+        if receiver in self._place:
+            return self.fitted.with_reception(prediction, inputs, self._place[receiver])
+        return prediction
+
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict`."""
         if receiver in self._place:

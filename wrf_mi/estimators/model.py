@@ -158,6 +158,10 @@ class Fitted(ABC):
             InputError: inputs that it cannot predict from.
         """
 
+    def with_reception(self, prediction: Prediction, inputs: Inputs, receiver: int) -> Prediction:
+        """Strengths [m] with their probability of reception; as they are if the model states none."""
+        return prediction
+
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict`, for callers that need no standard deviations."""
         return self.predict(inputs, receiver).mean

@@ -4,6 +4,10 @@ Phones differ by decibels, and how they are held: what one receives lies above o
 readings predicts, at all receivers alike. The offset has a Student-t prior with the scale of the runs of the data: the
 device may be of another make than theirs.
 
+A weaker antenna loses weak signals, while a chip that merely states less receives what others do. Which it is, is told
+by what the device received at the places of its readings and what it did not: its probability of reception is that of
+the shifted strengths where these readings are clearly likelier by it, else that of the mean device.
+
 Source: Robinson, "That BLUP is a good thing: the estimation of random effects" (1991), Statistical Science 6(1); Lange,
 Little and Taylor, "Robust statistical modeling using the t distribution" (1989), JASA 84.
 """
@@ -18,13 +22,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Prediction, Record
 from ..core.angles import FloatArray
+from ..training.selection import improves
 from .interpolation.pooled_process import DEGREES
 from .interpolation.run_offsets import NEAR_M, RUN_SD_DB
 from .model import Arrays, Decomposition, Fitted, Inputs
+from .reception import LEAST
 
 PLACE_DB = 6.0
 """Standard deviation of the error that all readings of a place have in common, by walks of a shopping centre that were
 held out: ten readings of a place tell little more than three."""
+CLEAR = 2.0  # standard errors by which reception has to gain: consecutive readings are alike
 ROUNDS = 20  # reweightings of the prior, after which the offset changes by less than 0.05 dB
 
 
@@ -69,11 +76,13 @@ class DeviceOffset:
         mean_db: posterior mean.
         std_db: posterior standard deviation.
         readings: number of readings that tell it.
+        loses_weak: whether its reception is that of strengths with the offset, rather than that of the mean device.
     """
 
     mean_db: float
     std_db: float
     readings: int
+    loses_weak: bool = False
 
 
 def device_offset(fitted: Fitted, own: OwnReadings | None) -> DeviceOffset:
@@ -110,7 +119,31 @@ def device_offset(fitted: Fitted, own: OwnReadings | None) -> DeviceOffset:
         prior = sd_db**2 * (DEGREES + mean_db**2 / sd_db**2) / (DEGREES + 1)
         variance = 1 / (1 / max(prior, sd_db**2) + precision.sum())
         mean_db = float(variance * (precision @ residual_db))
-    return DeviceOffset(mean_db, float(np.sqrt(variance)), int(np.isfinite(own.power_dbm).sum()))
+    offset = DeviceOffset(mean_db, float(np.sqrt(variance)), int(np.isfinite(own.power_dbm).sum()))
+    return replace(offset, loses_weak=count > 0 and _loses_weak(fitted, own, offset))
+
+
+def _loses_weak(fitted: Fitted, own: OwnReadings, offset: DeviceOffset) -> bool:
+    """Whether what a device received is clearly likelier by reception of strengths with its offset."""
+    inputs = Inputs(own.tx_pos_m, runs=np.full(len(own.tx_pos_m), ""))
+    loss = np.zeros((2, len(own.tx_pos_m)))  # of the mean device and with the offset, by reading
+    for receiver, power_dbm in enumerate(own.power_dbm):
+        of_mean = fitted.predict(inputs, receiver)
+        if of_mean.reception is None:
+            continue
+        shifted = fitted.with_reception(_shifted(of_mean, offset), inputs, receiver)
+        for sums, each in zip(loss, (of_mean, shifted), strict=True):
+            probability = np.asarray(each.reception)
+            sums -= np.log(np.maximum(np.where(np.isfinite(power_dbm), probability, 1 - probability), LEAST))
+    return improves(loss[1], loss[0], higher_is_better=False, errors=CLEAR)
+
+
+def _shifted(prediction: Prediction, offset: DeviceOffset) -> Prediction:
+    """Strengths of the mean device as those of one with an offset, with its deviation in theirs."""
+    std, std_mean = (
+        None if each is None else np.hypot(each, offset.std_db) for each in (prediction.std, prediction.std_mean)
+    )
+    return replace(prediction, mean=prediction.mean + offset.mean_db, std=std, std_mean=std_mean)
 
 
 class ForDevice(Fitted):
@@ -122,7 +155,7 @@ class ForDevice(Fitted):
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Signal strengths [m] in dBm, with the deviation of the offset in theirs."""
-        return self._shifted(self.fitted.predict(self._of_mean_device(inputs), receiver))
+        return self._of_device(self.fitted.predict(self._of_mean_device(inputs), receiver), inputs, receiver)
 
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict`."""
@@ -131,7 +164,7 @@ class ForDevice(Fitted):
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
         """As of the model; the offset belongs to the prediction alone."""
         parts = self.fitted.decompose(self._of_mean_device(inputs), receiver, std)
-        return replace(parts, prediction=self._shifted(parts.prediction))
+        return replace(parts, prediction=self._of_device(parts.prediction, inputs, receiver))
 
     def tracing_once(self) -> ForDevice:
         """As of the model."""
@@ -149,9 +182,8 @@ class ForDevice(Fitted):
     def _of_mean_device(self, inputs: Inputs) -> Inputs:
         return replace(inputs, runs=np.full(len(inputs), ""))
 
-    def _shifted(self, prediction: Prediction) -> Prediction:
-        std, std_mean = (
-            None if each is None else np.hypot(each, self.offset.std_db)
-            for each in (prediction.std, prediction.std_mean)
-        )
-        return replace(prediction, mean=prediction.mean + self.offset.mean_db, std=std, std_mean=std_mean)
+    def _of_device(self, prediction: Prediction, inputs: Inputs, receiver: int) -> Prediction:
+        shifted = _shifted(prediction, self.offset)
+        if prediction.reception is None or not self.offset.loses_weak:
+            return shifted
+        return self.fitted.with_reception(shifted, inputs, receiver)

@@ -9,9 +9,10 @@ probability of reception is a mean of three, with weights by the distance to the
 - neighbours: the share of the nearest training rows that it received, weighted by inverse squared distance.
 
 Sensitivity and weights maximise the likelihood of held-out training rows, received or not, given the strengths that are
-predicted without them. The full Tobit likelihood has the density of received strengths, too: its log loss on other rows
-is higher, as models of received rows predict too high a strength where nothing is received, and the sensitivity that
-follows from the weakest received strength then overstates reception.
+predicted without them. Parts other than the rate keep their weights where these rows gain by them, each group of rows
+scored by what is fitted to the others. The full Tobit likelihood has the density of received strengths, too: its log
+loss on other rows is higher, as models of received rows predict too high a strength where nothing is received, and the
+sensitivity that follows from the weakest received strength then overstates reception.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from ..core import Prediction, Record
 from ..core.angles import FloatArray
 from ..core.stored import NOT_STORED
 from ..core.types import IntArray
-from ..training.selection import HeldOut
+from ..tasks.scores import probability_scores
+from ..training.selection import FOLDS, HeldOut, clusters, improves
 
 PARTS = ("rate", "strength", "neighbours")  # probabilities that are mixed
 NEIGHBOURS, SOFTENING_M = 16, 0.4  # training rows of the neighbours' share, and addend of their distances, metres
@@ -187,12 +189,15 @@ class Reception:
         rows: training rows of the record [n].
         sensitivity: reception by the predicted strength.
         weights: weights of `PARTS` by the distance to the nearest training row.
+        held_out: scores of held-out pairs by the ``mixture`` fitted to other groups of rows, by the ``rate`` and by the
+            ``neighbours`` alone; None: too few pairs, or a run of an earlier version.
     """
 
     record: Record = field(metadata=NOT_STORED)
     rows: IntArray
     sensitivity: Sensitivity
     weights: Weights
+    held_out: dict[str, dict[str, float]] | None = None
 
     @cached_property
     def shares(self) -> ReceivedShares:
@@ -216,13 +221,36 @@ class Reception:
         received = ~np.isnan(record.observation[receiver, row])
         mean, std = predicted.mean.astype(float), predicted.stated_std
         shares = ReceivedShares(record, remaining)
-        sensitivity = Sensitivity.fit(mean, std, receiver, received, shares.rate)
-        parts, distance_m = np.empty((len(row), len(PARTS))), np.empty(len(row))
+        near, distance_m = np.empty(len(row)), np.empty(len(row))
         for number in np.unique(receiver):
             pairs = receiver == number
-            at = Prediction(mean[pairs], std[pairs]), record.tx_pos_m[row[pairs]], int(number)
-            parts[pairs], distance_m[pairs] = _parts(shares, sensitivity, *at)
-        return cls(record, rows, sensitivity, Weights.fit(parts, distance_m, received))
+            near[pairs], distance_m[pairs] = shares.near(record.tx_pos_m[row[pairs]], int(number))
+
+        def fitted(known: NDArray[np.bool_]) -> tuple[Sensitivity, Weights, FloatArray]:
+            """Sensitivity and weights by some pairs [q], and probabilities of all pairs by the parts [q, 3]."""
+            by_strength = Sensitivity.fit(mean[known], std[known], receiver[known], received[known], shares.rate)
+            parts = np.stack([shares.rate[receiver], by_strength(mean, std, receiver), near], axis=1)
+            return by_strength, Weights.fit(parts[known], distance_m[known], received[known]), parts
+
+        sensitivity, weights, parts = fitted(np.ones(len(row), bool))
+        scores, group = None, _groups(record, row)
+        if min(received.sum(), (~received).sum()) >= FEWEST and len(np.unique(group)) > 1:
+            crossed = np.empty(len(row))
+            for number in np.unique(group):
+                _, of_others, others = fitted(group != number)
+                crossed[group == number] = (of_others(distance_m) * others).sum(axis=1)[group == number]
+            by_name = {"mixture": crossed, "rate": parts[:, 0], "neighbours": near}
+            scores = {name: probability_scores(values, received) for name, values in by_name.items()}
+            # Receivers of one row are lost together: a row counts once.
+            _, place = np.unique(row, return_inverse=True)
+            of_mixture, of_rate = (
+                np.bincount(place, -np.log(np.clip(np.where(received, values, 1 - values), LEAST, 1)))
+                / np.bincount(place)
+                for values in (crossed, parts[:, 0])
+            )
+            if not improves(of_mixture, of_rate, higher_is_better=False):
+                weights = replace(weights, level=np.array([0, NO_WEIGHT, NO_WEIGHT]), slope=np.zeros(3))
+        return cls(record, rows, sensitivity, weights, scores)
 
     def __call__(self, prediction: Prediction, tx_pos_m: FloatArray, receiver: int) -> Prediction:
         """A receiver's predictions at positions [m, 3] in metres with their probability of reception."""
@@ -237,7 +265,18 @@ class Reception:
         # At the median distance of the held-out rows.
         weights = dict(zip(PARTS, map(float, self.weights(np.array([self.weights.scale_m]))[0]), strict=True))
         weights["distance_m"] = self.weights.scale_m
-        return {"sensitivity": {"width_db": fitted.width_db, "receivers": of_receivers, "weights": weights}}
+        facts = {"width_db": fitted.width_db, "receivers": of_receivers, "weights": weights}
+        return {"sensitivity": facts | ({} if self.held_out is None else {"held_out": self.held_out})}
+
+
+def _groups(record: Record, row: IntArray) -> IntArray:
+    """Group of each of some rows [q] that its reception is scored without, fewer than `FOLDS`: runs, or clusters."""
+    runs = np.zeros(len(row), str) if record.runs is None else record.runs[row]
+    if len(np.unique(runs)) > 1:
+        return np.asarray(np.unique(runs, return_inverse=True)[1].reshape(-1) % FOLDS)
+    places_m = record.tx_pos_m[row]
+    count = min(FOLDS, len(np.unique(places_m, axis=0)))
+    return clusters(places_m, count, np.random.default_rng(0)) if count > 1 else np.zeros(len(row), np.int64)
 
 
 def _parts(

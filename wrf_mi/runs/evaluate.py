@@ -29,7 +29,7 @@ from ..tasks import TASKS
 from ..tasks.scores import crps, inside_interval, signed_errors_db, summary
 from .baselines import COUNT, NOT_STORED, against, against_rmse, against_simple, constant_scores, evenly_spaced
 from .folder import METRICS, PREDICTIONS, RunConfig
-from .reception import reception_arrays, reception_block
+from .reception import RUN, reception_arrays, reception_block
 from .references import reference_arrays
 from .results import RECEPTION, STD_MEAN, reference_key
 
@@ -56,6 +56,7 @@ SHARED = (
     "row",
     "tx_pos",
     FREQUENCY,
+    RUN,
     "receiver_name",
     NOISE_FREE,
 )  # arrays of ``predictions.npz`` without an axis of receivers
@@ -114,6 +115,7 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         "truth": truth,
         "tx_pos": record.tx_pos_m[rows],
         **({} if record.carriers_hz is None else {FREQUENCY: record.carriers_hz[rows]}),
+        **({} if record.runs is None else {RUN: record.runs[rows]}),
         **reference_arrays(record, split),
         **constant_scores(record, split, truth),
         "receiver_name": np.asarray([r.name for r in record.receivers]),
@@ -333,6 +335,7 @@ def write_predictions(path: Path, arrays: dict[str, Any]) -> dict[str, Any]:
     """Write predictions as ``.npz``, without the first axis where there is one receiver; return the arrays.
 
     ``row`` [m] are rows from 0, ``tx_pos`` [m, 3] metres, ``frequency_hz`` [m] the carriers of rows that have several,
+    ``run`` [m] the runs of the measurement that rows are of, where the data name them,
     ``receiver_name`` [n_rx]. ``prediction`` and, if known, ``truth`` and ``reference_<name>`` are grey values in 0..1
     [n_rx, m, H, W] float32, power in dBm [n_rx, m] float32 (NaN: not received), or channel coefficients
     [n_rx, m, subcarriers] or [n_rx, m, antennas, subcarriers] complex64. ``std`` and ``std_mean``, if stated, are

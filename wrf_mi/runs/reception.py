@@ -13,6 +13,7 @@ from ..estimators.reception import ReceivedShares
 from ..tasks.scores import calibration_bins, probability_scores
 from .results import RECEPTION
 
+RUN = "run"  # array of ``predictions.npz``: names of the runs of the measurement that test rows are of [m]
 REFERENCES = ("reception_rate", "reception_neighbours")
 """Arrays of ``predictions.npz``: the share of the training rows that a receiver received, and of the nearest ones."""
 
@@ -34,16 +35,29 @@ def reception_arrays(
 
 
 def reception_block(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """Block ``reception`` of ``metrics.json``: scores, those of the references, and the reliability in bins."""
+    """Block ``reception`` of ``metrics.json``: scores, those of the references, and the reliability in bins.
+
+    Where test rows are of several runs of the measurement, ``runs`` has the same scores of each.
+    """
     known = np.isfinite(arrays[RECEPTION])
-    received = np.isfinite(arrays["truth"][known])
-    probability, *others = (arrays[key][known].astype(float) for key in (RECEPTION, *REFERENCES))
-    bins = [list(map(float, row)) for row in zip(*calibration_bins(probability, received), strict=True) if row[2]]
+    block = _scores(arrays, known)
+    runs = arrays.get(RUN, np.zeros(known.shape[1], str))
+    if len(names := np.unique(runs)) > 1:
+        of_runs = {str(name): known & (runs == name) for name in names}
+        block["runs"] = {name: _scores(arrays, pairs) for name, pairs in of_runs.items() if pairs.any()}
+    return block
+
+
+def _scores(arrays: Mapping[str, Any], pairs: NDArray[np.bool_]) -> dict[str, Any]:
+    """Block of some pairs of a receiver and a row [n_rx, m]; see `reception_block`."""
+    received = np.isfinite(arrays["truth"][pairs])
+    probability, *others = (arrays[key][pairs].astype(float) for key in (RECEPTION, *REFERENCES))
+    bins = zip(*calibration_bins(probability, received), strict=True)
     return {
         "received": float(received.mean()),
         **probability_scores(probability, received),
         "reference": {
             key: probability_scores(values, received) for key, values in zip(REFERENCES, others, strict=True)
         },
-        "bins": bins,
+        "bins": [list(map(float, row)) for row in bins if row[2]],
     }

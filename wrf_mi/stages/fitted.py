@@ -140,6 +140,10 @@ class FittedMixture(Fitted):
         """Weighted mean of the parts' predictions, [m, ...], with its standard deviation."""
         return self._of_inputs(inputs, receiver, Fitted.decompose).prediction
 
+    def with_reception(self, prediction: Prediction, inputs: Inputs, receiver: int) -> Prediction:
+        """Strengths [m] with their probability of reception, if it was fitted."""
+        return prediction if self.reception is None else self.reception(prediction, inputs.tx_pos_m, receiver)
+
     def predict_mean(self, inputs: Inputs, receiver: int) -> NDArray[Any]:
         """The mean of `predict`, by parts that save time without standard deviations."""
         return self._of_inputs(inputs, receiver, Fitted.decompose, std=False).prediction.mean

@@ -172,12 +172,18 @@ def _summary(figures: dict[str, Any]) -> str:
     text = f"likelihood: {shape}, {form['scale']:g} of the stated standard deviations"
     text += f", common offset of {form['offset_db']:g} dB" if form["offset_db"] else ""
     text += ", receivers that received nothing count" if form["silence"] else ""
+    if figures["neighbours_spread_m"] is not None:
+        text += f", times a density of {figures['neighbours_spread_m']:.2g} m around the nearest neighbours' estimate"
     if held_out is None:
         text += " (default: the run has too few training rows to hold any out)"
     else:
-        share = f"{held_out['inside']:.0%} inside their 90 % regions"
-        what = f"{held_out['rows']} predictions of held-out training rows"
-        text += f", chosen by {what}: {share}, mean error {held_out['error_m']:.2f} m"
+        what = f"{held_out['rows']} training rows, held out {held_out['folds']}"
+        near = f"nearest neighbours {held_out['neighbours_error_m']:.2f} m"
+        text += (
+            f"\nchosen by {what}: mean error {held_out['error_m']:.2f} m, {near}; regions of 90 % of the probability "
+        )
+        text += f"hold {held_out['inside']:.0%} of them, so that those of {figures['level']:.0%} of the positions have "
+        text += f"{figures['region_mass']:.0%}"
     level = f"{figures['level']:.0%}"
     known = {f"area of the {level} region (m2)": figures["area_m2"], f"radius of {level} (m)": figures["radius_m"]}
     known["error (m)"] = figures.get("error_m")
@@ -186,6 +192,10 @@ def _summary(figures: dict[str, Any]) -> str:
     text += "\n" + summary_table(f"{figures['n']} positions", known, 2)
     if "inside" in figures:
         text += f"\n{figures['inside']:.0%} of the true positions lie inside the {level} regions"
+    if "gain_on_neighbours_m" in figures:
+        gain = figures["gain_on_neighbours_m"]
+        text += f"\nmean error below that of nearest neighbours by {gain['value']:.2f} m "
+        text += f"(95 % interval {gain['low']:.2f} to {gain['high']:.2f} m)"
     text += f"\nat the border of the searched area: {figures['at_border']} of {figures['n']} estimates; outside of it: "
     text += f"training rows {figures['training_rows_outside']}"
     return text + (f", true positions {figures['outside']}" if "outside" in figures else "")

@@ -1,7 +1,9 @@
 """Position of a transmitter from what the receivers of a run received.
 
 The posterior over candidate positions inside the area is the likelihood of the observation under the run's predictions
-(`wrf_mi.apps.maps.locate_likelihood`), whose form held-out rows choose (`wrf_mi.apps.maps.locate_calibration`).
+(`wrf_mi.apps.maps.locate_likelihood`), times a density around the estimate of nearest neighbours
+(`wrf_mi.apps.maps.locate_neighbours`) where held-out rows gain by it, as they choose the form of the likelihood and the
+mass of regions (`wrf_mi.apps.maps.locate_calibration`).
 """
 
 from __future__ import annotations
@@ -13,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import softmax
 
 from ...core import InputError
 from ...core.angles import FloatArray
@@ -36,12 +37,14 @@ class LocatedPositions:
 
     Attributes:
         tx_pos_m: estimates [m, 3], metres: of the least expected distance; at the candidates' height.
-        radius_m: radius of the circle around each that holds the probability ``level`` [m], metres.
+        radius_m: radius of the circle around each that holds the true position with the probability ``level`` [m],
+            metres.
         area_m2: area of each highest-density region [m], square metres.
         probability: probabilities of the candidates [m, p].
         region: candidates in each highest-density region [m, p].
         neighbours_m: positions by k nearest neighbours [m, 3], metres; None without training rows.
-        level: probability that regions hold.
+        level: share of true positions that regions hold.
+        masses: sum of the candidates' probabilities in a region and in a circle with that share.
         candidates: candidate positions.
         calibration: form of the likelihood, with held-out error and coverage.
         at_border: whether each estimate lies at the border of the candidates' area [m]: it may lie beyond.
@@ -55,6 +58,7 @@ class LocatedPositions:
     region: NDArray[np.bool_]
     neighbours_m: FloatArray | None
     level: float
+    masses: tuple[float, float]
     candidates: Candidates
     calibration: Calibration
     at_border: NDArray[np.bool_]
@@ -122,7 +126,7 @@ def locate(
             was received; or an `xarray.DataArray` (row, receiver) with the names of receivers.
         step_m: distance between candidate positions, metres; None: 0.25 m, more for large areas.
         height_m: height of the transmitters; None: the median of the training rows.
-        level: probability that regions hold.
+        level: probability with which regions hold the true position.
         offset_db: standard deviation of an unknown offset of the transmitter's power from that of the training rows'
             transmitter; None: as chosen by held-out rows, or that of the device of ``run.own``.
         on_progress: progress callback.
@@ -183,18 +187,22 @@ def locate(
     estimate, radius = np.full((m, 3), candidates.grid.height_m), np.empty(m)
     at_border = np.empty(m, bool)
     probability, inside = np.empty((m, p), np.float32), np.empty((m, p), bool)
+    near, rows = calibration.neighbours, load_rows(run.folder, record).all_train
+    near_m = None if near is None else near.locate(record, rows, observed)
+    masses = calibration.masses(level)
+    if likelihood != calibration.likelihood:  # held-out rows do not tell of the offset of another transmitter
+        masses = max(masses[0], level), max(masses[1], level)
     for number, strengths in enumerate(observed.T):
         if stop():
             raise Interrupted(f"stopped after {number} of {m} positions; nothing is written")
-        probabilities = softmax(likelihood.log(strengths, *predicted))
-        best, radius[number], inside[number] = region_of(probabilities, candidates.distance_m, level)
+        neighbours_m = None if near_m is None else near_m[number]
+        probabilities = calibration.probabilities(likelihood.log(strengths, *predicted), neighbours_m, candidates)
+        best, radius[number], inside[number] = region_of(probabilities, candidates.distance_m, *masses)
         probability[number] = probabilities
         estimate[number, :2], at_border[number] = candidates.positions_m[best, :2], candidates.at_border[best]
         session.report("locating", (number + 1) / m)
-    area, near = inside.sum(axis=1) * candidates.cell_m2, calibration.neighbours
-    rows = load_rows(run.folder, record).all_train
-    near_m = None if near is None else near.locate(record, rows, observed)
-    of_regions = estimate, radius, area, probability, inside, near_m, level, candidates, calibration
+    area = inside.sum(axis=1) * candidates.cell_m2
+    of_regions = estimate, radius, area, probability, inside, near_m, level, masses, candidates, calibration
     return LocatedPositions(*of_regions, at_border, int(candidates.outside(record.tx_pos_m[rows]).sum()))
 
 

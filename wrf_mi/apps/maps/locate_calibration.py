@@ -1,9 +1,10 @@
-"""Choice of the likelihood's form and of k nearest neighbours by training rows that are held out in space.
+"""Choice of the posterior's form, of k nearest neighbours and of the mass of regions by held-out training rows.
 
 The run's model is fitted again to the rest of each fold (`folds_of`), predicts at all candidate positions, and locates
 the fold's held-out rows. The form with the greatest mean logarithm of the posterior density at the true positions is
 chosen: a proper score (Gneiting and Raftery, "Strictly proper scoring rules, prediction, and estimation" (2007), JASA
-102), which regions that are too narrow or too wide lower.
+102), which regions that are too narrow or too wide lower. The probability that regions hold is then that with which the
+stated share of the held-out positions lies inside (`wrf_mi.apps.maps.locate_likelihood.mass_of`).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -29,16 +30,18 @@ from ...core.array_files import stored_arrays, write_arrays
 from ...core.files import readable, write_atomically
 from ...core.settings import settings_from
 from ...core.types import IntArray
-from ...datasets.observations import fitted_receivers
+from ...datasets.observations import fitted_receivers, predicts_new_runs
 from ...estimators.held_out import fit_fold
+from ...estimators.interpolation.strength_fit import folds as stretches_of
 from ...estimators.model import Inputs, slices
 from ...models import Fitted, Session
 from ...runs.folder import load_rows
 from ...runs.run import Run
 from ...tasks.scores import LEVEL
-from ...training.selection import hold_out
+from ...training.selection import hold_out, last_gain
 from .grid import HEADINGS, Candidates
-from .locate_likelihood import Likelihood, Neighbours, Silence, choose_neighbours, region_of
+from .locate_likelihood import Likelihood, Silence, mass_of, ranks_of, region_of
+from .locate_neighbours import SPREADS, Neighbours, choose_neighbours, log_near
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +51,7 @@ WIDE = 0.95  # probability of the quantile by which the widths of distributions 
 MOST_ROWS = 300  # most held-out rows that are located
 TOGETHER = 512  # candidates that are predicted together
 TIMED = 64  # most candidates whose predictions are timed at once, before all are predicted
-FOLDS = 3  # hold-outs with other seeds: one alone has few positions, near each other
+FOLDS = 3  # hold-outs of other rows: one alone has few positions, near each other
 FOLDER, FILE = "locate", "locate.json"  # folder of finished folds in the run folder, and file of the choice
 
 
@@ -60,10 +63,27 @@ class Calibration:
     neighbours: Neighbours | None = None  # nearest neighbours; None: the run has no training rows to compare with
     rows: int = 0  # number of located held-out rows; 0: the form is the default one, as nothing could be held out
     error_m: float = np.nan  # their mean distance from the estimate, metres
-    inside: float = np.nan  # share of them inside the regions of probability `LEVEL`
-    neighbours_error_m: float = np.nan  # mean held-out distance of nearest neighbours, metres
+    inside: float = np.nan  # share of them inside the regions that hold the probability `LEVEL`
+    neighbours_error_m: float = np.nan  # mean distance of them from the nearest neighbours' estimate, metres
+    # standard deviation of the density around the neighbours' estimate along an axis, metres; None: the field alone
+    spread_m: float | None = None
+    denser: tuple[float, ...] = ()  # rank of each held-out row by density (`ranks_of`)
+    nearer: tuple[float, ...] = ()  # rank of each by the distance from the estimate
+    folds: str = ""  # how rows were held out, in words
     # mean log posterior density at the true positions of each form that was tried, per square metre
     scores: dict[str, float] | None = None
+
+    def probabilities(
+        self, of_field: FloatArray, neighbours_m: FloatArray | None, candidates: Candidates
+    ) -> FloatArray:
+        """Posterior probabilities [p] from the field's log likelihood [p] and the neighbours' estimate [2 or 3]."""
+        if self.spread_m is None or neighbours_m is None:
+            return np.asarray(softmax(of_field))
+        return np.asarray(softmax(of_field + log_near(candidates.positions_m, neighbours_m, self.spread_m)))
+
+    def masses(self, level: float) -> tuple[float, float]:
+        """Probabilities that a region and a circle hold whose shares of true positions are the level."""
+        return mass_of(self.denser, level), mass_of(self.nearer, level)
 
 
 def predict_candidates(
@@ -120,13 +140,15 @@ def headings_of(run: Run) -> int:
 @dataclass(frozen=True)
 class Located:
     """Held-out rows of a fold: predictions at the receivers of the given numbers, which have enough training rows in
-    the fold (`predict_candidates`); rows of the record [m], and the candidate nearest to each [m].
+    the fold (`predict_candidates`); rows of the record [m], the candidate nearest to each [m], and the nearest
+    neighbours' estimate of each [m, 3].
     """
 
     predicted: NDArray[np.float32]
     receivers: IntArray
     rows: IntArray
     truth: IntArray
+    neighbours_m: FloatArray
 
 
 def calibration_of(run: Run, fitted: Fitted, candidates: Candidates, session: Session) -> Calibration:
@@ -145,7 +167,7 @@ def calibration_of(run: Run, fitted: Fitted, candidates: Candidates, session: Se
             if stored.pop("key") == key:
                 return settings_from(Calibration, stored, str(file))
     record, split = run.problem.record, load_rows(run.folder, run.problem.record)
-    folds = folds_of(record, split)
+    folds, neighbours, words = folds_of(record, split)
     if not folds:
         return Calibration(Likelihood())
     parts, most = [], max(1, MOST_ROWS // len(folds))
@@ -159,10 +181,10 @@ def calibration_of(run: Run, fitted: Fitted, candidates: Candidates, session: Se
         receivers, predicted = _predicted_fold(run, fitted, fold, folder, candidates, session, report)
         test = fold.test[np.isfinite(record.observation[receivers][:, fold.test]).any(axis=0)]
         test = np.sort(np.random.default_rng([run.problem.seed, 11]).permutation(test)[:most])
-        parts.append(Located(predicted, receivers, test, candidates.nearest(record.tx_pos_m[test])))
-    neighbours, error_m = choose_neighbours(record, folds)
+        near_m = neighbours.locate(record, fold.all_train, np.asarray(record.observation[:, test], float))
+        parts.append(Located(predicted, receivers, test, candidates.nearest(record.tx_pos_m[test]), near_m))
     chosen = choose(record, parts, candidates, lambda share: session.report("choosing the likelihood", share))
-    chosen = replace(chosen, neighbours=neighbours, neighbours_error_m=error_m)
+    chosen = replace(chosen, neighbours=neighbours, folds=words)
     write_atomically(file, json.dumps({"key": key, **asdict(chosen)}, indent=1) + "\n")
     shutil.rmtree(run.folder / FOLDER, ignore_errors=True)
     return chosen
@@ -201,20 +223,39 @@ def _predicted_fold(
     return arrays["receivers"], arrays["predicted"]
 
 
-def folds_of(record: Record, split: Split) -> list[Split]:
-    """Hold-outs of other seeds (`hold_out`), whose likelihoods are compared; none where no rows can be held out."""
-    folds = [hold_out(record, replace(split, seed=split.seed + number)) for number in range(FOLDS)]
-    return [fold for fold in folds if fold is not None]
+def folds_of(record: Record, split: Split) -> tuple[list[Split], Neighbours, str]:
+    """Hold-outs whose likelihoods are compared, nearest neighbours chosen by them, and how rows are held out, in words.
+
+    Rows are as far from the others as those to be predicted, or of other runs (`hold_out`, with other seeds); or they
+    are stretches of the record's order, if nearest neighbours locate these with a greater error: consecutive rows of a
+    path share people, doors and the noise of their time, which rows of another day do not. No fold where no rows can
+    be held out.
+    """
+    far = [hold_out(record, replace(split, seed=split.seed + number)) for number in range(FOLDS)]
+    kinds = [([fold for fold in far if fold is not None], "as far from the others as predicted positions")]
+    if predicts_new_runs(record, split):
+        kinds = [(kinds[0][0], "of other runs")]
+    else:
+        rows = split.all_train
+        pairs = list(stretches_of(record.tx_pos_m[rows], FOLDS + 1))[:FOLDS]
+        none = np.zeros(0, np.int64)
+        stretches = [Split("held out", split.seed, rows[known], none, rows[out]) for known, out in pairs]
+        kinds.append((stretches, "in stretches of the data's order"))
+    tried = [(folds, words, *choose_neighbours(record, folds)) for folds, words in kinds if folds]
+    if not tried:
+        return [], Neighbours(1), ""
+    folds, words, neighbours, _ = max(tried, key=lambda kind: float(kind[3].mean()))
+    return folds, neighbours, words
 
 
 def choose(
     record: Record, parts: Sequence[Located], candidates: Candidates, report: Callable[[float], None]
 ) -> Calibration:
-    """The likelihood with the best score on held-out rows.
+    """The posterior with the best score on held-out rows, and their ranks.
 
     Degrees of freedom and scale are chosen together (`widest`), then the common offset. That and a probability of
     receiving nothing (`Silence`), each fold scored by the other folds', are kept where they raise the score by more
-    than the standard error.
+    than the standard error; so is a density around the nearest neighbours' estimate, the wider the earlier.
     """
     forms = [Likelihood(degrees, scale) for degrees in DEGREES for scale in SCALES]
     steps = len(forms) + len(OFFSETS_DB) + 1
@@ -244,28 +285,64 @@ def choose(
         scores["with receivers that received nothing"] = scores[_words(best)] + float(gain.mean())
         if _clear_gain(gain) > 0:
             best = replace(best, silence=silence)
-    errors_m, inside = _located(record, parts, candidates, best)
+    chosen = _with_neighbours(record, parts, candidates, best, scores)
     report(1.0)
-    return Calibration(best, None, len(errors_m), float(np.mean(errors_m)), float(np.mean(inside)), scores=scores)
+    return chosen
+
+
+def _with_neighbours(
+    record: Record, parts: Sequence[Located], candidates: Candidates, form: Likelihood, scores: dict[str, float]
+) -> Calibration:
+    """The posterior of a form of the likelihood with the chosen density around the neighbours' estimate, and ranks.
+
+    Scores of the densities are added to ``scores``.
+    """
+    truth = np.concatenate([part.truth for part in parts])
+    places_m = record.tx_pos_m[np.concatenate([part.rows for part in parts])]
+    of_field = [form.log(_strengths(record, part, row), *part.predicted) for part in parts for row in part.rows]
+    near_m = np.concatenate([part.neighbours_m for part in parts])
+    near_error_m = np.linalg.norm((near_m - places_m)[:, :2], axis=1)
+    deviation_m = float(np.sqrt(np.square(near_error_m).mean() / 2)) or 1.0
+
+    def posteriors(spread_m: float | None) -> Iterator[FloatArray]:
+        tried = Calibration(form, spread_m=spread_m)
+        return (tried.probabilities(log, near, candidates) for log, near in zip(of_field, near_m, strict=True))
+
+    # The wider the density, the less it can do harm; none is the first option.
+    options: list[tuple[float | None, FloatArray]] = []
+    for spread_m in (None, *(factor * deviation_m for factor in SPREADS)):
+        density = np.array([each[place] for each, place in zip(posteriors(spread_m), truth, strict=True)])
+        options.append((spread_m, _log_density(density, candidates)))
+        if spread_m is not None:
+            scores[f"nearest neighbours' estimate within {spread_m:.3g} m"] = float(options[-1][1].mean())
+    spread_m = last_gain(options, higher_is_better=True)
+    # Errors and ranks by the chosen posterior.
+    errors_m, ranks = np.empty(len(truth)), np.empty((len(truth), 2))
+    for number, probability in enumerate(posteriors(spread_m)):
+        best = region_of(probability, candidates.distance_m, LEVEL)[0]
+        errors_m[number] = np.linalg.norm((candidates.positions_m[best] - places_m[number])[:2])
+        ranks[number] = ranks_of(probability, candidates.distance_m, best, int(truth[number]))
+    return Calibration(
+        form,
+        rows=len(truth),
+        error_m=float(errors_m.mean()),
+        inside=float((ranks[:, 0] < LEVEL).mean()),
+        neighbours_error_m=float(near_error_m.mean()),
+        spread_m=spread_m,
+        denser=tuple(ranks[:, 0].tolist()),
+        nearer=tuple(ranks[:, 1].tolist()),
+        scores=scores,
+    )
+
+
+def _log_density(probability: FloatArray, candidates: Candidates) -> FloatArray:
+    """Logarithm of the density per square metre of candidates with probabilities [m]."""
+    return np.asarray(np.log(np.maximum(probability, np.finfo(float).tiny)) - np.log(candidates.cell_m2 or 1.0))
 
 
 def _silences_of_others(record: Record, parts: Sequence[Located]) -> list[Silence | None]:
     """Probability of receiving nothing for each fold, fitted to the others; to the only one where there are none."""
     return [fit_silence(record, [other for other in parts if other is not part] or parts) for part in parts]
-
-
-def _located(
-    record: Record, parts: Sequence[Located], candidates: Candidates, form: Likelihood
-) -> tuple[list[float], list[bool]]:
-    """Horizontal errors of held-out rows in metres, and whether the region holds their position."""
-    errors_m, inside = [], []
-    for part in parts:
-        for row, truth, place in zip(part.rows, part.truth, record.tx_pos_m[part.rows], strict=True):
-            probability = softmax(form.log(_strengths(record, part, row), *part.predicted))
-            estimate, _, region = region_of(probability, candidates.distance_m, LEVEL)
-            errors_m.append(float(np.linalg.norm((candidates.positions_m[estimate] - place)[:2])))
-            inside.append(bool(region[truth]))
-    return errors_m, inside
 
 
 def widest(forms: Sequence[Likelihood], scores: Sequence[FloatArray]) -> Likelihood:

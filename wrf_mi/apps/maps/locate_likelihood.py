@@ -7,31 +7,22 @@ differs from that of the training rows, is normal with mean zero and integrated 
 position, heading and offset the receivers are independent. The heading is unknown and uniform: the likelihood is
 averaged over headings jointly for all receivers, as one body shadows them.
 
-K nearest neighbours among the training rows' strengths (fingerprinting) are the reference (`Neighbours`).
-
 Source: Lange, Little and Taylor, "Robust statistical modeling using the t distribution" (1989), JASA 84; Liu
-and Pierce, "A note on Gauss-Hermite quadrature" (1994), Biometrika 81 (the offset); Bahl and
-Padmanabhan, "RADAR: an in-building RF-based user location and tracking system" (2000), INFOCOM (neighbours).
+and Pierce, "A note on Gauss-Hermite quadrature" (1994), Biometrika 81 (the offset).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln, log_expit, logsumexp
-from sklearn.neighbors import KNeighborsRegressor
 
-from ...core import Record, Split
 from ...core.angles import FloatArray
-from ...core.types import IntArray
 
 OFFSET_NODES = 7  # nodes of the quadrature over the common offset
-COUNTS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40)  # numbers of neighbours to choose from
-METRICS = ("euclidean", "nan_euclidean")
-"""Distances: a receiver without a value has its weakest training value, or is left out and the others are scaled up."""
+TRUST = 50  # number of held-out rows that weigh as much as the stated probability: they tell a share of 90 % to 4 %
 
 
 @dataclass(frozen=True)
@@ -99,16 +90,52 @@ class Likelihood:
         return np.asarray((constant - (n + 1) / 2 * np.log1p(square / n) - np.log(scale)).sum(axis=1))
 
 
-def region_of(probability: FloatArray, distance_m: FloatArray, level: float) -> tuple[int, float, NDArray[np.bool_]]:
+def region_of(
+    probability: FloatArray, distance_m: FloatArray, mass: float, circle_mass: float | None = None
+) -> tuple[int, float, NDArray[np.bool_]]:
     """Estimate and regions of a transmitter from probabilities [p] of candidates with distances [p, p] in metres.
 
     Returns:
         The candidate of the least expected distance from the transmitter (geometric median), the radius in metres of
-        the circle around it that holds the probability ``level``, and a mask [p] of the highest-density region.
+        the circle around it that holds the probability ``circle_mass``, by default ``mass``, and a mask [p] of the
+        highest-density region, which holds ``mass``.
     """
     best = int(np.argmin(distance_m @ probability))
     order = np.argsort(distance_m[best], kind="stable")
-    return best, float(distance_m[best][order][_last(probability[order], level)]), densest(probability, level)
+    last = _last(probability[order], mass if circle_mass is None else circle_mass)
+    return best, float(distance_m[best][order][last]), densest(probability, mass)
+
+
+def ranks_of(probability: FloatArray, distance_m: FloatArray, best: int, truth: int) -> tuple[float, float]:
+    """Probability of the candidates [p] denser than the true one, and of those nearer to the estimate ``best``.
+
+    A region of `region_of` holds the true candidate if it holds more than the first; the circle, more than the second.
+    """
+    denser, nearer = probability > probability[truth], distance_m[best] < distance_m[best, truth]
+    return float(probability[denser].sum()), float(probability[nearer].sum())
+
+
+def mass_of(ranks: ArrayLike, level: float) -> float:
+    """Probability that regions have to hold so that a share ``level`` of them holds the true position.
+
+    The quantile of held-out ranks (`ranks_of`), as in split conformal prediction: of n ranks the k-th smallest, for k =
+    ceil((n + 1) level), holds a further row that is exchangeable with them with at least the stated probability,
+    whatever the errors of the likelihood. Few ranks tell a quantile to several percent alone: they are joined by
+    `TRUST` evenly spaced ones, which are those of a posterior that is right. Without any it is the level.
+
+    Source: Lei, G'Sell, Rinaldo, Tibshirani and Wasserman, "Distribution-free predictive inference for regression"
+    (2018), JASA 113, section 2.2.
+
+    >>> round(mass_of(np.linspace(0, 1, 1001) ** 2, 0.9), 2)  # of regions that hold more than they state
+    0.82
+    >>> mass_of([], 0.9)
+    0.9
+    """
+    if not len(known := np.asarray(ranks, float)):
+        return level
+    ascending = np.sort(np.concatenate([known, (np.arange(TRUST) + 0.5) / TRUST]))
+    place = int(np.ceil((len(ascending) + 1) * level))
+    return float(ascending[place - 1]) if place <= len(ascending) else max(level, float(ascending[-1]))
 
 
 def densest(probability: FloatArray, level: float) -> NDArray[np.bool_]:
@@ -123,41 +150,3 @@ def _last(probability: FloatArray, level: float) -> int:
     """Index of the first of ordered candidates at which a probability is reached."""
     reached = np.cumsum(probability) >= level * (1 - 1e-12)
     return int(np.argmax(reached)) if reached.any() else len(probability) - 1
-
-
-@dataclass(frozen=True)
-class Neighbours:
-    """Number k of nearest neighbours, and their distance, one of `METRICS`."""
-
-    count: int
-    metric: str = METRICS[0]
-
-    def locate(self, record: Record, rows: IntArray, observed_dbm: FloatArray) -> FloatArray:
-        """Mean positions [m, 3] of the nearest of training rows [n], from strengths [n_rx, m], NaN: not received."""
-        known = np.asarray(record.observation[:, rows].T, float)
-        rows = rows[np.isfinite(known).any(axis=1)]
-        known = known[np.isfinite(known).any(axis=1)]
-        asked = np.asarray(observed_dbm.T, float)
-        if self.metric == METRICS[0]:
-            heard = np.isfinite(known)
-            weakest = np.where(heard.any(axis=0), np.where(heard, known, np.inf).min(axis=0), 0.0)
-            known, asked = (np.where(np.isfinite(values), values, weakest) for values in (known, asked))
-        model = KNeighborsRegressor(min(self.count, len(rows)), metric=self.metric)
-        return np.asarray(model.fit(known, record.tx_pos_m[rows]).predict(asked))
-
-
-def choose_neighbours(record: Record, folds: Sequence[Split]) -> tuple[Neighbours, float]:
-    """The number of neighbours and the distance with the least mean held-out error, and that error in metres."""
-    best, least = Neighbours(1), np.inf
-    for metric in METRICS:
-        for count in COUNTS:
-            chosen, errors = Neighbours(count, metric), []
-            for fold in folds:
-                test = fold.test[np.isfinite(record.observation[:, fold.test]).any(axis=0)]
-                if len(test):
-                    estimate = chosen.locate(record, fold.all_train, np.asarray(record.observation[:, test], float))
-                    errors.append(np.linalg.norm((estimate - record.tx_pos_m[test])[:, :2], axis=1))
-            error = float(np.concatenate(errors).mean()) if errors else np.inf
-            if error < least:
-                best, least = chosen, error
-    return best, least

@@ -290,7 +290,7 @@ def scales(position_m: FloatArray) -> tuple[float, float]:
     return spacing_m, extent_m
 
 
-def folds(position_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+def folds(position_m: FloatArray, number_of_folds: int = FOLDS) -> Iterator[tuple[IntArray, IntArray]]:
     """Training rows and held-out rows of each fold, as indices of positions [n, 3] in metres.
 
     Stretches of the record's order are held out. Where that is the order of time, as along a path, a stretch is
@@ -302,10 +302,10 @@ def folds(position_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
     visit = first[place.reshape(-1)]
     order = np.argsort(visit, kind="stable")
     begins = np.searchsorted(visit[order], visit[order])
-    stretch = int(np.clip(count // (2 * FOLDS), *STRETCH))
+    stretch = int(np.clip(count // (2 * number_of_folds), *STRETCH))
     number = begins // stretch
-    for fold in range(min(FOLDS, int(number[-1]) + 1)):
-        out = number % FOLDS == fold
+    for fold in range(min(number_of_folds, int(number[-1]) + 1)):
+        out = number % number_of_folds == fold
         near = out.copy()
         for step in range(1, int(stretch * BUFFER) + 1):
             near[step:] |= out[:-step]
