@@ -108,6 +108,9 @@ class Sensitivity:
         return of(minimize(cost, first, jac=True, method="L-BFGS-B").x)
 
 
+MOST_KEPT = 4_000_000  # distances to nearest rows that are kept, 64 MB with the numbers of the rows
+
+
 class ReceivedShares:
     """Shares of some training rows of a record that its receivers received: of all, and of those near a position.
 
@@ -121,14 +124,17 @@ class ReceivedShares:
         self._received = ~np.isnan(record.observation[:, rows])
         # With half a received and half a missing row (Krichevsky and Trofimov, 1981) no share is 0 or 1.
         self.rate = (self._received.sum(axis=1) + 0.5) / (len(rows) + 1)
-        self._last = np.zeros((0, 3)), np.zeros((0, 1)), np.zeros((0, 1), np.int64)
+        self._kept: dict[bytes, tuple[FloatArray, IntArray]] = {}
 
     def near(self, tx_pos_m: FloatArray, receiver: int) -> tuple[FloatArray, FloatArray]:
         """Share [m] of the nearest rows, and distance [m] in metres to the nearest, of positions [m, 3]."""
-        count, (positions_m, distance, row) = min(NEIGHBOURS, len(self.rows)), self._last
-        if not np.array_equal(positions_m, tx_pos_m):  # those of the receiver before, of the same transmitters
-            distance, row = self._tree.query(tx_pos_m, k=list(range(1, count + 1)))
-            self._last = tx_pos_m.copy(), distance, row
+        count, key = min(NEIGHBOURS, len(self.rows)), tx_pos_m.tobytes()
+        # A map asks for the same chunks of positions at each receiver.
+        if key not in self._kept:
+            if sum(distance.size for distance, _ in self._kept.values()) > MOST_KEPT:
+                self._kept.clear()
+            self._kept[key] = self._tree.query(tx_pos_m, k=list(range(1, count + 1)))
+        distance, row = self._kept[key]
         weight = (distance + SOFTENING_M) ** -2.0
         share = (weight * self._received[receiver][row]).sum(axis=1) / weight.sum(axis=1)
         # The rate counts as one more neighbour, so that no share is 0 or 1.
