@@ -67,7 +67,16 @@ REFUSED = [  # data set, command and options, and message
     ("spectra", "train --model wrf-gs+ --rx-polarization H", "--material and antenna options belong to a scene"),
     # Options and settings without effect beside the others.
     ("flat", "train --model mri --preset fast", "--preset fast: mri for such data has no presets; use --set"),
-    ("flat", "train --preset fast --stages residual", "preset fast: the settings state all that it does; omit one of"),
+    (
+        "flat",
+        "train --preset fast --stages residual --set search_seconds=9",
+        "preset fast: the settings state all that it does; omit one of",
+    ),
+    (
+        "flat",
+        "train --set search_seconds=9",
+        "search_seconds=9.0: no effect on hybrid of .*: no signal strengths are traced in",
+    ),
     ("spectra", "train --model kriging --depth 2", "--depth belongs to --model ray-tracing, not to kriging; omit it"),
     ("flat", "train --model idw --stages mean", "--stages belongs to --model hybrid, not to idw; omit it"),
     ("spectra", "train --model kriging --receiver-model array", "--receiver-model belongs to fields of spectra"),

@@ -241,10 +241,15 @@ class Hybrid(Model):
         return load_further(arrays, FittedMixture.from_arrays(self.name, arrays, problem, load))
 
     def unused_settings(self, problem: Problem, splits: Sequence[Split]) -> Mapping[str, str]:
-        """Steps where no stage trains step by step."""
-        idle = _stages_of(problem)
-        trained = [name for name, _ in _means(problem) if name != PATHS or SURFACES not in idle]
-        return {} if {*trained} & {PATHS, FIELD, FIELD_IN_SCENE} else {"steps": "no stage is trained step by step"}
+        """Steps where no stage trains step by step, and a limit of searches where there are none."""
+        idle, unused = _stages_of(problem), dict[str, str]()
+        means = _means(problem)
+        trained = [name for name, _ in means if name != PATHS or SURFACES not in idle]
+        if not {*trained} & {PATHS, FIELD, FIELD_IN_SCENE}:
+            unused["steps"] = "no stage is trained step by step"
+        if (PATHS, True) not in means or not isinstance(scene_side(problem.record), TracedStrengths):
+            unused["search_seconds"] = "no signal strengths are traced in a scene"
+        return unused
 
     def check(self, problem: Problem, splits: Sequence[Split]) -> None:
         """Refuse unknown positions, and data that no part can be fitted to."""

@@ -106,7 +106,9 @@ class Mean(Stage):
         return [Option(name, partial(self._fit, name)) for name in names]
 
     def _fit(self, name: str, state: State, split: Split, session: Session) -> State:
-        return replace(state, mean=_mean(state.problem, name, partial(session.report, "tracing a map")))
+        on_share = partial(session.report, "tracing a map")
+        on_share(0.0)
+        return replace(state, mean=_mean(state.problem, name, on_share))
 
 
 def _mean(problem: Problem, name: str, on_share: OnShare = lambda share: None) -> Traced:
