@@ -227,7 +227,7 @@ def absorbing_slab(loss_db: float, carrier_hz: float = LOSS_CARRIER_HZ) -> dict[
 
     # Without reflection a slab absorbs 20 log10(e) / 2 times conductivity, thickness and impedance of free space: this
     # conductivity is the least, and a hundred times it reflects more than the loss.
-    least = loss_db / (10 * np.log10(np.e) * LOSS_THICKNESS_M * 377)
+    least = loss_db * np.log(10) / (10 * LOSS_THICKNESS_M * 377)
     conductivity = float(brentq(excess_db, least / 2, 100 * least))
     return dict(zip(PERFECT_CONSTANTS, (1.0, float(f"{conductivity:.4g}"), LOSS_THICKNESS_M), strict=True))
 
