@@ -152,7 +152,8 @@ def power_tracer(scene: Any, record: Record, options: TraceOptions) -> Tracer:
         power = np.full((len(receivers), len(position_m)), np.nan)
         outside = solid_around(prepared.surfaces, position_m) < 0
         if outside.any():
-            power[:, outside] = _power_dbm(prepared, position_m[outside], receivers, options, record.tx_antenna)
+            how = receivers, options, record.tx_antenna
+            power[:, outside] = traced_powers(prepared, position_m[outside], *how, kept=False)
         return power
 
     return trace
@@ -209,25 +210,6 @@ def _means_outside(
     return np.asarray(mean[:, *nearest])
 
 
-def _power_dbm(
-    prepared: Prepared,
-    tx_pos_m: FloatArray,
-    receivers: Sequence[Receiver],
-    options: TraceOptions,
-    tx_antenna: Antenna,
-    on_share: OnShare = _quiet,
-) -> FloatArray:
-    """Received power [n_rx, m] in dBm for 0 dBm sent from points [m, 3] outside of solids, NaN without a path."""
-    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": tx_antenna, "check": False}
-    # In chunks: a path takes a kilobyte, and what is kept of it here is its power. Chains of reflections are kept.
-    chunks = np.array_split(tx_pos_m, max(1, len(tx_pos_m) * len(receivers) // PAIRS_TOGETHER))
-    powers = list[FloatArray]()
-    for number, chunk in enumerate(chunks):
-        on_share(number / len(chunks))
-        powers.append(np.asarray(rssi_dbm(trace_paths(prepared.scene, chunk, receivers, options, **how).paths), float))
-    return np.concatenate(powers, axis=1)
-
-
 def traced_powers(
     prepared: Prepared,
     tx_pos_m: FloatArray,
@@ -235,13 +217,17 @@ def traced_powers(
     options: TraceOptions,
     tx_antenna: Antenna,
     on_share: OnShare = _quiet,
+    kept: bool = True,
 ) -> FloatArray:
-    """Received powers of `_power_dbm`, kept in the user's cache."""
+    """Received power [n_rx, m] in dBm for 0 dBm sent from points [m, 3] outside of solids, NaN without a path.
+
+    Those ``kept`` are in the user's cache.
+    """
     # The key holds all that determines the powers, code and versions included; a stale file is never read.
     scene = prepared.scene
     slabs, slab_of_face = slabs_of_faces(scene, prepared.surfaces, "named")
     path = None
-    if (slab_of_face >= 0).all():  # other materials have no digest
+    if kept and (slab_of_face >= 0).all():  # other materials have no digest
         package = Path(__file__).parents[1]
         folders = package / "tracing", package / "receivers"
         code = {str(file.relative_to(package)): file for folder in folders for file in folder.rglob("*.py")}
@@ -252,7 +238,14 @@ def traced_powers(
         path = user_cache() / FOLDER / f"{content_digest(code, versions, faces, asked)}.npz"
         if path.exists():
             return np.asarray(stored_arrays(path)[POWER], float)
-    power = _power_dbm(prepared, tx_pos_m, receivers, options, tx_antenna, on_share)
+    how: dict[str, Any] = {"prepared": prepared, "tx_antenna": tx_antenna, "check": False}
+    # In chunks: a path takes a kilobyte, and what is kept of it here is its power. Chains of reflections are kept.
+    chunks = np.array_split(tx_pos_m, max(1, len(tx_pos_m) * len(receivers) // PAIRS_TOGETHER))
+    powers = list[FloatArray]()
+    for number, chunk in enumerate(chunks):
+        on_share(number / len(chunks))
+        powers.append(np.asarray(rssi_dbm(trace_paths(scene, chunk, receivers, options, **how).paths), float))
+    power = np.concatenate(powers, axis=1)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_arrays(path, {POWER: power})

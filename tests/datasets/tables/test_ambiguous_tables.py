@@ -97,9 +97,9 @@ def test_files_named_by_the_power_sent_are_runs(tmp_path: Path) -> None:
 
 
 def test_powers_sent_in_turn_are_runs_of_each_walk(tmp_path: Path) -> None:
-    table = pandas.concat([readings(TxPower=power, walk=walk) for power, walk in ((-8, "a"), (0, "a"), (0, "b"))])
-    record = imported(tmp_path, table)
-    assert sorted(set(record.runs)) == ["a -8 dBm", "a 0 dBm", "b 0 dBm"]
+    table = pandas.concat([readings(TxPower=power, walk=walk) for power, walk in ((-8, "a"), (0, "a"), (None, "b"))])
+    record = imported(tmp_path, table.astype({"TxPower": "Int64"}))
+    assert sorted(set(record.runs)) == ["a -8 dBm", "a 0 dBm", "b of no stated power"]
     assert len(record.tx_pos_m) == 30
 
 

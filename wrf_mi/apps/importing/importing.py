@@ -278,13 +278,15 @@ class _Import:
         return values[values.notna()].astype(str).str.strip()
 
     def _sent(self, readings: Readings) -> NDArray[np.str_] | None:
-        """Sent power of each row as a text, where one receiver has several: by a column, or by names of files."""
+        """Sent power of each row, "" where none is stated, if a receiver has several: by a column or names of files."""
         for name in self.table.frame.columns:
             values = self._of_readings(name, readings)
             several = values.groupby(readings.receiver[values.index]).nunique().max() > 1
             if name_words(name) & SENT and self.table.is_numeric(name) and several:
                 self.notes.append(f"{one_line(name)} is {listed(values.unique())}: a run for each, with its offset")
-                return np.asarray(self.table.frame[name].astype(str).str.strip().to_numpy(str))
+                column = self.table.frame[name]
+                pairs = zip(column, column.isna(), strict=True)
+                return np.array(["" if missing else f"{float(power):g}" for power, missing in pairs])
         powers = [SENT_IN_NAME.search(path.stem) for path, _ in self.table.files]
         texts = np.array([match[1] if match else "" for match in powers])
         if len(distinct := sorted({*texts} - {""}, key=float)) < 2:
@@ -308,7 +310,8 @@ class _Import:
             conditions["run"] = table.frame[of["run"]].astype(str).str.strip().to_numpy(str)
         if (sent := self._sent(readings)) is not None:
             runs = conditions.get("run", np.full(len(sent), ""))
-            conditions["run"] = np.array([f"{run} {power} dBm".strip() for run, power in zip(runs, sent, strict=True)])
+            powers = [f"{power} dBm" if power else "of no stated power" for power in sent]
+            conditions["run"] = np.array([f"{run} {power}".strip() for run, power in zip(runs, powers, strict=True)])
         if "frequency" in of and not self.options.frequency_hz:
             self.units["frequency"] = "-> Hz"
             conditions |= self._carriers(_hertz(table, of["frequency"]), readings)
