@@ -130,7 +130,7 @@ class FittedWithFew(Fitted):
         self.fitted, self.law, self._numbers = fitted, law, numbers
         self._place = {int(number): place for place, number in enumerate(numbers)}
         self.train_seconds, self.uses_heading = fitted.train_seconds, fitted.uses_heading
-        self.carriers_hz, self.run_sd_db = fitted.carriers_hz, fitted.run_sd_db
+        self.carriers_hz, self.run_sd_db, self.traces = fitted.carriers_hz, fitted.run_sd_db, fitted.traces
         self._states_std: bool | None = None
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:

@@ -144,6 +144,8 @@ class Fitted(ABC):
     uses_heading: bool | None = None  #: whether `predict` takes headings; None: as `Model.headings`
     #: carriers of the rows that it was fitted to, Hz, none for a single one; None: those of the record
     carriers_hz: FloatArray | None = None
+    #: whether predictions may trace paths or evaluate Gaussians, of one receiver at a time; False: NumPy does it all
+    traces: bool = True
     #: standard deviation in dB of the offset of another run or device than those of the data; None: they tell none
     run_sd_db: float | None = None
     #: of a fit that chose by held-out rows, not stored: predictions of `wrf_mi.training.selection.HeldOut` without them

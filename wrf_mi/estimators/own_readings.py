@@ -152,6 +152,7 @@ class ForDevice(Fitted):
     def __init__(self, fitted: Fitted, offset: DeviceOffset) -> None:
         self.fitted, self.offset = fitted, offset
         self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
+        self.traces = fitted.traces
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Signal strengths [m] in dBm, with the deviation of the offset in theirs."""

@@ -132,6 +132,7 @@ class FittedMixture(Fitted):
         self._distance = RowDistance.of_rows(self.problem.record, self.known)
         told = [part.run_sd_db for part in self.parts.values() if part.run_sd_db is not None]
         self.run_sd_db = max(told, default=None)
+        self.traces = any(part.traces for part in self.parts.values())
         model = self.parts.get(self.name)
         if model is not None:
             self.receivers, self.uses_heading, self.carriers_hz = model.receivers, model.uses_heading, model.carriers_hz

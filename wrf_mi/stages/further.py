@@ -39,7 +39,7 @@ class Further(Fitted):
     def __post_init__(self) -> None:
         before = self.before
         self.receivers, self.uses_heading, self.carriers_hz = before.receivers, before.uses_heading, before.carriers_hz
-        self.run_sd_db = before.run_sd_db
+        self.run_sd_db, self.traces = before.run_sd_db, before.traces
 
     @property
     def depends_on_heading(self) -> bool:

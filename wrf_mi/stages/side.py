@@ -37,7 +37,7 @@ class FittedInScene(Fitted):
     def __init__(self, fitted: Fitted, problem: Problem, stages: Collection[StageReport] = ()) -> None:
         self.fitted, self.problem, self.stages = fitted, problem, tuple(stages)
         self.receivers, self.uses_heading, self.carriers_hz = fitted.receivers, fitted.uses_heading, fitted.carriers_hz
-        self.run_sd_db = fitted.run_sd_db
+        self.run_sd_db, self.traces = fitted.run_sd_db, fitted.traces
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Observations of the receiver of that index, [m, ...]."""

@@ -12,7 +12,7 @@ from wrf_mi.core import InputError, Receiver, Record
 from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.estimators.interpolation import strengths
-from wrf_mi.estimators.interpolation.pooled_process import PooledProcess, ReceiverObservations
+from wrf_mi.estimators.interpolation.pooled_process import Basis, PooledProcess, ReceiverObservations
 from wrf_mi.estimators.interpolation.strength_fit import folds, widening
 from wrf_mi.estimators.interpolation.strength_settings import StrengthSettings
 from wrf_mi.estimators.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
@@ -77,18 +77,19 @@ def test_posterior_and_likelihood_equal_those_of_one_dense_covariance_matrix() -
     rng = np.random.default_rng(1)
     prior = np.array([5.0, 1.0])
     places = [Poses(rng.uniform(0, 3, (n, 3)), rng.uniform(0, 6, n)) for n in (7, 5)]
-    bases = [rng.normal(size=(len(p), 2)) for p in places]
+    both = np.arange(2)
+    bases = [Basis(rng.normal(size=(len(p), 2)), both) for p in places]
     values = [rng.normal(0, 4, len(p)) for p in places]
     noise = [rng.uniform(1, 3, len(p)) for p in places]
     every = Poses(*(np.concatenate([getattr(p, name) for p in places]) for name in ("position_m", "heading_rad")))
     rows = np.arange(7), np.arange(7, 12)
     parts = [ReceiverObservations(*part) for part in zip(rows, bases, values, noise, strict=True)]
     asked, basis = Poses(rng.uniform(0, 3, (4, 3)), rng.uniform(0, 6, 4)), rng.normal(size=(4, 2))
-    all_bases, y = np.concatenate(bases), np.concatenate(values)
+    all_bases, y = np.concatenate([each.columns for each in bases]), np.concatenate(values)
     for length_m in (0.5, 1.5):
         kernel = Hyperparameters(3.0, length_m, 1.0, 1.0, 1.0, 0.0, 0.0)
         process = PooledProcess(every, parts, kernel.covariance, prior, kernel.variance(True))
-        mean, variance = process.predict(1, asked, basis)
+        mean, variance = process.predict(1, asked, Basis(basis, both))
         dense = all_bases @ np.diag(prior**2) @ all_bases.T + np.diag(np.concatenate(noise))
         dense[:7, :7] += kernel.covariance(places[0], places[0])
         dense[7:, 7:] += kernel.covariance(places[1], places[1])
@@ -104,7 +105,7 @@ def test_posterior_and_likelihood_equal_those_of_one_dense_covariance_matrix() -
 def test_reweighting_is_robust_to_outliers() -> None:
     places = Poses(np.zeros((21, 3)), None)
     value = np.concatenate([np.zeros(20), [40.0]])
-    part = ReceiverObservations(np.arange(21), np.ones((21, 1)), value, np.ones(21))
+    part = ReceiverObservations(np.arange(21), Basis(np.ones((21, 1)), np.arange(1)), value, np.ones(21))
     kernel = Hyperparameters(1e-3, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0)
     plain, robust = (
         PooledProcess(places, [part], kernel.covariance, np.array([10.0]), kernel.variance(False), rounds).beta[0]

@@ -50,6 +50,7 @@ from ...core.carriers import FREQUENCY
 from ...core.receivers import receiver_index
 from ...models import Fitted, Inputs
 from ...parallel import Scheduler, row_parts
+from ...parallel.threads import on_threads
 from ...receivers.spreads import PathStatistics
 from ...runs.results import RECEPTION
 from ...runs.run import Run, open_run
@@ -64,7 +65,7 @@ if TYPE_CHECKING:
 
 THRESHOLD_DBM = -90.0
 CHUNK_SIZE = 10_000
-"""Largest number of positions in a chunk, each counted for each heading, and with a scene for each receiver."""
+"""Largest number of positions in a chunk, each counted for each heading, and for each receiver if paths are traced."""
 CHUNK_BYTES = 1 << 28  # bytes of a chunk's observations, with the copies that models make of them
 VALUE_BYTES = 32  # of each value of an observation: mean and standard deviation in float64, and a copy of each
 
@@ -213,7 +214,8 @@ def map_values(
     """
     each = int(np.prod(run.problem.record.observation.shape[2:]))
     size = min(CHUNK_SIZE, CHUNK_BYTES // (VALUE_BYTES * each))
-    size = size if run.problem.scene is None else min(size, CHUNK_SIZE // len(run.receivers))
+    if run.problem.scene is not None and run.fitted.traces:
+        size = min(size, CHUNK_SIZE // len(run.receivers))
     size = max(1, size // max(len(conditions.headings_rad), 1))
     variables = dict[str, NDArray[np.float32]]()
     scene = run.problem.opened_scene
@@ -254,11 +256,13 @@ def _mapped_part(
 ) -> list[dict[str, Any]]:
     # A chunk is traced to all receivers together, unless these are more than the mapped ones.
     fitted = run.fitted.tracing_once() if len(receivers) == len(run.receivers) else run.fitted
-    return [_of_chunk(run, fitted, positions_m, receiver, conditions) for receiver in receivers]
+    of_receiver = partial(_of_chunk, run, fitted, positions_m, conditions)
+    # What traces is not for threads, and has threads of its own.
+    return list(map(of_receiver, receivers)) if fitted.traces else on_threads(of_receiver, receivers)
 
 
 def _of_chunk(
-    run: Run, fitted: Fitted, positions_m: FloatArray, receiver: int, conditions: Conditions
+    run: Run, fitted: Fitted, positions_m: FloatArray, conditions: Conditions, receiver: int
 ) -> dict[str, Any]:
     task, count = run.problem.record.task, len(positions_m)
     inputs = conditions.inputs(positions_m)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
-from ...core import Prediction
+from ...core import Prediction, Split
 from ...core.angles import FloatArray
 from ...core.carriers import FREQUENCY
 from ...estimators.receiver_places import stored_places
@@ -75,7 +75,8 @@ def map_figure(dataset: xarray.Dataset, run: Run) -> Figure:
     the map's carrier have their measured level as colour, circles those that trained the model, squares all others.
     """
     flat = "point" not in dataset.sizes
-    measured = [_measured(dataset, run, k) for k in range(dataset.sizes["receiver"])]
+    split = load_rows(run.folder, run.problem.record)
+    measured = [_measured(dataset, run, split, k) for k in range(dataset.sizes["receiver"])]
     panels, estimated = _panels(dataset, measured), stored_places(run.folder)
     lines = -(-len(panels) // COLUMNS)
     columns = min(COLUMNS, len(panels))
@@ -227,9 +228,9 @@ def _aspect(dataset: xarray.Dataset) -> float:
     return 0.9 if "point" in dataset.sizes else float(np.clip(y_m / x_m, 0.3, 1.6))
 
 
-def _measured(dataset: xarray.Dataset, run: Run, number: int) -> _Measured:
+def _measured(dataset: xarray.Dataset, run: Run, split: Split, number: int) -> _Measured:
     """Rows with a level at a receiver of a map, at its carrier, thinned."""
-    record, split = run.problem.record, load_rows(run.folder, run.problem.record)
+    record = run.problem.record
     task, index = record.task, int(np.atleast_1d(dataset.attrs["receiver_numbers"])[number])
     added = float(dataset.attrs["transmit_power_dbm"]) if task.level_kind == "gain" else 0.0
     level = task.level(Prediction(record.observation[index])).mean + added

@@ -76,10 +76,7 @@ class KrigingSystem:
         covariance[np.diag_indices(n)] += noise
         self._lower = cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)
         self.trend = np.zeros((n, 0)) if trend is None else trend
-        # Columns of other receivers' terms are zero, and stay so.
-        self._used = np.flatnonzero(self.trend.any(axis=0))
-        self._trend = np.zeros(self.trend.shape, self._lower.dtype)
-        self._trend[:, self._used] = self.whiten(self.trend[:, self._used])
+        self._trend = self.whiten(self.trend)
 
     def whiten(self, values: Values) -> Values:
         """L^-1 v of columns v [n, q], K = L L^H."""
@@ -97,14 +94,7 @@ class KrigingSystem:
     @property
     def information(self) -> FloatArray:
         """B^T K^-1 B [p, p]: inverse covariance of the trend's coefficients without a prior."""
-        total = np.zeros((self.trend.shape[1],) * 2, self._trend.dtype)
-        self.add_information(total)
-        return total
-
-    def add_information(self, total: FloatArray) -> None:
-        """Add `information` to a matrix."""
-        used = self._trend[:, self._used]
-        total[np.ix_(self._used, self._used)] += used.conj().T @ used
+        return np.asarray(self._trend.conj().T @ self._trend)
 
     def projected(self, values: Values) -> Values:
         """B^T K^-1 y [p, q] of observations [n, q]."""
@@ -150,12 +140,10 @@ class KrigingSystem:
         if trend is None:
             return np.asarray(left)
         # And that of the trend's coefficients, R^T (B^T K^-1 B)^-1 R with R = b - B^T K^-1 k (equation 2.42).
+        gap = trend - half.T @ self._trend
         if covariance is None:
-            gap = trend - half.T @ self._trend
             return np.asarray(left + (gap * np.linalg.solve(self.information, gap.T).T).sum(axis=1))
-        used = np.union1d(self._used, np.flatnonzero(trend.any(axis=0)))  # of other receivers' terms none
-        gap = trend[:, used] - half.T @ self._trend[:, used]
-        return np.asarray(left + np.einsum("mp,mp->m", gap @ covariance[np.ix_(used, used)], gap))
+        return np.asarray(left + np.einsum("mp,mp->m", gap @ covariance, gap))
 
     @property
     def precision(self) -> Values:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -43,12 +43,19 @@ def of_each(work: Callable[[Any], Result], parts: Sequence[Any], rows: int) -> l
         return [work(part) for part in parts]
 
 
+class Basis(NamedTuple):
+    """Columns [n, p] of phi that are not zero for a receiver, and their numbers [p] among the coefficients beta [k]."""
+
+    columns: FloatArray
+    used: IntArray
+
+
 @dataclass(frozen=True)
 class ReceiverObservations:
-    """Observations of one receiver: numbers of their inputs [n], phi [n, k], y [n], variance of the noise [n]."""
+    """Observations of one receiver: numbers of their inputs [n], phi [n], y [n], variance of the noise [n]."""
 
     rows: IntArray
-    basis: FloatArray
+    basis: Basis
     value: FloatArray
     variance: FloatArray
 
@@ -88,17 +95,18 @@ class PooledProcess:
         def system(p: ReceiverObservations) -> KrigingSystem:
             inputs = self._inputs.take(p.rows)
             covariance = kernel(inputs, inputs) if every is None else every[np.ix_(p.rows, p.rows)]
-            return KrigingSystem(covariance, p.variance + jitter, p.basis)
+            return KrigingSystem(covariance, p.variance + jitter, p.basis.columns)
 
         self._systems = of_each(system, parts, sum(len(p.value) for p in parts))
-        pairs = list(zip(self._systems, parts, strict=True))
+        triples = [(system, part.basis.used, part.value) for system, part in zip(self._systems, parts, strict=True)]
         # Receivers are independent given beta: their information adds up to the prior's (equation 2.41).
-        self._information = np.diag(1 / np.square(self._prior_sd))
-        for each in self._systems:
-            each.add_information(self._information)
+        self._information, projected = np.diag(1 / np.square(self._prior_sd)), np.zeros(len(self._prior_sd))
+        for each, used, value in triples:
+            self._information[np.ix_(used, used)] += each.information
+            projected[used] += each.projected(value)
         vars(self).pop("covariance", None)
-        self.beta = np.linalg.solve(self._information, sum(system.projected(part.value) for system, part in pairs))
-        self._weights = [system.weights(part.value, self.beta) for system, part in pairs]
+        self.beta = np.linalg.solve(self._information, projected)
+        self._weights = [each.weights(value, self.beta[used]) for each, used, value in triples]
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -115,11 +123,16 @@ class PooledProcess:
         volume = float(np.linalg.slogdet(self._information)[1] + 2 * np.log(self._prior_sd).sum())
         return square + volume + sum(system.log_determinant for system in self._systems)
 
-    def predict(self, receiver: int, inputs: Any, basis: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis`` [m, k]."""
+    def predict(self, receiver: int, inputs: Any, basis: Basis) -> tuple[FloatArray, FloatArray]:
+        """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis``."""
         cross = self._kernel(inputs, self._inputs.take(self._parts[receiver].rows))
-        mean = basis @ self.beta + cross @ self._weights[receiver]
-        return mean, self._systems[receiver].variance(self._point_variance, cross, basis, self.covariance)
+        mean = self.trend(basis) + cross @ self._weights[receiver]
+        covariance = self.covariance[np.ix_(basis.used, basis.used)]
+        return mean, self._systems[receiver].variance(self._point_variance, cross, basis.columns, covariance)
+
+    def trend(self, basis: Basis) -> FloatArray:
+        """Posterior mean [m] of phi . beta."""
+        return np.asarray(basis.columns @ self.beta[basis.used])
 
     def weights(self, receiver: int) -> tuple[Any, FloatArray]:
         """Inputs of a receiver's observations, and weights [n] of the field's covariances with them in a mean."""
@@ -128,7 +141,7 @@ class PooledProcess:
     def residual(self, receiver: int) -> tuple[IntArray, FloatArray]:
         """Numbers of the inputs of a receiver's observations [n], and what phi . beta leaves of these [n]."""
         part = self._parts[receiver]
-        return part.rows, part.value - part.basis @ self.beta
+        return part.rows, part.value - self.trend(part.basis)
 
     def _reweighted(self, variance: Sequence[FloatArray]) -> list[ReceiverObservations]:
         """Parts with the noise variances that their residuals imply for Student-t noise.

@@ -20,7 +20,7 @@ from ...core.stored import NOT_STORED
 from ...core.types import IntArray
 from ...tasks.scores import LEVEL, REAL_90
 from .path_loss import FREE_SPACE, NEAREST_M
-from .pooled_process import PooledProcess, ReceiverObservations, of_each
+from .pooled_process import Basis, PooledProcess, ReceiverObservations, of_each
 from .strength_terms import PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
 from .strength_trees import Forest
 
@@ -57,8 +57,8 @@ class PriorMean:
     sd: FloatArray
     rx_sd_db: float
 
-    def columns(self, poses: Poses, receiver: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Expected dBm [n], columns [n, k] of its corrections, and their prior standard deviations [k]."""
+    def columns(self, poses: Poses, receiver: int) -> tuple[FloatArray, Basis, FloatArray]:
+        """Expected dBm [n], columns of its corrections, and the prior standard deviations of all receivers' [k]."""
         if self.traced is not None:
             power = self.traced(poses.position_m, receiver)
             level = power - self.traced.level_dbm  # centred, so that factor and offset are apart
@@ -104,8 +104,8 @@ class StrengthPosterior:
         return self.stops.poses.moved(self.hyperparameters.lever_m)
 
     @cached_property
-    def _terms(self) -> list[tuple[IntArray, FloatArray, FloatArray]]:
-        """Of each receiver: numbers of its stops [n], columns of the mean [n, k], values less the expected [n]."""
+    def _terms(self) -> list[tuple[IntArray, Basis, FloatArray]]:
+        """Of each receiver: numbers of its stops [n], columns of the mean [n], values less the expected [n]."""
         terms = []
         for receiver, values in enumerate(self.stops.value_dbm):
             received = np.flatnonzero(np.isfinite(values))
@@ -142,9 +142,9 @@ class StrengthPosterior:
         terms = [self.prior.columns(each, receiver)[:2] for each in moved]
 
         def posterior(k: int) -> tuple[FloatArray, FloatArray]:
-            mean, variance = self._process.predict(receiver, moved[k], terms[k][1])
+            mean, variance = spread.predict(receiver, moved[k], terms[k][1])
             if spread is not self._process:
-                variance = spread.predict(receiver, moved[k], terms[k][1])[1]
+                mean = self._mean(moved[k], receiver, terms[k][1])
             if self.forest is not None:
                 more = self.forest.predict(poses[k], receiver)
                 mean, variance = mean + more[0], variance + more[1]
@@ -163,10 +163,13 @@ class StrengthPosterior:
         """The mean of `predict`, dBm."""
         moved = poses.moved(self.hyperparameters.lever_m)
         expected, columns, _ = self.prior.columns(moved, receiver)
+        mean = expected + self._mean(moved, receiver, columns)
+        return mean if self.forest is None else mean + self.forest.predict(poses, receiver)[0]
+
+    def _mean(self, moved: Poses, receiver: int, columns: Basis) -> FloatArray:
+        """What corrects the expected power at antennas [m], without trees, dB."""
         field = self.hyperparameters.weighted_covariance(moved, *self._process.weights(receiver))
-        if self.forest is not None:
-            field = field + self.forest.predict(poses, receiver)[0]
-        return expected + columns @ self._process.beta + field
+        return self._process.trend(columns) + field
 
 
 def by_likelihood(

@@ -27,6 +27,7 @@ from ...core.angles import FloatArray
 from ...core.settings import Finite, Positive
 from ...core.types import IntArray
 from .path_loss import NEAREST_M
+from .pooled_process import Basis
 
 HARMONICS = 3
 """Harmonics of the transmitter's pattern over psi; more changed the held-out error of flat-ble by under 0.005 dB."""
@@ -110,15 +111,16 @@ class Hyperparameters:
 
     def weighted_covariance(self, a: Poses, b: Poses, weights: FloatArray) -> FloatArray:
         """Covariances times weights [m], shape [n]; positions and headings that repeat are evaluated once."""
+        if a.heading_rad is None:
+            return np.asarray(self.covariance(a, b) @ weights)
         places, place = np.unique(a.position_m, axis=0, return_inverse=True)
-        headings = np.zeros(len(a)) if a.heading_rad is None else a.heading_rad
-        turns, turn = np.unique(headings, return_inverse=True)
+        turns, turn = np.unique(a.heading_rad, return_inverse=True)
         if len(places) * len(turns) > MOST_PAIRS * len(a):
             return np.asarray(self.covariance(a, b) @ weights)
         # A map has every position at every heading: the body's part factors into one of positions and one of headings.
         distance = cdist(places, b.position_m)
         total = np.asarray(self.shadow_db**2 * (np.exp(-distance / self.shadow_m) @ weights))[place.ravel()]
-        if a.heading_rad is not None and b.heading_rad is not None:
+        if b.heading_rad is not None:
             shares = np.exp(self.concentration * (np.cos(turns[:, None] - b.heading_rad) - 1)) * weights
             body = self.body_db**2 * (np.exp(-distance / self.body_m) @ shares.T)
             total = total + body[place.ravel(), turn]
@@ -148,13 +150,13 @@ def basis(
     traced_dbm: FloatArray | None,
     sd: FloatArray,
     rx_sd_db: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Columns of the mean [n, k] for n poses, and the prior standard deviations of their coefficients [k], above 0.
+) -> tuple[Basis, FloatArray]:
+    """Columns of the mean for n poses, and the prior standard deviations of the coefficients of all receivers [k].
 
-    Columns of the other receivers' parts are zero, so that k is the same for all receivers. ``traced_dbm`` [n] is the
-    local mean of the traced power less a typical level, None without a scene. ``sd`` [4, 2] holds the deviations of the
-    part common to all receivers and of each receiver's part: offset in dB, exponent of distance, factor of the traced
-    power, first harmonic over psi in dB (the k-th has 1 / k of it); ``rx_sd_db`` that of the first harmonic over phi.
+    ``traced_dbm`` [n] is the local mean of the traced power less a typical level, None without a scene. ``sd`` [4, 2]
+    holds the deviations of the part common to all receivers and of each receiver's part: offset in dB, exponent of
+    distance, factor of the traced power, first harmonic over psi in dB (the k-th has 1 / k of it); ``rx_sd_db`` that of
+    the first harmonic over phi.
     """
     away = receivers_m[receiver] - poses.position_m
     distance = np.maximum(np.linalg.norm(away, axis=1), NEAREST_M)
@@ -171,17 +173,14 @@ def basis(
     for k in range(1, RX_HARMONICS + 1):
         terms += [(wave(k * bearing), 0, rx_sd_db / k) for wave in (np.cos, np.sin)]
     # The part of each term that is common to all receivers, and that of each; a deviation of 0: there is no such part.
-    count, begin = len(receivers_m), 0
-    sizes = [1 * (common > 0) + count * (each > 0) for _, common, each in terms]
-    columns, deviations = np.zeros((len(poses), sum(sizes))), np.empty(sum(sizes))
-    for (column, common, each), size in zip(terms, sizes, strict=True):
-        if common > 0:
-            columns[:, begin], deviations[begin] = column, common
-        if each > 0:
-            columns[:, begin + size - count + receiver] = column
-            deviations[begin + size - count : begin + size] = each
-        begin += size
-    return columns, deviations
+    count, columns, used, deviations = len(receivers_m), list[FloatArray](), list[int](), list[float]()
+    for column, common, each in terms:
+        for deviation, size, own in ((common, 1, 0), (each, count, receiver)):
+            if deviation > 0:
+                columns.append(column)
+                used.append(len(deviations) + own)
+                deviations += [deviation] * size
+    return Basis(np.stack(columns, axis=1), np.array(used)), np.array(deviations)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from collections.abc import Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -91,7 +92,8 @@ class Strengths(Fitted):
 
     def __post_init__(self) -> None:
         """Headings count where the training rows had them."""
-        self.uses_heading = self.field.headings
+        self.uses_heading, traced = self.field.headings, self.field.prior.traced
+        self.traces = traced is not None and traced.exact
         self.run_sd_db = None if self.offsets is None else self.offsets.sd_db
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
@@ -103,9 +105,11 @@ class Strengths(Fitted):
         position_m = finite_positions(inputs, "kriging")
         mean, std, std_mean = np.empty((3, len(position_m)))
         noise = self.field.noise * self.widen[receiver] ** 2
-        for rows, poses in self._chunks(position_m, inputs):
-            with one_blas_thread():
-                means, variances = zip(*self.field.predict(poses, receiver), strict=True)
+        chunks = self._chunks(position_m, inputs)
+        with one_blas_thread():
+            predicted = iter(self.field.predict([each for _, poses in chunks for each in poses], receiver))
+        for rows, poses in chunks:
+            means, variances = zip(*islice(predicted, len(poses)), strict=True)
             # Of unknown headings: variance within each, and between their means.
             variance = np.mean(variances, axis=0) * self.widen[receiver] ** 2 + np.var(means, axis=0)
             mean[rows] = np.mean(means, axis=0)
