@@ -30,6 +30,7 @@ polarisation of some paths, but a co-polarised link keeps most of its power."""
 SAMPLE = 256  # transmitters on which the gain is judged
 TRACED, ROUGH = 32, TraceOptions(transmission=True, depth=2, reflections=1, rays=1 << 12)
 """Transmitters and options of the trace for models that do not trace all transmitters at once."""
+TRIED = 16  # receivers of that trace: antennas of one building are alike, and each takes a search
 
 
 class RayTracer:
@@ -168,10 +169,15 @@ def warn_of_cross_polarization(traced: TraceResult, scene: Any) -> None:
 
 
 def check_polarization(scene: Any, tx_pos_m: FloatArray, receivers: Sequence[Receiver], tx_antenna: Antenna) -> None:
-    """Trace a few of the transmitters [n, 3], metres, and warn of cross-polarised receivers."""
-    few = tx_pos_m[spread(len(tx_pos_m), TRACED)]
-    traced = trace_paths(scene, few, receivers, ROUGH, tx_antenna=tx_antenna, check=False)
-    warn_of_cross_polarization(traced, scene)
+    """Trace a few of the transmitters [n, 3], metres, and warn of cross-polarised receivers among a few of those stated.
+
+    Whoever has not stated where a receiver is has not stated its antenna either.
+    """
+    few, stated = tx_pos_m[spread(len(tx_pos_m), TRACED)], [receiver for receiver in receivers if receiver.is_surveyed]
+    if stated:
+        tried = [stated[place] for place in spread(len(stated), TRIED)]
+        traced = trace_paths(scene, few, tried, ROUGH, tx_antenna=tx_antenna, check=False)
+        warn_of_cross_polarization(traced, scene)
 
 
 def _median_power(traced: TraceResult) -> FloatArray:
