@@ -15,7 +15,7 @@ from ...core import InputError, Record
 from ...core.carriers import carriers_text
 from ...core.files import listed, one_line
 from ..importing.options import AVERAGES
-from .options import DATASET, Arguments, add_command
+from .options import DATASET, Arguments, add_command, comma_numbers
 from .output import exit_status, show
 
 SHOWN_CARRIERS = 8
@@ -62,7 +62,17 @@ def _add_import(data: Any) -> None:
     add("--not-heard", action="append", metavar="DBM", help=text)
     add("--average", choices=AVERAGES, help="mean of the readings of a place (default: db)")
     add("--place", dest="place_m", **metres, help="average in squares of this side (default: at equal positions)")
-    add("--units", metavar="UNIT", help="unit of positions: m, mm, cm, km, ft, deg (default: by names, or m)")
+    add("--units", metavar="UNIT", help="unit of positions: m, mm, cm, km, ft, deg, px (default: by names, or m)")
+    add(
+        "--plan", metavar="PICTURE", help="plan in whose pixels positions are (--units px), y down; or a ROS map's YAML"
+    )
+    add("--resolution", dest="resolution_m", **metres, help="side of a pixel of the plan")
+    text = "point of the plan, from its lower left corner, metres, that becomes the origin, as of mesh"
+    add("--origin", dest="origin_m", type=comma_numbers(3, "X,Y,Z"), metavar="X,Y,Z", help=text)
+    text = "move positions by pairs of points: x,y,to_x,to_y, in the tables' unit and in metres"
+    add("--register-pairs", metavar="CSV", help=text)
+    text = "axis that is up in a trajectory of --positions: z, y, or -y (a camera's frame) as --up=-y"
+    add("--up", metavar="AXIS", help=text)
     add("--pitch", dest="pitch_m", **metres, help="positions are indices of a grid of this pitch")
     add("--crs", metavar="CRS", help="coordinate reference system of positions, such as EPSG:3857")
     text = "unit of headings: rad, deg (from x towards y) or compass (degrees from north, clockwise)"

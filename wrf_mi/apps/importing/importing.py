@@ -22,7 +22,8 @@ from ...datasets.ble_folder import CARRIER_HZ, write_ble_folder
 from ...datasets.unknown import SENT, name_words
 from ...tasks import RSSI
 from .files import Table, joined, read_table
-from .forms import HERTZ, described, find_columns, parsed_columns, unit_of, without_slots
+from .fixes import with_fixes, without_stale
+from .forms import HERTZ, PIXELS, described, find_columns, parsed_columns, unit_of, without_slots
 from .options import ImportOptions, option_name
 from .picture import plan_picture
 from .places import (
@@ -38,6 +39,7 @@ from .places import (
     with_cells,
     with_positions,
 )
+from .programs import RADIOS
 from .readings import (
     Means,
     Readings,
@@ -48,14 +50,14 @@ from .readings import (
     without_not_heard,
 )
 from .receivers_table import read_receivers
+from .registration import registered_frame
+from .trajectories import upright
 
 FACTS, PICTURE = "import.yml", "plan.png"  # files beside the tables: what the import assumed, and a plan of the rows
 MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
 MOST_CELLS = 50_000_000  # largest number of receivers times places: 2 GB while means are computed
 BAND = 0.25  # largest relative spread of the channels of one band: 0.14 of Wi-Fi at 5 GHz, while 2.4 and 5 GHz are two
 TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
-RADIOS = frozenset({"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "umts", "tdscdma", "lte", "nr", "5g"})
-"""Values of a column of kinds of radio, in small letters."""
 SENT_IN_NAME = re.compile(r"(?<![\d.])(-?\d+(?:\.\d+)?)[ _]?dbm", re.IGNORECASE)
 STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
 
@@ -143,7 +145,7 @@ class _Import:
         self._check_radios(readings)
 
         # Rows of one position, heading, carrier, run and part of the split are averaged.
-        conditions = self._conditions(readings)
+        conditions = self._conditions(readings, frame)
         keys = {"z": xyz_m[:, 2], **conditions, "part": self.is_test}
         place = place_numbers(keys, xyz_m[:, :2], self.options.place_m)
         count = np.bincount(place)
@@ -180,7 +182,9 @@ class _Import:
 
         # Tables, each with positions of another file, if any.
         paths = [*files, *options.test]
-        tables, positions = ([read_table(path, options.sheet) for path in part] for part in (paths, options.positions))
+        as_is = {"id", "rssi"} <= self.stated.keys()
+        tables = [without_stale(read_table(path, options.sheet, as_is), self.stated) for path in paths]
+        positions = [upright(read_table(path, options.sheet), options.up) for path in options.positions]
         if len(positions) not in (0, 1, len(paths)):
             text = f"{len(positions)} files of positions for {len(paths)} tables"
             raise InputError(f"--positions: {text}; give one for each table, those of --test last, or one for all")
@@ -188,17 +192,20 @@ class _Import:
             positions *= len(paths) // len(positions)
             pairs = [with_positions(*pair, self.stated) for pair in zip(tables, positions, strict=True)]
             tables = [table for table, _ in pairs]
+            self.notes += positions[0].notes[1:]
             self.notes.append(f"positions of {options.positions[0]} are matched {pairs[0][1]}")
 
         # One table of all rows that are chosen, and the number of each row's file.
-        tables = [without_slots(table) for table in tables]
+        tables = [with_fixes(table, self.stated) for table in tables]
+        tables = tables if as_is else [without_slots(table) for table in tables]
         self._file = np.repeat(np.arange(len(paths)), list(map(len, tables)))
         table = joined(tables)
         for name, text in options.where.items():
             chosen_rows = table.where(name, text)
             left_out = len(table) - np.count_nonzero(chosen_rows)
             self.notes.append(f"{left_out} rows are left out: their {one_line(name)} is not {one_line(text)}")
-            table = dataclasses.replace(table, frame=table.frame[chosen_rows])
+            frame = table.frame[chosen_rows].dropna(axis=1, how="all")  # columns of other kinds of rows
+            table = dataclasses.replace(table, frame=frame)
             self._file = self._file[chosen_rows]
         return table, self._file >= len(files)
 
@@ -210,17 +217,37 @@ class _Import:
             "storey_m": (without_z and "floor" in of, "it belongs to a column floor without z"),
             "heading": ("heading" in of, "the table has no column of headings"),
             "anchor_height_m": (self.options.anchors is not None, "it belongs to --anchors"),
+            "plan": (self._unit() in PIXELS and self.options.register_pairs is None, "it belongs to --units px"),
+            "resolution_m": (self.options.plan is not None, "it belongs to --plan"),
+            "origin_m": (self.options.plan is not None, "it belongs to --plan"),
+            "up": (bool(self.options.positions), "it belongs to a trajectory of --positions"),
         }
         for name, (counts, reason) in needed.items():
             if not counts and getattr(self.options, name) != getattr(ImportOptions, name):
                 raise DataFault(self.table.files[0][0], f"{option_name(name)}: {reason}; omit it")
+
+    def _unit(self) -> str:
+        """Unit of positions that is stated by an option, a column's name, or a survey with a picture; or ""."""
+        options, of, table = self.options, self.columns.of, self.table
+        unit = options.units or self.columns.unit("x" if "x" in of else "lon")
+        if not unit and not options.pitch_m and table.image and "x" in of:
+            where = f"x and y are points of {one_line(table.image)}; give --units px --plan {shlex.quote(table.image)}"
+            text = "--resolution M (metres of a pixel), --units px --register-pairs pairs.csv, or --units m"
+            raise DataFault(table.files[0][0], f"{where} {text}")
+        return unit
 
     def _positions(self) -> tuple[LocalFrame, FloatArray]:
         """The local frame and the positions [rows, 3] in it."""
         options, table, of = self.options, self.table, self.columns.of
         first, second, geographic = plane_columns(of, table)
         xy = finite_columns(table, [first, second])
-        unit = options.units or self.columns.unit("lon" if geographic else "x")
+        unit = self._unit()
+        if unit in PIXELS or options.register_pairs is not None:
+            pairs, is_pixels = options.register_pairs, unit in PIXELS
+            frame, note = registered_frame(options.plan, options.resolution_m, options.origin_m, pairs, is_pixels)
+            self.units |= {"x": unit or "registered", "y": unit or "registered"}
+            self.notes.append(note)
+            return frame, np.column_stack([frame.local_m(xy), self._heights_m()])
         scale_m = options.pitch_m or unit_scale(unit, "--units")
         frame, notes = find_frame(xy, geographic, unit, scale_m, options.crs)
         self.notes += notes
@@ -234,7 +261,8 @@ class _Import:
         """Heights of the rows, from z, the floor, or an assumption."""
         options, table, of = self.options, self.table, self.columns.of
         if "z" in of:
-            self.units["z"] = self.columns.unit("z") or options.units.replace("deg", "m") or "m"
+            unit = "m" if options.units in ("deg", *PIXELS) else options.units
+            self.units["z"] = self.columns.unit("z") or unit or "m"
             return finite_columns(table, [of["z"]])[:, 0] * unit_scale(self.units["z"], "--units")
         count, stated_m = int(self._file.max()) + 1, np.atleast_1d(np.asarray(options.height_m, float))
         if len(stated_m) not in (1, count):
@@ -294,7 +322,7 @@ class _Import:
         self.notes.append(f"files at {', '.join(distinct)} dBm sent, by their names: a run for each, with its offset")
         return np.asarray(texts[self._file])
 
-    def _conditions(self, readings: Readings) -> dict[str, Any]:
+    def _conditions(self, readings: Readings, frame: LocalFrame) -> dict[str, Any]:
         """Heading, carrier and run of each row where stated; rows that differ in them are not averaged."""
         of, table, conditions = self.columns.of, self.table, {}
         if "split" in of:
@@ -305,7 +333,9 @@ class _Import:
                 self.columns.kept.append(of.pop(meaning))
         if "heading" in of:
             headings = finite_columns(table, [of["heading"]])[:, 0]
-            conditions["heading"], self.units["heading"] = headings_rad(headings, of["heading"], self.options.heading)
+            headings, unit = headings_rad(headings, of["heading"], self.options.heading)
+            conditions["heading"] = headings if "north" in unit else frame.headings_rad(headings)
+            self.units["heading"] = unit
         if "run" in of:
             conditions["run"] = table.frame[of["run"]].astype(str).str.strip().to_numpy(str)
         if (sent := self._sent(readings)) is not None:
@@ -359,7 +389,8 @@ class _Import:
         """Receivers with the carriers of their readings, if these state any."""
         options = self.options
         table = None if options.anchors is None else read_table(options.anchors, options.sheet)
-        receivers, notes = read_receivers(table, ids, frame, options.units, options.anchor_height_m)
+        unit = PIXELS[0] if self._unit() in PIXELS else options.units
+        receivers, notes = read_receivers(table, ids, frame, unit, options.anchor_height_m)
         pairs = zip(ids, receivers, strict=True)
         carriers = [self.carrier_of.get(name, receiver.frequency_hz) for name, receiver in pairs]
         if None in carriers or options.frequency_hz:  # one carrier for all

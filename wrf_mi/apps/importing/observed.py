@@ -66,8 +66,7 @@ def _positions_m(table: Table, columns: Columns, frame: Mapping[str, Any] | None
         return None
     *names, geographic = plane_columns(columns.of, table)
     if frame is not None:
-        of_import = LocalFrame(frame["crs"], frame["scale_m"], tuple(frame["origin"]), frame["swapped"])
-        return of_import.local_m(finite_columns(table, names))
+        return LocalFrame.from_facts(frame).local_m(finite_columns(table, names))
     if geographic:
         text = "positions in degrees, and the data of the run state no origin; give x, y in its frame, or no positions"
         raise DataFault(table.files[0][0], text, line=1)
