@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from wrf_mi import import_measurements
 from wrf_mi.apps.importing import ImportReport
 from wrf_mi.core import Record
-from wrf_mi.scene.plan.sources import read_plan
+from wrf_mi.scene.plan.sources import PlanGrid, read_plan
 
 pandas = pytest.importorskip("pandas")
 pytest.importorskip("pyproj")
@@ -53,15 +53,13 @@ def plan(tmp_path: Path) -> Path:
     return tmp_path / "plan.png"
 
 
-CLICKS = "px,bssid,rssi\nx,y,bssid,rssi\n40,20,a,-50\n180,90,a,-70\n40,20,b,-61\n"
-
-
 def test_pixels_of_a_plan_lie_where_its_walls_are(plan: Path, tmp_path: Path) -> None:
     file = written(tmp_path, "clicks.csv", "x,y,bssid,rssi\n42.5,40.5,a,-50\n180,90,a,-70\n42.5,40.5,b,-61\n")
     anchors = written(tmp_path, "aps.csv", "id,x,y\na,0,100\nb,200,0\n")
     options = {"units": "px", "plan": plan, "resolution_m": RESOLUTION_M, "anchors": anchors}
     report = imported(tmp_path, file, **options)
     grid = read_plan(plan, RESOLUTION_M)
+    assert isinstance(grid, PlanGrid)
     middle = grid.centres_m(grid.occupied).mean(axis=0)
     np.testing.assert_allclose(report.record.tx_pos_m[0, :2], middle, atol=RESOLUTION_M / 2)
     np.testing.assert_allclose(report.record.tx_pos_m[1, :2], [9.0, 0.5])
@@ -84,7 +82,7 @@ def test_pixels_are_registered_by_pairs(tmp_path: Path) -> None:
     np.testing.assert_allclose(record.tx_heading_rad, np.pi / 6)
 
 
-REFUSED_PIXELS = {
+REFUSED_PIXELS: dict[str, tuple[dict[str, Any], str]] = {
     "no plan": ({"units": "px"}, r"--units px: pixels of which picture\? Give --plan plan\.png, or --register-pairs"),
     "no scale": ({"units": "px", "plan": True}, r"a picture has no resolution; give .*\(--resolution\)"),
     "no pixels": ({"plan": True}, "--plan: it belongs to --units px; omit it"),
@@ -141,6 +139,7 @@ def test_json_of_surveys_with_a_picture_and_points(case: str, plan: Path, tmp_pa
     ("name", "text", "message"),
     [
         ("s.json", '{"points": [{"a": 1}]}', "no object with a strength .*--columns x=x,y=y,id=bssid,rssi=rssi"),
+        ("s.json", '{"a": ' * 900 + "1" + "}" * 900, "no object with a strength|no JSON|without end"),
         ("s.json", "{", "no JSON .*export the survey again"),
         ("t.csv", "x,y,box,v\n1,2,02:00:00:00:00:01,-60\n", "--columns box"),
         ("t.csv", "u,v,name,q\n1.5,2,hall,b\n1,3,hall,c\n2,3,attic,d\n", r"try --columns 'x=u,y=v,id=name,rssi=\?'"),
@@ -208,8 +207,8 @@ def test_serving_cell_and_neighbours_of_gnettrack_are_receivers(tmp_path: Path) 
 
 def test_fixes_and_strengths_in_alternate_rows_of_nemo(tmp_path: Path) -> None:
     """The second reading is a quarter of the way from the first fix to the second; the last one is after all fixes."""
-    names = ("RSRP (LTE pcell)", "Physical cell identity (LTE pcell)")
-    names += ("RSRP (LTE detected) - 1", "Physical cell identity (LTE detected) - 1")
+    names = ["RSRP (LTE pcell)", "Physical cell identity (LTE pcell)"]
+    names += ["RSRP (LTE detected) - 1", "Physical cell identity (LTE detected) - 1"]
     rows = ["2024-05-01 10:00:00.0,48.0,11.0,,,,", "2024-05-01 10:00:01.0,,,-80,7,-90,8"]
     rows += ["2024-05-01 10:00:04.0,48.0004,11.0,,,,", "2024-05-01 10:00:05.0,,,-85,7,,"]
     file = written(tmp_path, "nemo.csv", "\n".join(["Time,Latitude,Longitude," + ",".join(names), *rows]) + "\n")
@@ -252,6 +251,19 @@ def test_event_logs_with_waypoints_without_cached_scans(tmp_path: Path) -> None:
     assert strengths(record) == {"F0_1_2": {(5.0, 2.0): -70}}
     short = written(tmp_path, "d.txt", event_log(*events, (START, "TYPE_WIFI", "net")))
     error_line(import_measurements, short, tmp_path / "other", "TYPE_WIFI has 3 fields; remove the line")
+
+
+def test_rows_that_received_nothing_are_kept_beside_a_missing_position(tmp_path: Path) -> None:
+    text = "time,x,y,rssi_a\n0,0,0,-50\n1,1,0,\n2,2,0,-60\n3,3,0,-61\n"
+    report = imported(tmp_path, written(tmp_path, "t.csv", text))
+    assert len(report.record) == 4
+    file = written(tmp_path, "u.csv", text + "4,,,-62\n")
+    error_line(import_measurements, file, tmp_path / "other", "row 5: x is empty or infinite; give a number")
+
+
+def test_columns_of_a_room_are_no_cell(tmp_path: Path) -> None:
+    report = imported(tmp_path, written(tmp_path, "t.csv", "x,y,area,cell,rssi\n0,0,12,a,-50\n1,0,12,b,-60\n"))
+    assert [receiver.name for receiver in report.record.receivers] == ["a", "b"]
 
 
 def test_last_seen_of_another_clock_is_not_used(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def add_parser(commands: Any) -> None:
 
 
 def _add_import(data: Any) -> None:
-    text = "make a data set from tables of signal strengths: CSV, Parquet, Excel (docs/howto/own-data.md)"
+    text = "make a data set from tables, surveys and logs of signal strengths (docs/howto/own-data.md, surveys.md)"
     parser = add_command(data, "import", import_command, text)
     add, metres = parser.add_argument, dict[str, Any](type=float, metavar="M")
     add("files", nargs="+", metavar="FILE", help="tables with a column per receiver, or a row per reading")

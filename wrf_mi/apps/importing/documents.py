@@ -42,12 +42,15 @@ def read_document(path: Path, text: str) -> tuple[list[Row], str]:
                 content = [json.loads(line) for line in lines]
             except json.JSONDecodeError:
                 raise DataFault(path, f"no JSON ({one_line(error)}); export the survey again") from None
-    rows = list(_rows(content, {}, _is_reading)) or list(_rows(content, {}, _is_point))
+    try:
+        rows, image = list(_rows(content, {}, _is_reading)) or list(_rows(content, {}, _is_point)), _image(content)
+    except RecursionError:
+        raise DataFault(path, "objects within objects without end; export the survey again") from None
     if not rows:
         text = "no object with a strength (rssi, level, dbm) or with x and y"
         remedy = "write its points as a table with a row for each reading and --columns x=x,y=y,id=bssid,rssi=rssi"
         raise DataFault(path, f"{text}; {remedy}")
-    return rows, _image(content)
+    return rows, image
 
 
 def _rows(node: Any, around: Row, is_row: Any) -> Iterator[Row]:

@@ -176,11 +176,11 @@ def _of_program(table: Table, as_is: bool) -> Table:
         table = replace(table, frame=frame, has_header=True, notes=(*table.notes, note))
     if set(QUATERNION) <= set(frame.columns):
         frame = frame.rename(columns=POSE_NAMES)
-    program = None if as_is else program_of(list(frame.columns))
-    if program is not None:
+    program = program_of(list(frame.columns))
+    for column, number in program.unknown.items() if program else ():
+        frame = frame.assign(**{column: frame[column].mask(frame[column] == number)})
+    if program is not None and not as_is:
         frame = frame.rename(columns=program.new_name)
-        for column, number in program.unknown.items():
-            frame[column] = frame[column].mask(frame[column] == number)
         notes = (*table.notes, f"{file.name}: columns of {program.name}")
         return replace(table, frame=frame, columns=program.columns, notes=notes)
     if not as_is and (parts := cell_parts(list(frame.columns))):

@@ -58,7 +58,9 @@ def with_fixes(table: Table, stated: Mapping[str, str]) -> Table:
     if is_fix.all():
         return table
     heard, file = _heard(table, of), table.files[0][0].name
-    if "time" in of and (is_fix & ~heard).any() and (heard & ~is_fix).any():
+    # Where most readings have a position of their own, a row without one is a fault, and one without strengths a place
+    # where nothing was received.
+    if "time" in of and (is_fix & ~heard).any() and np.count_nonzero(heard & ~is_fix) > np.count_nonzero(heard) / 2:
         return _interpolated(table, of, is_fix, heard)
     if pair == ("x", "y") or not is_fix.any():
         return table

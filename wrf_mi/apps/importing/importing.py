@@ -21,9 +21,10 @@ from ...core.types import IntArray
 from ...datasets.ble_folder import CARRIER_HZ, write_ble_folder
 from ...datasets.unknown import SENT, name_words
 from ...tasks import RSSI
+from .carriers import carriers_of_receivers, column_hz
 from .files import Table, joined, read_table
 from .fixes import with_fixes, without_stale
-from .forms import HERTZ, PIXELS, described, find_columns, parsed_columns, unit_of, without_slots
+from .forms import PIXELS, described, find_columns, parsed_columns, unit_of, without_slots
 from .options import ImportOptions, option_name
 from .picture import plan_picture
 from .places import (
@@ -56,7 +57,6 @@ from .trajectories import upright
 FACTS, PICTURE = "import.yml", "plan.png"  # files beside the tables: what the import assumed, and a plan of the rows
 MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
 MOST_CELLS = 50_000_000  # largest number of receivers times places: 2 GB while means are computed
-BAND = 0.25  # largest relative spread of the channels of one band: 0.14 of Wi-Fi at 5 GHz, while 2.4 and 5 GHz are two
 TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
 SENT_IN_NAME = re.compile(r"(?<![\d.])(-?\d+(?:\.\d+)?)[ _]?dbm", re.IGNORECASE)
 STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
@@ -88,7 +88,8 @@ def import_measurements(
     at one place are averaged. The folder also holds ``import.yml`` with all that was assumed, and ``plan.png``.
 
     Args:
-        files: tables in CSV, Parquet or Excel; their rows train, unless there is a column ``split``.
+        files: tables in CSV, Parquet or Excel, JSON of surveys, and logs (docs/howto/surveys.md); their rows train, unless
+            there is a column ``split``.
         out: folder to write.
         replace: whether an existing folder is replaced.
         options: attributes of `ImportOptions`.
@@ -344,26 +345,11 @@ class _Import:
             conditions["run"] = np.array([f"{run} {power}".strip() for run, power in zip(runs, powers, strict=True)])
         if "frequency" in of and not self.options.frequency_hz:
             self.units["frequency"] = "-> Hz"
-            conditions |= self._carriers(_hertz(table, of["frequency"]), readings)
+            carriers_hz = column_hz(table, of["frequency"])
+            self.carrier_of, notes = carriers_of_receivers(carriers_hz, readings)
+            self.notes += notes
+            conditions |= {} if self.carrier_of else {"frequency_hz": carriers_hz}
         return conditions
-
-    def _carriers(self, carriers_hz: FloatArray, readings: Readings) -> dict[str, Any]:
-        """Carriers of rows, none where each receiver has its own, as in a scan of Wi-Fi networks."""
-        heard = np.column_stack([readings.receiver, carriers_hz[readings.row]])
-        pairs, count = np.unique(heard, axis=0, return_counts=True)
-        # Access points change their channels now and then; where carriers are compared, every receiver has several.
-        parts = [np.flatnonzero(pairs[:, 0] == number) for number in np.unique(pairs[:, 0])]
-        several = [part for part in parts if len(part) > 1]
-        one_band = all(np.ptp(pairs[part, 1]) <= BAND * pairs[part, 1].min() for part in several)
-        if len(np.unique(pairs[:, 1])) == 1 or 2 * len(several) >= len(parts) or not one_band:
-            return {"frequency_hz": carriers_hz}
-        most = [pairs[part[np.argmax(count[part])]] for part in parts]
-        self.carrier_of = {readings.ids[int(number)]: float(carrier) for number, carrier in most}
-        if several:
-            named = listed([readings.ids[int(pairs[part[0], 0])] for part in several])
-            text = f"{len(several)} of {len(parts)} receivers changed their channel, and have that of most readings"
-            self.notes.append(f"{text}: {named}")
-        return {}
 
     def _means(self, readings: Readings, place: IntArray, places: int) -> tuple[list[str], Means]:
         """Ids of the receivers that remain, and the means of their readings at each place."""
@@ -440,13 +426,3 @@ def _test_rows(table: Table, column: str) -> NDArray[np.bool_]:
         text = f"{one_line(column)} is {one_line(words[wrong[0]])!r}; give train or test, or --columns split=-"
         raise table.fault(text, int(wrong[0]))
     return np.isin(words, TEST_WORDS)
-
-
-def _hertz(table: Table, column: str) -> FloatArray:
-    """Carriers in Hz, from the unit of their column or else by their size."""
-    values = finite_columns(table, [column])[:, 0]
-    if (wrong := values <= 0).any():
-        row = int(np.argmax(wrong))
-        raise table.fault(f"{one_line(column)} is {values[row]:g}; give the carrier, or --columns frequency=-", row)
-    largest = values.max()
-    return values * HERTZ.get(unit_of(column), 1e9 if largest < 1e3 else 1e6 if largest < 1e6 else 1.0)

@@ -90,12 +90,13 @@ def program_of(names: list[str]) -> Program | None:
 
 
 def cell_parts(names: list[str]) -> list[str]:
-    """Columns that identify a cell together; none without both an area and a cell."""
+    """Columns that identify a cell together; none without an area of a network and a cell."""
     parts = {
         part: next((name for name in names if plain_name(name) in words.split("|")), None)
         for part, words in CELL_PARTS.items()
     }
-    return [name for name in parts.values() if name] if parts["area"] and parts["cell"] else []
+    of_network = parts["area"] and (parts["net"] or plain_name(parts["area"]) != "area")
+    return [name for name in parts.values() if name] if of_network and parts["cell"] else []
 
 
 @dataclass(frozen=True)
