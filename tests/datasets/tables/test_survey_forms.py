@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from changed_folders import error_line
+from commands import Command
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -251,6 +252,15 @@ def test_event_logs_with_waypoints_without_cached_scans(tmp_path: Path) -> None:
     assert strengths(record) == {"F0_1_2": {(5.0, 2.0): -70}}
     short = written(tmp_path, "d.txt", event_log(*events, (START, "TYPE_WIFI", "net")))
     error_line(import_measurements, short, tmp_path / "other", "TYPE_WIFI has 3 fields; remove the line")
+
+
+def test_notes_on_many_files_are_printed_for_the_first(tmp_path: Path, command: Command) -> None:
+    events = [(START, "TYPE_WAYPOINT", 1.0, 2.0), wifi(START + 10, -50, START), (START + 90, "TYPE_WAYPOINT", 1.0, 2.0)]
+    files = [written(tmp_path, f"walk{number}.txt", event_log(*events)) for number in range(8)]
+    out = command.done(["data", "import", *files, "--out", tmp_path / "data"])
+    assert out.count("readings were cached") == 3
+    assert "import.yml has 15 more notes of this kind" in out
+    assert (tmp_path / "data" / "import.yml").read_text().count("readings were cached") == 8
 
 
 def test_rows_that_received_nothing_are_kept_beside_a_missing_position(tmp_path: Path) -> None:

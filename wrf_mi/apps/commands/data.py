@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from .options import DATASET, Arguments, add_command, comma_numbers
 from .output import exit_status, show
 
 SHOWN_CARRIERS = 8
+MOST_ALIKE = 3  # notes of one kind on several files that are printed
 
 
 def add_parser(commands: Any) -> None:
@@ -139,9 +142,20 @@ def import_command(a: Arguments) -> int:
     values: dict[str, Any] = {"folder": str(report.folder), "columns": report.columns, "notes": report.notes}
     values |= {"summary": facts, "check": check.as_dict(), "next": next_command}
     rows = f"{a.out}: {facts['rows']} rows, {len(facts['receivers'])} receivers; plan.png shows them"
-    lines = [*report.columns, "", *report.notes, "", rows, *check.lines(), f"next: {next_command}"]
+    lines = [*report.columns, "", *_of_many_files(report.notes), "", rows, *check.lines(), f"next: {next_command}"]
     show(a.json, values, "\n".join(lines))
     return 0 if check.ok else 2
+
+
+def _of_many_files(notes: Sequence[str]) -> list[str]:
+    """Notes without those that differ from `MOST_ALIKE` others in the name of their file and in numbers alone."""
+    seen, shown = Counter[str](), list[str]()
+    for note in notes:
+        kind = re.sub(r"\d[\d.,]*", "#", note.partition(": ")[2])
+        seen[kind] += 1
+        shown += [note] * (not kind or seen[kind] <= MOST_ALIKE)
+    more = len(notes) - len(shown)
+    return shown + [f"import.yml has {more} more notes of this kind on other files"] * bool(more)
 
 
 def _where(text: str) -> tuple[str, str]:

@@ -88,8 +88,8 @@ def import_measurements(
     at one place are averaged. The folder also holds ``import.yml`` with all that was assumed, and ``plan.png``.
 
     Args:
-        files: tables in CSV, Parquet or Excel, JSON of surveys, and logs (docs/howto/surveys.md); their rows train, unless
-            there is a column ``split``.
+        files: tables in CSV, Parquet or Excel, JSON of surveys, and logs (docs/howto/surveys.md); their rows train,
+            unless there is a column ``split``.
         out: folder to write.
         replace: whether an existing folder is replaced.
         options: attributes of `ImportOptions`.
