@@ -391,12 +391,15 @@ def test_messages_of_espresense_have_a_run_for_each_device(tmp_path: Path) -> No
         for time, dbm in ((1000.0, -60), (1004.0, -64)):
             payload = {"mac": "dd8800003777", "id": device, "rssi@1m": -59, "rssi": dbm + offset, "distance": 6.58}
             lines.append(f"{time} espresense/devices/{device}/kitchen {json.dumps(payload)}")
+    lines.insert(0, "999.0 espresense/rooms/kitchen/status online")
     file = written(tmp_path, "mqtt.log", "\n".join(lines) + "\n")
     path = written(tmp_path, "path.csv", "time,x,y\n1000,0,0\n1004,4,0\n")
     nodes = "nodes:\n- name: kitchen\n  point: [1, 2, 2.1]\n- name: hall\n  point: [5, 5, 2]\n"
     nodes = f"timeout: 30\nfloors:\n- id: first\n  bounds: [[0, 0, 0], [9, 9, 3]]\n{nodes}"
     anchors = written(tmp_path, "config.yaml", nodes)
-    record = imported(tmp_path, file, positions=[path], anchors=anchors).record
+    report = imported(tmp_path, file, positions=[path], anchors=anchors)
+    assert has_note(report, "4 rows; 1 lines of other topics are left out")
+    record = report.record
     np.testing.assert_allclose(record.receivers[0].position_m, [1, 2, 2.1])
     by_run = {run: sorted(record.observation[0, record.runs == run]) for run in set(record.runs)}
     assert by_run == {"phone:a": [-64, -60], "tag-b": [-72, -68]}

@@ -124,6 +124,11 @@ def test_lines_above_the_header_are_left_out(lines: int, tmp_path: Path) -> None
     assert table.notes[0].endswith(f"{lines} lines above it are left out")
 
 
+def test_rows_after_a_blank_line_are_of_the_same_table(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("x,y,ap,rssi\n1,2,a,-60\n\n1,2,hall,60\n\n")
+    assert len(read_table(tmp_path / "t.csv").frame) == 2
+
+
 def test_a_row_with_other_fields_is_no_preamble(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text("1,2,-60,7\n" + "1,2,-60\n" * 5)
     error_line(read_table, tmp_path / "t.csv", "3 fields, but the first line has 4")

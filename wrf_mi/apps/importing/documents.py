@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from .programs import EVENT_LOGS, MQTT, EventLog
 
 POINTS = frozenset({"point", "position", "location", "coordinates", "xy", "xyz", "pos"})
 """Names of lists that hold x, y and, if stated, z."""
+FIRST_MESSAGES, FIRST_EVENTS = 50, 20_000
+"""Lines in which a reading of MQTT is looked for, and a position or reading among those of a phone's other sensors."""
 IMAGE = re.compile(r".+\.(?:png|jpe?g|gif|bmp|svg|webp)", re.IGNORECASE)
 IMAGE_WORDS = frozenset({"image", "plan", "floorplan", "map", "background", "picture"})
 ADDRESS = re.compile(r"(?:[0-9a-f]{2}[:_-]){5}[0-9a-f]{2}.*", re.IGNORECASE)
@@ -111,27 +114,24 @@ def _image(node: Any) -> str:
     return next(filter(None, map(_image, inner)), "")
 
 
-def read_messages(text: str) -> list[Row]:
-    """Rows of the lines of MQTT in a text; none where it has others."""
+def read_messages(lines: Sequence[str]) -> list[Row]:
+    """Rows of the lines of MQTT that are readings; none where the first lines have none."""
     rows = []
-    for line in filter(None, map(str.strip, text.splitlines())):
-        if (match := MQTT.fullmatch(line)) is None:
-            return []
-        try:
-            payload = json.loads(match["payload"])
-        except json.JSONDecodeError:
-            return []
-        named = {name: match[name] for name in ("time", "device", "node") if match[name] is not None}
-        rows.append(payload | named)
+    for line in lines if any(map(MQTT.fullmatch, lines[:FIRST_MESSAGES])) else ():
+        with suppress(json.JSONDecodeError):
+            if (match := MQTT.fullmatch(line)) is not None:
+                named = {name: match[name] for name in ("time", "device", "node") if match[name] is not None}
+                rows.append(json.loads(match["payload"]) | named)
     return rows
 
 
 def event_log_of(lines: Sequence[str]) -> EventLog | None:
     """The form of a log with events of several kinds, by its first lines."""
     for log in EVENT_LOGS:
-        kinds = [parts[log.kind] for line in lines if len(parts := line.split(log.separator)) > log.kind]
-        if any(kind in log.fields for kind in kinds):
-            return log
+        for line in lines[:FIRST_EVENTS]:
+            parts = line.split(log.separator, log.kind + 1)
+            if len(parts) > log.kind and parts[log.kind] in log.fields:
+                return log
     return None
 
 

@@ -265,10 +265,11 @@ def _read_text(path: Path, sheet: str) -> Table:
         blank = not plain
     if not rows:
         raise DataFault(path, "empty; give a row per measurement")
-    if (log := event_log_of([line for _, line in rows[:SAMPLE]])) is not None:
+    lines = [line for _, line in rows]
+    if (log := event_log_of(lines)) is not None:
         return _of_rows(path, read_events(path, rows, log))
-    if messages := read_messages(text):
-        return _of_rows(path, messages)
+    if messages := read_messages(lines):
+        return _of_rows(path, messages, left_out=len(lines) - len(messages))
     rows, note_of_tables = _chosen_table(path, rows, first, sheet)
 
     # Separator and decimal mark, without lines above the header.
@@ -318,7 +319,9 @@ def _chosen_table(
     A table begins with a header, which is the first line or follows a blank one.
     """
     headers = {row: _fields(rows[row][1], _separator([rows[row][1]])[0]) for row in sorted({0, *first})}
-    starts = [row for row, names in headers.items() if row == 0 or (len(names) > 1 and not _is_row(names, "."))]
+    starts = [
+        row for row, names in headers.items() if row == 0 or (len(names) > 1 and not any(map(NUMBER.fullmatch, names)))
+    ]
     if len(headers[0]) == 1:  # lines above the header
         starts = starts[:1]
     ends = [*starts[1:], len(rows)]
@@ -332,7 +335,7 @@ def _chosen_table(
     return tables[name], f"; tables that are left out, by their first column (--sheet): {others}"
 
 
-def _of_rows(path: Path, rows: Sequence[Mapping[str, Any]], image: str = "") -> Table:
+def _of_rows(path: Path, rows: Sequence[Mapping[str, Any]], image: str = "", left_out: int = 0) -> Table:
     """A table of rows with named fields, texts of numbers read as numbers."""
     frame = package("pandas").DataFrame(rows)
     for name in frame.columns:
@@ -340,6 +343,7 @@ def _of_rows(path: Path, rows: Sequence[Mapping[str, Any]], image: str = "") -> 
             frame[name] = package("pandas").to_numeric(frame[name])
     _check_size(path, len(frame), frame.shape[1])
     note = f"{path.name}: {len(frame)} rows" + f", points of {image}" * bool(image)
+    note += f"; {left_out} lines of other topics are left out" * bool(left_out)
     return Table(_with_units(frame), ((path, len(frame)),), (note,), image=image)
 
 

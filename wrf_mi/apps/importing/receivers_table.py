@@ -71,7 +71,9 @@ def _measured_cells(table: Table, measured: Mapping[str, str]) -> Table:
 
     Tables of a country have millions of cells.
     """
-    parts = table.frame[CELL].dropna().str.split("-")
+    numbers = {key.rpartition("-")[2] for key in measured}
+    identities = table.frame[CELL].dropna()
+    parts = identities[identities.str.rpartition("-")[2].isin(numbers)].str.split("-")
     for count in (4, 3, 2, 1):  # country, network, area and cell, without the first ones
         keys = parts.map(lambda part, count=count: id_key("-".join(part[-count:])))
         chosen = keys[keys.isin(list(measured))]
