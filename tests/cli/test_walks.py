@@ -12,9 +12,9 @@ from PIL import Image
 WALKS = {
     "mall-f3": (
         "mesh {data}/geojson_map.json --wall-height 4 --out {out}/scene",
-        "data import {data}/train.csv --test {data}/test.csv --place 3 --min-rows 100 --out {out}/data",
+        "data import {data}/train.csv --test {data}/test.csv --place 3 --min-rows 110 --out {out}/data",
         "train {out}/data --scene {out}/scene --preset fast --out {out}/run",
-        "map {out}/run --step 4 --out {out}/map.nc",
+        "map {out}/run --step 8 --out {out}/map.nc",
         "locate {out}/run --out {out}/positions.csv",
     ),
     "flat-ble": (

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from changed_folders import error_line
 from commands import Command
 from PIL import Image
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from wrf_mi import import_measurements
 from wrf_mi.apps.importing import ImportReport
+from wrf_mi.apps.importing.observed import read_observed
 from wrf_mi.core import Record
 from wrf_mi.scene.plan.sources import PlanGrid, read_plan
 
@@ -427,3 +429,20 @@ def test_dumps_of_bermuda_are_readings_of_scanners(tmp_path: Path) -> None:
     assert found[scanners[0]] == {(0.0, 0.0): -50, (3.0, 1.0): -60}
     assert found[scanners[1]] == {(0.0, 0.0): -60, (3.0, 1.0): -70}
     assert set(record.runs) == {"02:00:00:00:00:99"}
+
+
+def test_logs_that_are_located_are_read_as_those_that_are_imported(tmp_path: Path) -> None:
+    report = imported(tmp_path, written(tmp_path, "log.txt", GNETTRACK))
+    facts = yaml.safe_load((tmp_path / "data" / "import.yml").read_text())
+    observed = read_observed(tmp_path / "log.txt", facts)
+    assert observed.xy_m is not None
+    np.testing.assert_allclose(observed.xy_m, report.record.tx_pos_m[:, :2], atol=1e-5)
+    names = [receiver.name.removeprefix("anchor") for receiver in report.record.receivers]
+    np.testing.assert_array_equal(observed.dbm[[observed.ids.index(name) for name in names]], report.record.observation)
+
+
+def test_pixels_of_a_plan_are_located_in_its_frame(plan: Path, tmp_path: Path) -> None:
+    file = written(tmp_path, "clicks.csv", "x,y,bssid,rssi\n40,40,a,-50\n180,90,a,-70\n")
+    report = imported(tmp_path, file, units="px", plan=plan, resolution_m=RESOLUTION_M)
+    facts = yaml.safe_load((tmp_path / "data" / "import.yml").read_text())
+    np.testing.assert_allclose(read_observed(file, facts).xy_m, report.record.tx_pos_m[:, :2])

@@ -13,7 +13,8 @@ from ...core import DataFault
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from .files import Table, read_table
-from .forms import Columns, find_columns
+from .fixes import with_fixes, without_stale
+from .forms import Columns, find_columns, without_slots
 from .places import LocalFrame, finite_columns, place_numbers, plane_columns, unit_scale
 from .readings import mean_strengths, read_readings, without_not_heard
 
@@ -45,7 +46,7 @@ def read_observed(path: str | Path, facts: Mapping[str, Any]) -> ObservedTable:
     Raises:
         InputError: a table or a field that cannot be understood.
     """
-    table = read_table(path)
+    table = without_slots(with_fixes(without_stale(read_table(path), {}), {}))
     try:
         columns = find_columns(table, {})
     except DataFault as fault:  # whose remedies are options of the import
