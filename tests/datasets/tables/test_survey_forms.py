@@ -265,6 +265,14 @@ def test_notes_on_many_files_are_printed_for_the_first(tmp_path: Path, command: 
     assert (tmp_path / "data" / "import.yml").read_text().count("readings were cached") == 8
 
 
+def test_cached_scans_are_told_by_dates(tmp_path: Path) -> None:
+    rows = ["10:00:05,10:00:04,0,-50", "10:00:05,10:00:01,0,-90", "10:00:09,,1,-60"]
+    rows = [",".join(f"2024-05-01 {field}" if ":" in field else field for field in row.split(",")) for row in rows]
+    text = "\n".join(["time,last_seen,x,rssi_a,y", *(f"{row},0" for row in rows)]) + "\n"
+    report = imported(tmp_path, written(tmp_path, "t.csv", text))
+    assert strengths(report.record) == {"a": {(0.0, 0.0): -50, (1.0, 0.0): -60}}
+
+
 def test_rows_that_received_nothing_are_kept_beside_a_missing_position(tmp_path: Path) -> None:
     text = "time,x,y,rssi_a\n0,0,0,-50\n1,1,0,\n2,2,0,-60\n3,3,0,-61\n"
     report = imported(tmp_path, written(tmp_path, "t.csv", text))

@@ -27,7 +27,7 @@ def without_stale(table: Table, stated: Mapping[str, str]) -> Table:
     of = named_columns(list(table.frame.columns), dict(stated))
     if not {"time", "seen"} <= of.keys():
         return table
-    written, seen = seconds(table, of["time"]), seconds(table, of["seen"])
+    written, seen = (seconds(table, of[name], may_be_empty=True) for name in ("time", "seen"))
     largest = float(np.nanmax(np.abs(written), initial=0.0))
     age_s = (written - seen) / next((ticks for least, ticks in TICKS.items() if largest > least), 1.0)
     file, name = table.files[0][0].name, of["seen"]
@@ -78,7 +78,7 @@ def _heard(table: Table, of: Mapping[str, str]) -> NDArray[np.bool_]:
 
 def _interpolated(table: Table, of: Mapping[str, str], is_fix: NDArray[np.bool_], heard: NDArray[np.bool_]) -> Table:
     """Readings at positions between those of the rows with a fix, of each run; those before or after are left out."""
-    time_s = seconds(table, of["time"])
+    time_s = seconds(table, of["time"], may_be_empty=True)
     runs = table.frame[of["run"]].astype(str).to_numpy() if "run" in of else np.full(len(table), "")
     names = [of[meaning] for meaning in PLACES if meaning in of and meaning not in ("floor", "heading")]
     values: dict[str, FloatArray] = {name: table.numbers(name).copy() for name in names}

@@ -336,14 +336,15 @@ def with_cells(table: Table, column: str) -> Table:
     return replace(table, frame=table.frame.assign(**{name: parts[k] for k, name in enumerate(names)}))
 
 
-def seconds(table: Table, column: str) -> FloatArray:
-    """Times of a column in its unit, or in seconds where they are dates."""
+def seconds(table: Table, column: str, may_be_empty: bool = False) -> FloatArray:
+    """Times of a column in its unit, or in seconds where they are dates; NaN where they are empty and may be so."""
     if table.is_numeric(column):
         return table.numbers(column)
     pandas = package("pandas")
     texts = table.frame[column].astype("string").str.replace(DATE, r"\1-\2-\3 \4:\5:\6", regex=True)
     times = pandas.to_datetime(texts, errors="coerce", format="mixed", utc=True)
-    if len(wrong := np.flatnonzero(times.isna().to_numpy())):
+    empty = texts.isna().to_numpy(bool)
+    if len(wrong := np.flatnonzero(times.isna().to_numpy() & ~(empty & may_be_empty))):
         text = f"{one_line(column)} is {str(table.frame[column].iloc[wrong[0]])[:40]!r}"
         raise table.fault(f"{text}; give a time as a number or an ISO date", int(wrong[0]))
     return np.asarray((times - pandas.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(float))
