@@ -91,6 +91,7 @@ REFUSED_PIXELS: dict[str, tuple[dict[str, Any], str]] = {
     "no pixels": ({"plan": True}, "--plan: it belongs to --units px; omit it"),
     "no picture": ({"resolution_m": 0.1}, "--resolution: it belongs to --plan; omit it"),
     "pairs": ({"units": "px", "register_pairs": True}, "1 pairs at one place tell no scale; give two pairs"),
+    "pitch": ({"units": "px", "plan": True, "pitch_m": 0.6}, "--pitch: positions are pixels, or registered by pairs"),
     "up": ({"up": "z"}, "--up: it belongs to a trajectory of --positions; omit it"),
     "axis": ({"up": "x"}, "--up 'x' is unknown; give --up=z, --up=y or --up=-y"),
 }

@@ -212,13 +212,17 @@ class _Import:
 
     def _check_idle(self) -> None:
         """Refuse options of quantities that the tables state, or do not have."""
-        of, without_z = self.columns.of, "z" not in self.columns.of
+        of, without_z, pairs = self.columns.of, "z" not in self.columns.of, self.options.register_pairs
+        is_registered = pairs is not None or self._unit() in PIXELS
         needed = {
             "height_m": (without_z, "the table has a column z"),
             "storey_m": (without_z and "floor" in of, "it belongs to a column floor without z"),
             "heading": ("heading" in of, "the table has no column of headings"),
             "anchor_height_m": (self.options.anchors is not None, "it belongs to --anchors"),
-            "plan": (self._unit() in PIXELS and self.options.register_pairs is None, "it belongs to --units px"),
+            "register_pairs": ("x" in of, "positions are longitude and latitude"),
+            "pitch_m": (not is_registered, "positions are pixels, or registered by pairs"),
+            "crs": (not is_registered, "positions are pixels, or registered by pairs"),
+            "plan": (self._unit() in PIXELS and pairs is None, "it belongs to --units px"),
             "resolution_m": (self.options.plan is not None, "it belongs to --plan"),
             "origin_m": (self.options.plan is not None, "it belongs to --plan"),
             "up": (bool(self.options.positions), "it belongs to a trajectory of --positions"),
