@@ -257,6 +257,20 @@ def test_event_logs_with_waypoints_without_cached_scans(tmp_path: Path) -> None:
     error_line(import_measurements, short, tmp_path / "other", "TYPE_WIFI has 3 fields; remove the line")
 
 
+def test_logs_of_several_floors_are_not_pooled(tmp_path: Path) -> None:
+    events = [(START, "TYPE_WAYPOINT", 1.0, 2.0), wifi(START + 10, -50, START), (START + 90, "TYPE_WAYPOINT", 1.0, 2.0)]
+    files = [
+        written(tmp_path, f"{floor}.txt", f"#\tFloorId:5\tFloorName:{floor}\n" + event_log(*events))
+        for floor in ("B1", "F1")
+    ]
+    message = r"logs are of the floors B1, F1; give --columns floor=floor_name, or one floor by --where floor_name=B1"
+    error_line(import_measurements, files, tmp_path / "data", message)
+    record = import_measurements(files, tmp_path / "data", columns="floor=floor_name").record
+    np.testing.assert_allclose(record.tx_pos_m[:, 2], [-1.7, 1.3])
+    record = import_measurements(files, tmp_path / "one", where={"floor_name": "B1"}).record
+    np.testing.assert_allclose(record.tx_pos_m[:, 2], 1.3)
+
+
 def test_notes_on_many_files_are_printed_for_the_first(tmp_path: Path, command: Command) -> None:
     events = [(START, "TYPE_WAYPOINT", 1.0, 2.0), wifi(START + 10, -50, START), (START + 90, "TYPE_WAYPOINT", 1.0, 2.0)]
     files = [written(tmp_path, f"walk{number}.txt", event_log(*events)) for number in range(8)]

@@ -13,7 +13,7 @@ from ...core import DataFault
 from ...core.files import one_line
 from ...core.yaml_files import read_yaml
 from ...datasets.unknown import SENT, STRENGTH, name_words
-from .programs import EVENT_LOGS, MQTT, EventLog
+from .programs import EVENT_LOGS, FLOOR_NAME, MQTT, EventLog
 
 POINTS = frozenset({"point", "position", "location", "coordinates", "xy", "xyz", "pos"})
 """Names of lists that hold x, y and, if stated, z."""
@@ -135,13 +135,14 @@ def event_log_of(lines: Sequence[str]) -> EventLog | None:
     return None
 
 
-def read_events(path: Path, lines: Sequence[tuple[int, str]], log: EventLog) -> list[Row]:
-    """Rows of the positions and readings of an event log; a file is a walk.
+def read_events(path: Path, text: str, lines: Sequence[tuple[int, str]], log: EventLog) -> list[Row]:
+    """Rows of the positions and readings of an event log, by its numbered ``lines`` without comments; a file is a walk.
 
     Raises:
         InputError: an event with fewer fields than its kind has.
     """
-    rows = []
+    rows, floor = [], re.search(log.floor, text)
+    named = {"walk": path.stem} | ({FLOOR_NAME: floor[1]} if floor else {})
     for number, line in lines:
         parts = line.split(log.separator)
         fields = log.fields.get(parts[log.kind]) if len(parts) > log.kind else None
@@ -150,10 +151,10 @@ def read_events(path: Path, lines: Sequence[tuple[int, str]], log: EventLog) -> 
         try:
             row = {name: _field(parts, index) for name, index in fields.items()}
         except IndexError:
-            text = f"{parts[log.kind]} has {len(parts)} fields; remove the line, or export the log again"
-            raise DataFault(path, text, line=number) from None
+            what = f"{parts[log.kind]} has {len(parts)} fields; remove the line, or export the log again"
+            raise DataFault(path, what, line=number) from None
         radio = {"Type": log.radios[parts[log.kind]]} if parts[log.kind] in log.radios else {}
-        rows.append({"walk": path.stem, "time": parts[log.time]} | row | radio)
+        rows.append(named | {"time": parts[log.time]} | row | radio)
     return rows
 
 

@@ -267,7 +267,7 @@ def _read_text(path: Path, sheet: str) -> Table:
         raise DataFault(path, "empty; give a row per measurement")
     lines = [line for _, line in rows]
     if (log := event_log_of(lines)) is not None:
-        return _of_rows(path, read_events(path, rows, log))
+        return _of_rows(path, read_events(path, text, rows, log))
     if messages := read_messages(lines):
         return _of_rows(path, messages, left_out=len(lines) - len(messages))
     rows, note_of_tables = _chosen_table(path, rows, first, sheet)

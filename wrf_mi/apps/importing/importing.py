@@ -40,7 +40,7 @@ from .places import (
     with_cells,
     with_positions,
 )
-from .programs import RADIOS
+from .programs import FLOOR_NAME, RADIOS
 from .readings import (
     Means,
     Readings,
@@ -296,7 +296,13 @@ class _Import:
                 raise DataFault(self.table.files[0][0], f"{text}, or name another column by --columns rssi=...")
 
     def _check_radios(self, readings: Readings) -> None:
-        """Refuse strengths of several kinds of radio."""
+        """Refuse strengths of several kinds of radio, and logs of several floors at one height."""
+        if FLOOR_NAME in self.table.frame and FLOOR_NAME not in self.columns.of.values():
+            floors = self.table.frame[FLOOR_NAME].dropna().unique()
+            if len(floors) > 1:
+                text = f"logs are of the floors {one_line(listed(floors))}; give --columns floor={FLOOR_NAME}"
+                remedy = f"or one floor by --where {shlex.quote(f'{FLOOR_NAME}={floors[0]}')}"
+                raise DataFault(self.table.files[0][0], f"{text}, {remedy}")
         for name in self.table.frame.columns:
             values = self._of_readings(name, readings)
             if values.nunique() > 1 and set(values.str.lower()) <= RADIOS:

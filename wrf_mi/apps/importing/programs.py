@@ -18,6 +18,7 @@ RADIOS = frozenset({"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "u
 """Values of a column of kinds of radio, in small letters."""
 CELL_PARTS = {"mcc": "mcc", "net": "net|mnc", "area": "area|lac|tac", "cell": "cell|cellid|cid|ci|eci"}
 """Names of the columns that identify a cell together: country, network, area and number."""
+FLOOR_NAME = "floor_name"  # column of the floor that the head of a log states
 CELL = "network-area-cell"  # column of the identity that `CELL_PARTS` make
 UNIT_LENGTH = 1e-3  # largest deviation of quaternions and rotations from length 1: files round to six decimals
 
@@ -166,6 +167,7 @@ class EventLog:
         time: number of the field with the time.
         radios: kind of radio of the kinds of readings.
         fields: fields by column, of each kind; a tuple of fields is one identity.
+        floor: pattern of the name of the floor in the comments.
     """
 
     separator: str
@@ -173,6 +175,7 @@ class EventLog:
     time: int
     radios: Mapping[str, str]
     fields: Mapping[str, Mapping[str, int | tuple[int, ...]]]
+    floor: str
 
 
 EVENT_LOGS = (
@@ -186,6 +189,7 @@ EVENT_LOGS = (
             "TYPE_WIFI": {"ssid": 2, "bssid": 3, "rssi": 4, "frequency_mhz": 5, "last_seen": 6},
             "TYPE_BEACON": {"bssid": (2, 3, 4), "rssi": 6},
         },
+        floor=r"FloorName:(\S+)",
     ),
 )
 """The first: logs of the Indoor Location Competition 2.0."""
