@@ -24,7 +24,7 @@ from ...tasks import RSSI
 from .carriers import carriers_of_receivers, column_hz
 from .files import Table, joined, read_table
 from .fixes import with_fixes, without_stale
-from .forms import PIXELS, described, find_columns, parsed_columns, unit_of, without_slots
+from .forms import PIXELS, described, find_columns, parsed_columns, without_slots
 from .options import ImportOptions, option_name
 from .picture import plan_picture
 from .places import (
@@ -40,7 +40,7 @@ from .places import (
     with_cells,
     with_positions,
 )
-from .programs import FLOOR_NAME, RADIOS
+from .pooled import refuse_per_cent, refuse_several_kinds, texts_of_readings
 from .readings import (
     Means,
     Readings,
@@ -135,7 +135,7 @@ class _Import:
     def run(self, replace: bool) -> ImportReport:
         """Read, average and write."""
         self._check_idle()
-        self._check_strengths()
+        refuse_per_cent(self.table, self.columns)
 
         # Positions of the rows, and single readings without numbers for "not heard".
         frame, xyz_m = self._positions()
@@ -143,7 +143,7 @@ class _Import:
         self.notes += notes
         if not len(readings.dbm):
             raise DataFault(self.table.files[0][0], "no reading was heard; correct --columns or --not-heard")
-        self._check_radios(readings)
+        refuse_several_kinds(self.table, self.columns, readings)
 
         # Rows of one position, heading, carrier, run and part of the split are averaged.
         conditions = self._conditions(readings, frame)
@@ -286,40 +286,10 @@ class _Import:
         self.notes.append(f"no column z: {text} {listed([f'{z:g}' for z in heights_m])} m above the floor (--height)")
         return height_m
 
-    def _check_strengths(self) -> None:
-        """Refuse strengths in per cent, whose scale is that of each program."""
-        of = self.columns.of
-        names = [of["rssi"]] if "rssi" in of and not self.columns.strengths else list(self.columns.strengths)
-        for name in names:
-            if unit_of(name) == "%" or name_words(name) & {"quality", "percent"}:
-                text = f"{one_line(name)} is in per cent; give dBm (in Windows dBm = quality / 2 - 100)"
-                raise DataFault(self.table.files[0][0], f"{text}, or name another column by --columns rssi=...")
-
-    def _check_radios(self, readings: Readings) -> None:
-        """Refuse strengths of several kinds of radio, and logs of several floors at one height."""
-        if FLOOR_NAME in self.table.frame and FLOOR_NAME not in self.columns.of.values():
-            floors = self.table.frame[FLOOR_NAME].dropna().unique()
-            if len(floors) > 1:
-                text = f"logs are of the floors {one_line(listed(floors))}; give --columns floor={FLOOR_NAME}"
-                remedy = f"or one floor by --where {shlex.quote(f'{FLOOR_NAME}={floors[0]}')}"
-                raise DataFault(self.table.files[0][0], f"{text}, {remedy}")
-        for name in self.table.frame.columns:
-            values = self._of_readings(name, readings)
-            if values.nunique() > 1 and set(values.str.lower()) <= RADIOS:
-                counts = listed([f"{one_line(text)} ({rows})" for text, rows in values.value_counts().items()])
-                text = f"{one_line(name)} is {counts}: these are not pooled"
-                remedy = f"choose one by --where {shlex.quote(f'{name}={values.value_counts().index[0]}')}"
-                raise DataFault(self.table.files[0][0], f"{text}; {remedy}")
-
-    def _of_readings(self, name: str, readings: Readings) -> Any:
-        """Texts of a column where it is stated, by the number of the reading."""
-        values = self.table.frame[name].iloc[readings.row].reset_index(drop=True)
-        return values[values.notna()].astype(str).str.strip()
-
     def _sent(self, readings: Readings) -> NDArray[np.str_] | None:
         """Sent power of each row, "" where none is stated, if a receiver has several: by a column or names of files."""
         for name in self.table.frame.columns:
-            values = self._of_readings(name, readings)
+            values = texts_of_readings(self.table, name, readings)
             several = values.groupby(readings.receiver[values.index]).nunique().max() > 1
             if name_words(name) & SENT and self.table.is_numeric(name) and several:
                 self.notes.append(f"{one_line(name)} is {listed(values.unique())}: a run for each, with its offset")
