@@ -146,11 +146,14 @@ def test_json_of_surveys_with_a_picture_and_points(case: str, plan: Path, tmp_pa
         ("s.json", '{"a": ' * 900 + "1" + "}" * 900, "no object with a strength|no JSON|without end"),
         ("s.json", "{", "no JSON .*export the survey again"),
         ("t.csv", "x,y,box,v\n1,2,02:00:00:00:00:01,-60\n", "--columns box"),
+        ("t.csv", "x,y,station,v\n1,2,hall,-60\n1,2,attic,-70\n", "give --columns id=station,rssi=v, or --receivers"),
+        ("t.csv", "u,v,station,q\n1.5,2,hall,-60\n2,3,attic,-70\n", "give --columns x=u,y=v,id=station,rssi=q"),
+        ("t.csv", "u,v,bssid,rssi\n1.5,2,a,-60\n2,3,b,-70\n", r"try --columns x=u,y=v \(or lon=,lat="),
         ("t.csv", "u,v,name,q\n1.5,2,hall,b\n1,3,hall,c\n2,3,attic,d\n", r"try --columns 'x=u,y=v,id=name,rssi=\?'"),
     ],
 )
 def test_other_forms_are_refused_with_what_to_try(name: str, text: str, message: str, tmp_path: Path) -> None:
-    message = message.replace("--columns box", r"Give --columns id=box,rssi=v, or --receivers")
+    message = message.replace("--columns box", r"give --columns id=box,rssi=v, or --receivers")
     error_line(import_measurements, written(tmp_path, name, text), tmp_path / "data", message)
 
 

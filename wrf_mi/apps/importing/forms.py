@@ -169,32 +169,34 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
     for columns_of in FORMS.values():
         if (columns := columns_of(table, of, receivers)) is not None:
             columns.kept = list(table.frame.columns.drop([*columns.of.values(), *columns.strengths]))
-            addresses = [name for name in columns.kept if _has_addresses(table, name)]
-            if len(columns.strengths) == 1 and addresses and not receivers:
+            tellers = [name for name in columns.kept if _tells_receivers(table, name)]
+            if len(columns.strengths) == 1 and tellers and not receivers:
+                strength = one_line(next(iter(columns.strengths)))
                 text = (
-                    f"{one_line(addresses[0])} has addresses, and {one_line(next(iter(columns.strengths)))} strengths"
+                    f"{one_line(tellers[0])} has names, {strength} strengths: readings of several receivers, or of one"
                 )
-                text += ": a reading in each row, or one receiver?"
-                remedy = f"Give --columns {suggested_columns(table, of)}, or --receivers 'PATTERN*'"
-                raise DataFault(table.files[0][0], f"{text} {remedy}", line=1)
+                remedy = f"give --columns {suggested_columns(table, of)}, or --receivers 'PATTERN*'"
+                raise DataFault(table.files[0][0], f"{text}; {remedy}", line=1)
             return columns
     text = f"no column of signal strengths among {shown_names(names)}"
     remedy = f"try --columns {suggested_columns(table, of)}, or --receivers 'PATTERN*' for a column of each receiver"
     raise DataFault(table.files[0][0], f"{text}; {remedy}", line=1)
 
 
-def suggested_columns(table: Table, of: Mapping[str, str]) -> str:
-    """Text of ``--columns`` for a table of readings, by the values of its columns; ``?`` where none is likely."""
+def suggested_columns(table: Table, of: Mapping[str, str], meanings: Sequence[str] = ("x", "y", "id", "rssi")) -> str:
+    """Text of ``--columns`` for a table, by the values of its columns; ``?`` where none is likely."""
     free = [name for name in table.frame.columns if name not in of.values()]
     numeric = [name for name in free if table.is_numeric(name)]
     texts = [name for name in free if name not in numeric]
     addresses = [name for name in texts if _has_addresses(table, name)]
+    tellers = [name for name in texts if _tells_receivers(table, name)]
     repeated = [name for name in texts if 1 < table.frame[name].nunique() < len(table)]
     strengths = [name for name in numeric if _is_dbm(table, name)]
     planar = [name for name in numeric if name not in strengths]
-    likely = {"id": [*addresses, *repeated], "rssi": strengths}
-    if not ({"x", "y"} <= of.keys() or {"lon", "lat"} <= of.keys()):
-        likely = {"x": planar, "y": planar[1:]} | likely
+    likely = {"x": planar, "y": planar[1:], "id": [*addresses, *tellers, *repeated], "rssi": strengths}
+    if {"x", "y"} <= of.keys() or {"lon", "lat"} <= of.keys():
+        meanings = [meaning for meaning in meanings if meaning not in ("x", "y")]
+    likely = {meaning: likely[meaning] for meaning in meanings}
     chosen = {meaning: of.get(meaning) or next(iter(names), "?") for meaning, names in likely.items()}
     return shlex.quote(one_line(",".join(f"{meaning}={name}" for meaning, name in chosen.items())))
 
@@ -202,6 +204,11 @@ def suggested_columns(table: Table, of: Mapping[str, str]) -> str:
 def _has_addresses(table: Table, name: str) -> bool:
     texts = table.frame[name].dropna().astype(str).str.strip()
     return bool(texts.str.fullmatch(MAC.pattern, case=False).any())
+
+
+def _tells_receivers(table: Table, name: str) -> bool:
+    """Whether a column has addresses, or several names under a heading of receivers."""
+    return _has_addresses(table, name) or (ColumnName(name).is_identity and table.frame[name].nunique() > 1)
 
 
 def shown_names(names: Sequence[str]) -> str:

@@ -15,7 +15,7 @@ from ...core.angles import FloatArray
 from ...core.files import listed, one_line
 from ...scene.coordinates import LATITUDE, LONGITUDE, local_projection
 from .files import Table, package
-from .forms import METRES, named_columns, shown_names, unit_of
+from .forms import METRES, named_columns, shown_names, suggested_columns, unit_of
 
 DEGREES = "EPSG:4326"
 FAR_M = 10_000.0  # largest coordinate without a shift: single precision resolves a millimetre to 16 km
@@ -176,7 +176,8 @@ def plane_columns(of: Mapping[str, str], table: Table) -> tuple[str, str, bool]:
         if first in of and second in of:
             return of[first], of[second], geographic
     names = shown_names(list(table.frame.columns))
-    remedy = "name them by --columns x=...,y=... or lon=...,lat=..., cell=... for both in one text, or --positions FILE"
+    remedy = f"try --columns {suggested_columns(table, of, ('x', 'y'))} (or lon=,lat=, or cell= for both in one text), "
+    remedy += "or give --positions FILE"
     raise InputError(f"{table.files[0][0]}: no columns of positions among {names}; {remedy}")
 
 
