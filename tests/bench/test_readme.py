@@ -162,7 +162,7 @@ STATED = {
     *(("export.md", "format"), ("joint.md", "setting"), ("locate.md", "column"), ("maps.md", "variable")),
     *(("changelog.md", "0.1.0"), ("gaussians.md", "constant"), ("gaussians.md", "setting"), ("numerics.md", "")),
     ("plugins.md", "parameter"),
-    *(("mesh.md", "you have"), ("own-data.md", "your table"), ("quickstart.md", "symptom")),
+    *(("mesh.md", "you have"), ("own-data.md", "your table"), ("surveys.md", "file"), ("quickstart.md", "symptom")),
     *(("data.md", "columns of receivers"), ("data.md", "columns of rows")),
 }
 """Page and first cell of tables of definitions, settings and bounds, which nobody measures."""

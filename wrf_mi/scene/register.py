@@ -81,6 +81,23 @@ def register_pairs(source_m: ArrayLike, target_m: ArrayLike, name: str = "pairs"
     return np.asarray(rigid.params if dimension == 3 else planar_matrix_to_3D(rigid.params))
 
 
+def similar_pixels(source: ArrayLike, target_m: ArrayLike, name: str = "pairs") -> FloatArray:
+    """Matrix [2, 3] that makes metres of pixels of a picture, whose y runs down, from pairs [n, 2] (Umeyama 1991).
+
+    Raises:
+        InputError: fewer than two pairs, pairs at one place, or a bad fit.
+    """
+    pixels, target = np.asarray(source, float) * [1, -1], np.asarray(target_m, float)
+    if len(pixels) < 2 or _open_rotation(pixels, target):
+        raise InputError(f"{name}: {len(pixels)} pairs at one place tell no scale; give two pairs, well apart")
+    similar = estimate_transform("similarity", pixels, target)
+    error = similar.residuals(pixels, target)
+    if (rms := float(np.sqrt(np.mean(error**2)))) > LARGEST_RMS_M:
+        text = f"the pairs disagree by {rms:.2f} m rms (at most {LARGEST_RMS_M} m), pair {int(np.argmax(error)) + 1} by"
+        raise InputError(f"{name}: {text} {error.max():.2f} m: check this pair; x, y are pixels from the upper left")
+    return np.asarray(similar.params[:2] * [1, -1, 1])
+
+
 def _open_rotation(source: FloatArray, target: FloatArray) -> str:
     """Where pairs lie if that leaves their rotation open: at one place, or in 3D on one line; else empty."""
     spread = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (source, target)]

@@ -81,7 +81,7 @@ def test_units_stand_at_the_end_of_names() -> None:
     ("stated", "receivers", "message"),
     [
         ("x=east", (), r"line 1: no column east \(columns: x, y, p\); correct --columns"),
-        ("", ("AP*",), r"no column of signal strengths among x, y, p; name it by"),
+        ("", ("AP*",), r"no column of signal strengths among x, y, p; try --columns 'id=\?,rssi=\?', or --receivers"),
         ("", (), r"no column of signal strengths"),
         *((text, (), r"--columns: .* give MEANING=COLUMN") for text in ("place=x", "x", "x=")),
     ],

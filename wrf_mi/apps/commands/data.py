@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,10 +17,11 @@ from ...core import InputError, Record
 from ...core.carriers import carriers_text
 from ...core.files import listed, one_line
 from ..importing.options import AVERAGES
-from .options import DATASET, Arguments, add_command
+from .options import DATASET, Arguments, add_command, comma_numbers
 from .output import exit_status, show
 
 SHOWN_CARRIERS = 8
+MOST_ALIKE = 3  # notes of one kind on several files that are printed
 
 
 def add_parser(commands: Any) -> None:
@@ -41,7 +44,7 @@ def add_parser(commands: Any) -> None:
 
 
 def _add_import(data: Any) -> None:
-    text = "make a data set from tables of signal strengths: CSV, Parquet, Excel (docs/howto/own-data.md)"
+    text = "make a data set from tables, surveys and logs of signal strengths (docs/howto/own-data.md, surveys.md)"
     parser = add_command(data, "import", import_command, text)
     add, metres = parser.add_argument, dict[str, Any](type=float, metavar="M")
     add("files", nargs="+", metavar="FILE", help="tables with a column per receiver, or a row per reading")
@@ -62,7 +65,17 @@ def _add_import(data: Any) -> None:
     add("--not-heard", action="append", metavar="DBM", help=text)
     add("--average", choices=AVERAGES, help="mean of the readings of a place (default: db)")
     add("--place", dest="place_m", **metres, help="average in squares of this side (default: at equal positions)")
-    add("--units", metavar="UNIT", help="unit of positions: m, mm, cm, km, ft, deg (default: by names, or m)")
+    add("--units", metavar="UNIT", help="unit of positions: m, mm, cm, km, ft, deg, px (default: by names, or m)")
+    add(
+        "--plan", metavar="PICTURE", help="plan in whose pixels positions are (--units px), y down; or a ROS map's YAML"
+    )
+    add("--resolution", dest="resolution_m", **metres, help="side of a pixel of the plan")
+    text = "point of the plan, from its lower left corner, metres, that becomes the origin, as of mesh"
+    add("--origin", dest="origin_m", type=comma_numbers(3, "X,Y,Z"), metavar="X,Y,Z", help=text)
+    text = "move positions by pairs of points: x,y,to_x,to_y, in the tables' unit and in metres"
+    add("--register-pairs", metavar="CSV", help=text)
+    text = "axis that is up in a trajectory of --positions: z, y, or -y (a camera's frame) as --up=-y"
+    add("--up", metavar="AXIS", help=text)
     add("--pitch", dest="pitch_m", **metres, help="positions are indices of a grid of this pitch")
     add("--crs", metavar="CRS", help="coordinate reference system of positions, such as EPSG:3857")
     text = "unit of headings: rad, deg (from x towards y) or compass (degrees from north, clockwise)"
@@ -129,9 +142,20 @@ def import_command(a: Arguments) -> int:
     values: dict[str, Any] = {"folder": str(report.folder), "columns": report.columns, "notes": report.notes}
     values |= {"summary": facts, "check": check.as_dict(), "next": next_command}
     rows = f"{a.out}: {facts['rows']} rows, {len(facts['receivers'])} receivers; plan.png shows them"
-    lines = [*report.columns, "", *report.notes, "", rows, *check.lines(), f"next: {next_command}"]
+    lines = [*report.columns, "", *_of_many_files(report.notes), "", rows, *check.lines(), f"next: {next_command}"]
     show(a.json, values, "\n".join(lines))
     return 0 if check.ok else 2
+
+
+def _of_many_files(notes: Sequence[str]) -> list[str]:
+    """Notes without those that differ from `MOST_ALIKE` others in the name of their file and in numbers alone."""
+    seen, shown = Counter[str](), list[str]()
+    for note in notes:
+        kind = re.sub(r"\d[\d.,]*", "#", note.partition(": ")[2])
+        seen[kind] += 1
+        shown += [note] * (not kind or seen[kind] <= MOST_ALIKE)
+    more = len(notes) - len(shown)
+    return shown + [f"import.yml has {more} more notes of this kind on other files"] * bool(more)
 
 
 def _where(text: str) -> tuple[str, str]:

@@ -200,3 +200,18 @@ def _number(text: str) -> int | float:
         return int(text) if text.strip().lstrip("+-").isdecimal() else float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+
+
+def comma_numbers(count: int, form: str) -> Callable[[str], tuple[float, ...]]:
+    """Type of an option of numbers between commas."""
+
+    def parsed(text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(value) for value in text.split(","))
+        except ValueError:
+            values = ()
+        if len(values) != count:
+            raise argparse.ArgumentTypeError(f"{text!r}: give {form} in metres")
+        return values
+
+    return parsed

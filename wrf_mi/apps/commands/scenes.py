@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...core import InputError
-from .options import DATASET, SCENE, Arguments, add_antennas, add_command, add_rows, antenna_options
+from .options import DATASET, SCENE, Arguments, add_antennas, add_command, add_rows, antenna_options, comma_numbers
 from .output import Watch, show
 
 if TYPE_CHECKING:
@@ -35,7 +33,7 @@ def _add_mesh(commands: Any) -> None:
     add("--up", choices=("y", "z"), help=text)
     text = "point of the source (of a picture, from its lower left corner), metres, z up, that becomes the origin, "
     text += "such as 701300,4485500,0"
-    add("--origin", type=_numbers(3, "X,Y,Z"), metavar="X,Y,Z", help=text)
+    add("--origin", type=comma_numbers(3, "X,Y,Z"), metavar="X,Y,Z", help=text)
     add("--wall-height", type=float, metavar="M", help="height from floor to ceiling; required for a plan")
     add("--floor", type=float, default=0.0, metavar="M", help="z of a plan's floor (default: 0)")
     add("--resolution", type=float, metavar="M", help="side of a plan's cell where the file has none")
@@ -44,7 +42,7 @@ def _add_mesh(commands: Any) -> None:
     text = (
         "width and height of a plan in longitude and latitude, metres, from its lower left corner, such as 236.7,219.7"
     )
-    add("--extent", type=_numbers(2, "WIDTH,HEIGHT"), metavar="WIDTH,HEIGHT", help=text)
+    add("--extent", type=comma_numbers(2, "WIDTH,HEIGHT"), metavar="WIDTH,HEIGHT", help=text)
     add("--materials", metavar="FILE", help="materials.yml with rules and exceptions")
     add("--register-pairs", metavar="CSV", help="move by pairs of points: x,y[,z],to_x,to_y[,to_z]")
     add("--register-walls", metavar="CSV", help="move so that walls lie on those of a layout: x,y")
@@ -87,21 +85,6 @@ def mesh_command(a: Arguments) -> int:
         lines += check.lines()
     facts |= {"floor_m2": float(floor_m2), "origin_m": scene.origin_m, "check": check.as_dict()}
     return show(a.json, facts, "\n".join(lines))
-
-
-def _numbers(count: int, form: str) -> Callable[[str], tuple[float, ...]]:
-    """Type of an option of numbers between commas."""
-
-    def parsed(text: str) -> tuple[float, ...]:
-        try:
-            values = tuple(float(value) for value in text.split(","))
-        except ValueError:
-            values = ()
-        if len(values) != count:
-            raise argparse.ArgumentTypeError(f"{text!r}: give {form} in metres")
-        return values
-
-    return parsed
 
 
 def _add_correct(commands: Any) -> None:

@@ -1,13 +1,15 @@
-"""Tables in CSV of any separator and decimal mark, with comments or without header, in Parquet and Excel."""
+"""Tables in CSV of any separator and decimal mark, with comments or without header, in Parquet, Excel and documents."""
 
 from __future__ import annotations
 
 import csv
 import io
 import re
+import shlex
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,8 +23,8 @@ from ...core.files import listed, one_line, readable
 from ...core.memory import require_memory
 from ...datasets.folder_files import SINGLE_MAX
 from ...datasets.receivers_file import plain_id
-
-Frame = Any  # pandas.DataFrame, which is imported where it is used
+from .documents import event_log_of, read_document, read_events, read_messages
+from .programs import CELL, POSE_NAMES, QUATERNION, Frame, cell_parts, headerless_form, program_of
 
 COMMENTS = ("#", "%", "//")
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas"}
@@ -37,9 +39,11 @@ COMMA_FRACTION = re.compile(r"[+-]?\d+,\d+")
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|nan", re.IGNORECASE)
 FIELD_UNIT = re.compile(r"([+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?)\s*([a-zA-Z]{1,7}|%)")
 """A number with its unit, as in ``-65dBm``, ``2437 MHz`` and ``85%``."""
+MOST_FIELDS = 12  # names of columns that a message has at most
 MOST_PREAMBLE = 20  # lines above the header that name the program, the device or the survey
+DOCUMENTS = (".json", ".jsonl", ".ndjson", ".yaml", ".yml")
+TRY_COLUMNS = "--columns x=X,y=Y,id=BSSID,rssi=RSSI (names of its columns)"
 CONVERSIONS = {
-    ".json": "write its points as a table with a row for each reading: x,y,bssid,rssi",
     **dict.fromkeys((".geojson", ".kml", ".kmz"), "write its points as a table of readings: lon,lat,bssid,rssi"),
     ".gpx": "write its track as a table time,lat,lon and give it by --positions",
     **dict.fromkeys((".xls", ".xlsb", ".ods", ".numbers"), "save it as .xlsx or .csv"),
@@ -67,12 +71,16 @@ class Table:
         files: path and number of rows of each file.
         notes: form of each file in words, such as its separator.
         has_header: whether the columns have names.
+        columns: columns by meaning that the program tells which wrote the file.
+        image: picture in whose pixels positions are, or "".
     """
 
     frame: Frame
     files: tuple[tuple[Path, int], ...]
     notes: tuple[str, ...] = ()
     has_header: bool = True
+    columns: Mapping[str, str] = field(default_factory=dict)
+    image: str = ""
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -117,25 +125,29 @@ class Table:
         return True
 
 
-def read_table(path: str | Path, sheet: str = "") -> Table:
-    """Read a table by its ending: ``.parquet``, ``.xlsx``, or else text.
+def read_table(path: str | Path, sheet: str = "", as_is: bool = False) -> Table:
+    """Read a table by its ending: ``.parquet``, ``.xlsx``, a document (``.json``, ``.yaml``), or else text.
 
     Numbers that all have one unit in their fields, such as ``-65dBm``, are read with that unit in the column's name.
 
     Args:
-        path: the file.
-        sheet: name of the sheet of a workbook; "": its only one with cells.
+        path: the file; ``FILE.xlsx#SHEET`` names a sheet of its own.
+        sheet: name of the sheet of a workbook, or first column of one of the tables in a text; "": the only one.
+        as_is: whether columns keep the names that the program gave them, where others state their meaning.
 
     Raises:
         InputError: missing or damaged file, another format, a workbook of several sheets without ``sheet``, rows with
             more or fewer fields than the first, a column named twice, or more fields than memory
             holds.
     """
+    workbook, mark, own_sheet = str(path).rpartition("#")
+    if mark and workbook.lower().endswith(".xlsx") and not Path(path).exists():
+        path, sheet = workbook, own_sheet
     path, pandas = Path(path), package("pandas")
     missing = DataFault(path, "missing; give a file that exists")
     suffix = path.suffix.lower()
     if remedy := CONVERSIONS.get(suffix):
-        raise DataFault(path, f"{suffix} is not read as a table; {remedy}")
+        raise DataFault(path, f"{suffix} is not read as a table; {remedy}, then {TRY_COLUMNS}")
     if suffix == ".parquet":
         package("pyarrow")
         with readable(path, missing, "give a file in the format of .parquet"):
@@ -147,20 +159,47 @@ def read_table(path: str | Path, sheet: str = "") -> Table:
         name = _chosen_sheet(path, {name: len(frame) for name, frame in sheets.items() if frame.size}, sheet)
         frame, note = sheets[name], f", sheet {one_line(name)}" * (len(sheets) > 1)
     else:
-        return _read_text(path)
+        return _of_program(_read_text(path, sheet), as_is)
     frame.columns = [str(name).strip() for name in frame.columns]
     _check_names(path, list(frame.columns))
     _check_size(path, len(frame), frame.shape[1])
-    return Table(_with_units(frame), ((path, len(frame)),), (f"{path.name}: {len(frame)} rows{note}",))
+    table = Table(_with_units(frame), ((path, len(frame)),), (f"{path.name}: {len(frame)} rows{note}",))
+    return _of_program(table, as_is)
+
+
+def _of_program(table: Table, as_is: bool) -> Table:
+    """A table with the names and meanings of columns that its program tells."""
+    frame, file = table.frame, table.files[0][0]
+    if not table.has_header and (form := headerless_form(frame)):
+        note = f"{file.name}: columns of {form.name}, which has no header"
+        frame = frame.set_axis(list(form.columns), axis=1)
+        table = replace(table, frame=frame, has_header=True, notes=(*table.notes, note))
+    if set(QUATERNION) <= set(frame.columns):
+        frame = frame.rename(columns=POSE_NAMES)
+    program = program_of(list(frame.columns))
+    for column, number in program.unknown.items() if program else ():
+        frame = frame.assign(**{column: frame[column].mask(frame[column] == number)})
+    if program is not None and not as_is:
+        frame = frame.rename(columns=program.new_name)
+        notes = (*table.notes, f"{file.name}: columns of {program.name}")
+        return replace(table, frame=frame, columns=program.columns, notes=notes)
+    if not as_is and (parts := cell_parts(list(frame.columns))):
+        known = frame[parts].notna().all(axis=1)
+        texts = frame[parts].astype("string").apply(lambda column: column.str.strip().map(plain_id, na_action="ignore"))
+        identity = texts[parts[0]].str.cat(texts[parts[1:]], sep="-").where(known)
+        notes = (*table.notes, f"{file.name}: a cell is told by {', '.join(parts)} together")
+        return replace(table, frame=frame.assign(**{CELL: identity}), columns={"id": CELL}, notes=notes)
+    return replace(table, frame=frame)
 
 
 def _chosen_sheet(path: Path, rows: dict[str, int], sheet: str) -> str:
-    """The sheet that is asked for, or the only one with cells, of those with their number of rows."""
+    """The sheet or table that is asked for, or the only one with cells, of those with their number of rows."""
     if sheet in rows or (not sheet and len(rows) == 1):
         return sheet or next(iter(rows))
     named = listed([f"{one_line(name)} ({count} rows)" for name, count in rows.items()])
     what = f"no sheet {one_line(sheet)} with cells" if sheet else "several sheets"
-    raise DataFault(path, f"{what} ({named}); choose one by --sheet NAME")
+    shown = shlex.quote(max(rows, key=lambda name: rows[name], default="NAME"))
+    raise DataFault(path, f"{what} ({named}); choose one by --sheet NAME, such as --sheet {shown}")
 
 
 def _with_units(frame: Frame) -> Frame:
@@ -191,7 +230,8 @@ def joined(tables: list[Table]) -> Table:
     frames = [table.frame.set_axis(table.frame.index + start) for table, start in zip(tables, starts, strict=False)]
     frame = package("pandas").concat(frames)
     _check_size(files[-1][0], len(frame), frame.shape[1])
-    return Table(frame, files, tuple(note for table in tables for note in table.notes), first.has_header)
+    notes = tuple(note for table in tables for note in table.notes)
+    return replace(first, frame=frame, files=files, notes=notes)
 
 
 def _check_names(path: Path, names: list[str]) -> None:
@@ -205,21 +245,32 @@ def _check_size(path: Path, rows: int, columns: int) -> None:
         raise DataFault(path, "no rows; give one per measurement")
 
 
-def _read_text(path: Path) -> Table:
+def _read_text(path: Path, sheet: str) -> Table:
     """A table of text, whose separator, decimal mark and header are recognised from its first lines."""
     missing = DataFault(path, "missing; give a file that exists")
     with readable(path, missing, "give a table as text (CSV), Parquet (.parquet) or Excel (.xlsx)"):
         encoding, text = _decoded(path)
-    # Numbers and texts of the lines of rows, and the comment above the first of them.
-    rows, comment = list[tuple[int, str]](), ""
+    if path.suffix.lower() in DOCUMENTS:
+        objects, image = read_document(path, text)
+        return _of_rows(path, objects, image)
+    # Numbers and texts of the lines of rows, after a blank line or not, and the comment above the first of them.
+    rows, comment, blank, first = list[tuple[int, str]](), "", False, list[int]()
     for number, line in enumerate(text.split("\n"), start=1):
         plain = line.strip()
         if plain and not plain.startswith(COMMENTS):
+            first += [len(rows)] * blank
             rows.append((number, line))
         elif plain and not rows:
             comment = plain
+        blank = not plain
     if not rows:
         raise DataFault(path, "empty; give a row per measurement")
+    lines = [line for _, line in rows]
+    if (log := event_log_of(lines)) is not None:
+        return _of_rows(path, read_events(path, text, rows, log))
+    if messages := read_messages(lines):
+        return _of_rows(path, messages, left_out=len(lines) - len(messages))
+    rows, note_of_tables = _chosen_table(path, rows, first, sheet)
 
     # Separator and decimal mark, without lines above the header.
     separator, above = _separator_below([line for _, line in rows[:SAMPLE]])
@@ -239,8 +290,10 @@ def _read_text(path: Path) -> Table:
     # Fields: pandas fills missing ones silently.
     for number, line in rows if separator != SPACES else ():
         if (fields := line.count(separator) + 1) != len(names) and '"' not in line:
-            text = f"{fields} fields, but the first line has {len(names)}; correct or remove the line"
-            raise DataFault(path, text, line=number)
+            text = f"{fields} fields, but the first line has {len(names)}"
+            shown = one_line(", ".join(names[:MOST_FIELDS]))
+            remedy = "correct or remove the line, or write a row for each reading with a header and give"
+            raise DataFault(path, f"{text} ({shown}); {remedy} {TRY_COLUMNS}", line=number)
     rows = rows[header == "in its first line" :]
     _check_size(path, len(rows), len(names))
     with readable(path, missing, "correct the line"):
@@ -254,8 +307,44 @@ def _read_text(path: Path) -> Table:
     form = f"separated by {SEPARATORS.get(separator, 'blanks')}" + ", decimal comma" * (decimal == ",")
     form += f", encoding {encoding}" * (encoding != "utf-8-sig")
     note = f"{path.name}: {len(frame)} rows, {form}, header {header}"
-    note += f"; {above} lines above it are left out" * bool(above)
+    note += f"; {above} lines above it are left out" * bool(above) + note_of_tables
     return Table(_with_units(frame), ((path, len(frame)),), (note,), header != "absent")
+
+
+def _chosen_table(
+    path: Path, rows: list[tuple[int, str]], first: Sequence[int], sheet: str
+) -> tuple[list[tuple[int, str]], str]:
+    """Rows of one of several tables in a text, and what was left out; ``first`` rows follow a blank line.
+
+    A table begins with a header, which is the first line or follows a blank one.
+    """
+    headers = {row: _fields(rows[row][1], _separator([rows[row][1]])[0]) for row in sorted({0, *first})}
+    starts = [
+        row for row, names in headers.items() if row == 0 or (len(names) > 1 and not any(map(NUMBER.fullmatch, names)))
+    ]
+    if len(headers[0]) == 1:  # lines above the header
+        starts = starts[:1]
+    ends = [*starts[1:], len(rows)]
+    tables = {headers[start][0]: rows[start:end] for start, end in zip(starts, ends, strict=True)}
+    counts = {name: len(lines) - 1 for name, lines in tables.items()}
+    if len(tables) == 1:
+        return rows, ""
+    known = [name for name, lines in tables.items() if program_of(_fields(lines[0][1], ","))]
+    name = _chosen_sheet(path, counts, sheet or (known[0] if len(known) == 1 else ""))
+    others = listed([f"{one_line(other)} ({counts[other]} rows)" for other in tables if other != name])
+    return tables[name], f"; tables that are left out, by their first column (--sheet): {others}"
+
+
+def _of_rows(path: Path, rows: Sequence[Mapping[str, Any]], image: str = "", left_out: int = 0) -> Table:
+    """A table of rows with named fields, texts of numbers read as numbers."""
+    frame = package("pandas").DataFrame(rows)
+    for name in frame.columns:
+        with suppress(ValueError, TypeError):
+            frame[name] = package("pandas").to_numeric(frame[name])
+    _check_size(path, len(frame), frame.shape[1])
+    note = f"{path.name}: {len(frame)} rows" + f", points of {image}" * bool(image)
+    note += f"; {left_out} lines of other topics are left out" * bool(left_out)
+    return Table(_with_units(frame), ((path, len(frame)),), (note,), image=image)
 
 
 def _decoded(path: Path) -> tuple[str, str]:

@@ -7,6 +7,7 @@ letters without unit, blanks and marks (`ColumnName`).
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -20,7 +21,8 @@ from .files import Frame, Table, package
 
 METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048, "inch": 0.0254}
 HERTZ = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
-UNITS = (*METRES, *HERTZ, "deg", "degrees", "rad", "dbm", "mw", "s", "ms", "%")
+PIXELS = ("px", "pixel", "pixels")
+UNITS = (*METRES, *PIXELS, *HERTZ, "deg", "degrees", "rad", "dbm", "mw", "s", "ms", "%")
 MARKED_UNIT = re.compile(r"[(\[]\s*([A-Za-z]+|%)\s*[)\]]|[_ ]([A-Za-z]+|%)$")
 AFFIXES = ("", "coord", "coordinate", "pos", "position", "loc", "location", "point", "p", "gt", "true", "tag")
 """Words before or after x, y and z in names of coordinates."""
@@ -32,6 +34,7 @@ MEANINGS = {
     "floor": "floor|floorid|floornumber|storey|level",
     "heading": "heading|yaw|orientation|bearing|azimuth|course|compass",
     "time": "time|timestamp|ts|datetime|date|rxtime|unixtime|epoch|t|firstseen",
+    "seen": "lastseen|lastseentimestamp|lastseentime",
     "run": "run|session|visit|campaign|trajectory|track|walk|device|phone|handset|user",
     "split": "split|subset",
     "frequency": "frequency|freq|carrier|carrierfrequency|primaryfrequency|centerfreq|centrefrequency|centerfrequency",
@@ -155,6 +158,7 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
         InputError: no such column, or none that can be strengths.
     """
     names = list(table.frame.columns)
+    stated = {meaning: name for meaning, name in table.columns.items() if name in names} | dict(stated)
     # A unit that all fields of a column have stands in its name, where whoever states the column does not know of it.
     with_unit = {ColumnName(name).without_unit: name for name in names if unit_of(name)}
     stated = {meaning: name if name in names else with_unit.get(name, name) for meaning, name in stated.items()}
@@ -165,10 +169,46 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
     for columns_of in FORMS.values():
         if (columns := columns_of(table, of, receivers)) is not None:
             columns.kept = list(table.frame.columns.drop([*columns.of.values(), *columns.strengths]))
+            tellers = [name for name in columns.kept if _tells_receivers(table, name)]
+            if len(columns.strengths) == 1 and tellers and not receivers:
+                strength = one_line(next(iter(columns.strengths)))
+                text = (
+                    f"{one_line(tellers[0])} has names, {strength} strengths: readings of several receivers, or of one"
+                )
+                remedy = f"give --columns {suggested_columns(table, of)}, or --receivers 'PATTERN*'"
+                raise DataFault(table.files[0][0], f"{text}; {remedy}", line=1)
             return columns
     text = f"no column of signal strengths among {shown_names(names)}"
-    remedy = "name it by --columns rssi=...,id=... or by --receivers 'PATTERN*'"
+    remedy = f"try --columns {suggested_columns(table, of)}, or --receivers 'PATTERN*' for a column of each receiver"
     raise DataFault(table.files[0][0], f"{text}; {remedy}", line=1)
+
+
+def suggested_columns(table: Table, of: Mapping[str, str], meanings: Sequence[str] = ("x", "y", "id", "rssi")) -> str:
+    """Text of ``--columns`` for a table, by the values of its columns; ``?`` where none is likely."""
+    free = [name for name in table.frame.columns if name not in of.values()]
+    numeric = [name for name in free if table.is_numeric(name)]
+    texts = [name for name in free if name not in numeric]
+    addresses = [name for name in texts if _has_addresses(table, name)]
+    tellers = [name for name in texts if _tells_receivers(table, name)]
+    repeated = [name for name in texts if 1 < table.frame[name].nunique() < len(table)]
+    strengths = [name for name in numeric if _is_dbm(table, name)]
+    planar = [name for name in numeric if name not in strengths]
+    likely = {"x": planar, "y": planar[1:], "id": [*addresses, *tellers, *repeated], "rssi": strengths}
+    if {"x", "y"} <= of.keys() or {"lon", "lat"} <= of.keys():
+        meanings = [meaning for meaning in meanings if meaning not in ("x", "y")]
+    likely = {meaning: likely[meaning] for meaning in meanings}
+    chosen = {meaning: of.get(meaning) or next(iter(names), "?") for meaning, names in likely.items()}
+    return shlex.quote(one_line(",".join(f"{meaning}={name}" for meaning, name in chosen.items())))
+
+
+def _has_addresses(table: Table, name: str) -> bool:
+    texts = table.frame[name].dropna().astype(str).str.strip()
+    return bool(texts.str.fullmatch(MAC.pattern, case=False).any())
+
+
+def _tells_receivers(table: Table, name: str) -> bool:
+    """Whether a column has addresses, or several names under a heading of receivers."""
+    return _has_addresses(table, name) or (ColumnName(name).is_identity and table.frame[name].nunique() > 1)
 
 
 def shown_names(names: Sequence[str]) -> str:

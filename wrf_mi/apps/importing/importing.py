@@ -21,8 +21,10 @@ from ...core.types import IntArray
 from ...datasets.ble_folder import CARRIER_HZ, write_ble_folder
 from ...datasets.unknown import SENT, name_words
 from ...tasks import RSSI
+from .carriers import carriers_of_receivers, column_hz
 from .files import Table, joined, read_table
-from .forms import HERTZ, described, find_columns, parsed_columns, unit_of, without_slots
+from .fixes import with_fixes, without_stale
+from .forms import PIXELS, described, find_columns, parsed_columns, without_slots
 from .options import ImportOptions, option_name
 from .picture import plan_picture
 from .places import (
@@ -38,6 +40,7 @@ from .places import (
     with_cells,
     with_positions,
 )
+from .pooled import refuse_per_cent, refuse_several_kinds, texts_of_readings
 from .readings import (
     Means,
     Readings,
@@ -48,14 +51,13 @@ from .readings import (
     without_not_heard,
 )
 from .receivers_table import read_receivers
+from .registration import registered_frame
+from .trajectories import upright
 
 FACTS, PICTURE = "import.yml", "plan.png"  # files beside the tables: what the import assumed, and a plan of the rows
 MOST_STEPS = 500  # largest extent of whole numbers that may be indices of a grid
 MOST_CELLS = 50_000_000  # largest number of receivers times places: 2 GB while means are computed
-BAND = 0.25  # largest relative spread of the channels of one band: 0.14 of Wi-Fi at 5 GHz, while 2.4 and 5 GHz are two
 TRAIN_WORDS, TEST_WORDS = ("train", "training", "validation", "valid", "val"), ("test", "testing")
-RADIOS = frozenset({"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "umts", "tdscdma", "lte", "nr", "5g"})
-"""Values of a column of kinds of radio, in small letters."""
 SENT_IN_NAME = re.compile(r"(?<![\d.])(-?\d+(?:\.\d+)?)[ _]?dbm", re.IGNORECASE)
 STRENGTH_DIGITS = 4  # decimals of means and their noise in dB
 
@@ -86,7 +88,8 @@ def import_measurements(
     at one place are averaged. The folder also holds ``import.yml`` with all that was assumed, and ``plan.png``.
 
     Args:
-        files: tables in CSV, Parquet or Excel; their rows train, unless there is a column ``split``.
+        files: tables in CSV, Parquet or Excel, JSON of surveys, and logs (docs/howto/surveys.md); their rows train,
+            unless there is a column ``split``.
         out: folder to write.
         replace: whether an existing folder is replaced.
         options: attributes of `ImportOptions`.
@@ -132,7 +135,7 @@ class _Import:
     def run(self, replace: bool) -> ImportReport:
         """Read, average and write."""
         self._check_idle()
-        self._check_strengths()
+        refuse_per_cent(self.table, self.columns)
 
         # Positions of the rows, and single readings without numbers for "not heard".
         frame, xyz_m = self._positions()
@@ -140,10 +143,10 @@ class _Import:
         self.notes += notes
         if not len(readings.dbm):
             raise DataFault(self.table.files[0][0], "no reading was heard; correct --columns or --not-heard")
-        self._check_radios(readings)
+        refuse_several_kinds(self.table, self.columns, readings)
 
         # Rows of one position, heading, carrier, run and part of the split are averaged.
-        conditions = self._conditions(readings)
+        conditions = self._conditions(readings, frame)
         keys = {"z": xyz_m[:, 2], **conditions, "part": self.is_test}
         place = place_numbers(keys, xyz_m[:, :2], self.options.place_m)
         count = np.bincount(place)
@@ -180,7 +183,9 @@ class _Import:
 
         # Tables, each with positions of another file, if any.
         paths = [*files, *options.test]
-        tables, positions = ([read_table(path, options.sheet) for path in part] for part in (paths, options.positions))
+        as_is = {"id", "rssi"} <= self.stated.keys()
+        tables = [without_stale(read_table(path, options.sheet, as_is), self.stated) for path in paths]
+        positions = [upright(read_table(path, options.sheet), options.up) for path in options.positions]
         if len(positions) not in (0, 1, len(paths)):
             text = f"{len(positions)} files of positions for {len(paths)} tables"
             raise InputError(f"--positions: {text}; give one for each table, those of --test last, or one for all")
@@ -188,39 +193,66 @@ class _Import:
             positions *= len(paths) // len(positions)
             pairs = [with_positions(*pair, self.stated) for pair in zip(tables, positions, strict=True)]
             tables = [table for table, _ in pairs]
+            self.notes += positions[0].notes[1:]
             self.notes.append(f"positions of {options.positions[0]} are matched {pairs[0][1]}")
 
         # One table of all rows that are chosen, and the number of each row's file.
-        tables = [without_slots(table) for table in tables]
+        tables = [with_fixes(table, self.stated) for table in tables]
+        tables = tables if as_is else [without_slots(table) for table in tables]
         self._file = np.repeat(np.arange(len(paths)), list(map(len, tables)))
         table = joined(tables)
         for name, text in options.where.items():
             chosen_rows = table.where(name, text)
             left_out = len(table) - np.count_nonzero(chosen_rows)
             self.notes.append(f"{left_out} rows are left out: their {one_line(name)} is not {one_line(text)}")
-            table = dataclasses.replace(table, frame=table.frame[chosen_rows])
+            frame = table.frame[chosen_rows].dropna(axis=1, how="all")  # columns of other kinds of rows
+            table = dataclasses.replace(table, frame=frame)
             self._file = self._file[chosen_rows]
         return table, self._file >= len(files)
 
     def _check_idle(self) -> None:
         """Refuse options of quantities that the tables state, or do not have."""
-        of, without_z = self.columns.of, "z" not in self.columns.of
+        of, without_z, pairs = self.columns.of, "z" not in self.columns.of, self.options.register_pairs
+        is_registered = pairs is not None or self._unit() in PIXELS
         needed = {
             "height_m": (without_z, "the table has a column z"),
             "storey_m": (without_z and "floor" in of, "it belongs to a column floor without z"),
             "heading": ("heading" in of, "the table has no column of headings"),
             "anchor_height_m": (self.options.anchors is not None, "it belongs to --anchors"),
+            "register_pairs": ("x" in of, "positions are longitude and latitude"),
+            "pitch_m": (not is_registered, "positions are pixels, or registered by pairs"),
+            "crs": (not is_registered, "positions are pixels, or registered by pairs"),
+            "plan": (self._unit() in PIXELS and pairs is None, "it belongs to --units px"),
+            "resolution_m": (self.options.plan is not None, "it belongs to --plan"),
+            "origin_m": (self.options.plan is not None, "it belongs to --plan"),
+            "up": (bool(self.options.positions), "it belongs to a trajectory of --positions"),
         }
         for name, (counts, reason) in needed.items():
             if not counts and getattr(self.options, name) != getattr(ImportOptions, name):
                 raise DataFault(self.table.files[0][0], f"{option_name(name)}: {reason}; omit it")
+
+    def _unit(self) -> str:
+        """Unit of positions that is stated by an option, a column's name, or a survey with a picture; or ""."""
+        options, of, table = self.options, self.columns.of, self.table
+        unit = options.units or self.columns.unit("x" if "x" in of else "lon")
+        if not unit and not options.pitch_m and table.image and "x" in of:
+            where = f"x and y are points of {one_line(table.image)}; give --units px --plan {shlex.quote(table.image)}"
+            text = "--resolution M (metres of a pixel), --units px --register-pairs pairs.csv, or --units m"
+            raise DataFault(table.files[0][0], f"{where} {text}")
+        return unit
 
     def _positions(self) -> tuple[LocalFrame, FloatArray]:
         """The local frame and the positions [rows, 3] in it."""
         options, table, of = self.options, self.table, self.columns.of
         first, second, geographic = plane_columns(of, table)
         xy = finite_columns(table, [first, second])
-        unit = options.units or self.columns.unit("lon" if geographic else "x")
+        unit = self._unit()
+        if unit in PIXELS or options.register_pairs is not None:
+            pairs, is_pixels = options.register_pairs, unit in PIXELS
+            frame, note = registered_frame(options.plan, options.resolution_m, options.origin_m, pairs, is_pixels)
+            self.units |= {"x": unit or "registered", "y": unit or "registered"}
+            self.notes.append(note)
+            return frame, np.column_stack([frame.local_m(xy), self._heights_m()])
         scale_m = options.pitch_m or unit_scale(unit, "--units")
         frame, notes = find_frame(xy, geographic, unit, scale_m, options.crs)
         self.notes += notes
@@ -234,7 +266,8 @@ class _Import:
         """Heights of the rows, from z, the floor, or an assumption."""
         options, table, of = self.options, self.table, self.columns.of
         if "z" in of:
-            self.units["z"] = self.columns.unit("z") or options.units.replace("deg", "m") or "m"
+            unit = "m" if options.units in ("deg", *PIXELS) else options.units
+            self.units["z"] = self.columns.unit("z") or unit or "m"
             return finite_columns(table, [of["z"]])[:, 0] * unit_scale(self.units["z"], "--units")
         count, stated_m = int(self._file.max()) + 1, np.atleast_1d(np.asarray(options.height_m, float))
         if len(stated_m) not in (1, count):
@@ -253,34 +286,10 @@ class _Import:
         self.notes.append(f"no column z: {text} {listed([f'{z:g}' for z in heights_m])} m above the floor (--height)")
         return height_m
 
-    def _check_strengths(self) -> None:
-        """Refuse strengths in per cent, whose scale is that of each program."""
-        of = self.columns.of
-        names = [of["rssi"]] if "rssi" in of and not self.columns.strengths else list(self.columns.strengths)
-        for name in names:
-            if unit_of(name) == "%" or name_words(name) & {"quality", "percent"}:
-                text = f"{one_line(name)} is in per cent; give dBm (in Windows dBm = quality / 2 - 100)"
-                raise DataFault(self.table.files[0][0], f"{text}, or name another column by --columns rssi=...")
-
-    def _check_radios(self, readings: Readings) -> None:
-        """Refuse strengths of several kinds of radio."""
-        for name in self.table.frame.columns:
-            values = self._of_readings(name, readings)
-            if values.nunique() > 1 and set(values.str.lower()) <= RADIOS:
-                counts = listed([f"{one_line(text)} ({rows})" for text, rows in values.value_counts().items()])
-                text = f"{one_line(name)} is {counts}: these are not pooled"
-                remedy = f"choose one by --where {shlex.quote(f'{name}={values.value_counts().index[0]}')}"
-                raise DataFault(self.table.files[0][0], f"{text}; {remedy}")
-
-    def _of_readings(self, name: str, readings: Readings) -> Any:
-        """Texts of a column where it is stated, by the number of the reading."""
-        values = self.table.frame[name].iloc[readings.row].reset_index(drop=True)
-        return values[values.notna()].astype(str).str.strip()
-
     def _sent(self, readings: Readings) -> NDArray[np.str_] | None:
         """Sent power of each row, "" where none is stated, if a receiver has several: by a column or names of files."""
         for name in self.table.frame.columns:
-            values = self._of_readings(name, readings)
+            values = texts_of_readings(self.table, name, readings)
             several = values.groupby(readings.receiver[values.index]).nunique().max() > 1
             if name_words(name) & SENT and self.table.is_numeric(name) and several:
                 self.notes.append(f"{one_line(name)} is {listed(values.unique())}: a run for each, with its offset")
@@ -294,7 +303,7 @@ class _Import:
         self.notes.append(f"files at {', '.join(distinct)} dBm sent, by their names: a run for each, with its offset")
         return np.asarray(texts[self._file])
 
-    def _conditions(self, readings: Readings) -> dict[str, Any]:
+    def _conditions(self, readings: Readings, frame: LocalFrame) -> dict[str, Any]:
         """Heading, carrier and run of each row where stated; rows that differ in them are not averaged."""
         of, table, conditions = self.columns.of, self.table, {}
         if "split" in of:
@@ -305,7 +314,9 @@ class _Import:
                 self.columns.kept.append(of.pop(meaning))
         if "heading" in of:
             headings = finite_columns(table, [of["heading"]])[:, 0]
-            conditions["heading"], self.units["heading"] = headings_rad(headings, of["heading"], self.options.heading)
+            headings, unit = headings_rad(headings, of["heading"], self.options.heading)
+            conditions["heading"] = headings if "north" in unit else frame.headings_rad(headings)
+            self.units["heading"] = unit
         if "run" in of:
             conditions["run"] = table.frame[of["run"]].astype(str).str.strip().to_numpy(str)
         if (sent := self._sent(readings)) is not None:
@@ -314,26 +325,11 @@ class _Import:
             conditions["run"] = np.array([f"{run} {power}".strip() for run, power in zip(runs, powers, strict=True)])
         if "frequency" in of and not self.options.frequency_hz:
             self.units["frequency"] = "-> Hz"
-            conditions |= self._carriers(_hertz(table, of["frequency"]), readings)
+            carriers_hz = column_hz(table, of["frequency"])
+            self.carrier_of, notes = carriers_of_receivers(carriers_hz, readings)
+            self.notes += notes
+            conditions |= {} if self.carrier_of else {"frequency_hz": carriers_hz}
         return conditions
-
-    def _carriers(self, carriers_hz: FloatArray, readings: Readings) -> dict[str, Any]:
-        """Carriers of rows, none where each receiver has its own, as in a scan of Wi-Fi networks."""
-        heard = np.column_stack([readings.receiver, carriers_hz[readings.row]])
-        pairs, count = np.unique(heard, axis=0, return_counts=True)
-        # Access points change their channels now and then; where carriers are compared, every receiver has several.
-        parts = [np.flatnonzero(pairs[:, 0] == number) for number in np.unique(pairs[:, 0])]
-        several = [part for part in parts if len(part) > 1]
-        one_band = all(np.ptp(pairs[part, 1]) <= BAND * pairs[part, 1].min() for part in several)
-        if len(np.unique(pairs[:, 1])) == 1 or 2 * len(several) >= len(parts) or not one_band:
-            return {"frequency_hz": carriers_hz}
-        most = [pairs[part[np.argmax(count[part])]] for part in parts]
-        self.carrier_of = {readings.ids[int(number)]: float(carrier) for number, carrier in most}
-        if several:
-            named = listed([readings.ids[int(pairs[part[0], 0])] for part in several])
-            text = f"{len(several)} of {len(parts)} receivers changed their channel, and have that of most readings"
-            self.notes.append(f"{text}: {named}")
-        return {}
 
     def _means(self, readings: Readings, place: IntArray, places: int) -> tuple[list[str], Means]:
         """Ids of the receivers that remain, and the means of their readings at each place."""
@@ -359,7 +355,8 @@ class _Import:
         """Receivers with the carriers of their readings, if these state any."""
         options = self.options
         table = None if options.anchors is None else read_table(options.anchors, options.sheet)
-        receivers, notes = read_receivers(table, ids, frame, options.units, options.anchor_height_m)
+        unit = PIXELS[0] if self._unit() in PIXELS else options.units
+        receivers, notes = read_receivers(table, ids, frame, unit, options.anchor_height_m)
         pairs = zip(ids, receivers, strict=True)
         carriers = [self.carrier_of.get(name, receiver.frequency_hz) for name, receiver in pairs]
         if None in carriers or options.frequency_hz:  # one carrier for all
@@ -409,13 +406,3 @@ def _test_rows(table: Table, column: str) -> NDArray[np.bool_]:
         text = f"{one_line(column)} is {one_line(words[wrong[0]])!r}; give train or test, or --columns split=-"
         raise table.fault(text, int(wrong[0]))
     return np.isin(words, TEST_WORDS)
-
-
-def _hertz(table: Table, column: str) -> FloatArray:
-    """Carriers in Hz, from the unit of their column or else by their size."""
-    values = finite_columns(table, [column])[:, 0]
-    if (wrong := values <= 0).any():
-        row = int(np.argmax(wrong))
-        raise table.fault(f"{one_line(column)} is {values[row]:g}; give the carrier, or --columns frequency=-", row)
-    largest = values.max()
-    return values * HERTZ.get(unit_of(column), 1e9 if largest < 1e3 else 1e6 if largest < 1e6 else 1.0)

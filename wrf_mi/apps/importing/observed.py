@@ -13,7 +13,8 @@ from ...core import DataFault
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from .files import Table, read_table
-from .forms import Columns, find_columns
+from .fixes import with_fixes, without_stale
+from .forms import Columns, find_columns, without_slots
 from .places import LocalFrame, finite_columns, place_numbers, plane_columns, unit_scale
 from .readings import mean_strengths, read_readings, without_not_heard
 
@@ -45,7 +46,7 @@ def read_observed(path: str | Path, facts: Mapping[str, Any]) -> ObservedTable:
     Raises:
         InputError: a table or a field that cannot be understood.
     """
-    table = read_table(path)
+    table = without_slots(with_fixes(without_stale(read_table(path), {}), {}))
     try:
         columns = find_columns(table, {})
     except DataFault as fault:  # whose remedies are options of the import
@@ -66,8 +67,7 @@ def _positions_m(table: Table, columns: Columns, frame: Mapping[str, Any] | None
         return None
     *names, geographic = plane_columns(columns.of, table)
     if frame is not None:
-        of_import = LocalFrame(frame["crs"], frame["scale_m"], tuple(frame["origin"]), frame["swapped"])
-        return of_import.local_m(finite_columns(table, names))
+        return LocalFrame.from_facts(frame).local_m(finite_columns(table, names))
     if geographic:
         text = "positions in degrees, and the data of the run state no origin; give x, y in its frame, or no positions"
         raise DataFault(table.files[0][0], text, line=1)

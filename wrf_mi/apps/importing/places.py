@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
-from ...core.files import one_line
+from ...core.files import listed, one_line
 from ...scene.coordinates import LATITUDE, LONGITUDE, local_projection
 from .files import Table, package
-from .forms import METRES, named_columns, shown_names, unit_of
+from .forms import METRES, named_columns, shown_names, suggested_columns, unit_of
 
 DEGREES = "EPSG:4326"
 FAR_M = 10_000.0  # largest coordinate without a shift: single precision resolves a millimetre to 16 km
@@ -34,7 +34,10 @@ PAIR = re.compile(
     r"\D{0,2}?([+-]?\d+(?:\.\d*)?)\s*[,;\s]\s*([+-]?\d+(?:\.\d*)?)(?:\s*[,;\s]\s*([+-]?\d+(?:\.\d*)?))?\D{0,2}"
 )
 """Coordinates x, y and, if stated, z in one text, as in ``(3.5, -2.0)``."""
+DATE = re.compile(r"^(\d{4})\D(\d\d)\D(\d\d)\D(\d\d)\D(\d\d)\D(\d\d)")
+"""Dates with any marks, as in ``2018.05.07_18.57.10``."""
 MOST_FLOORS = 20  # numbers of a third column without name from which it is no floor
+FILE = "file"  # column of positions with the names of the files that were measured there
 PLACES = ("x", "y", "z", "lat", "lon", "floor", "heading")
 
 
@@ -47,12 +50,14 @@ class LocalFrame:
         scale_m: metres of a unit.
         origin: coordinates of the local origin: metres, or longitude and latitude in degrees with a ``crs``.
         swapped: whether x is the latitude.
+        affine: rows of the matrix [2, 3] that makes metres of pixels of a plan or of registered coordinates; (): none.
     """
 
     crs: str = ""
     scale_m: float = 1.0
     origin: tuple[float, float] = (0.0, 0.0)
     swapped: bool = False
+    affine: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def local_crs(self) -> str:
@@ -61,6 +66,9 @@ class LocalFrame:
 
     def local_m(self, xy: FloatArray) -> FloatArray:
         """Metres [n, 2] from coordinates [n, 2] of the table, NaN where unknown."""
+        if self.affine:
+            matrix = np.array(self.affine)
+            return np.asarray(xy @ matrix[:, :2].T + matrix[:, 2])
         xy = xy[:, ::-1] if self.swapped else xy
         if not self.crs:
             return np.asarray(xy * self.scale_m - self.origin)
@@ -68,7 +76,21 @@ class LocalFrame:
 
     def facts(self) -> dict[str, Any]:
         """The attributes and the projection, in plain values."""
-        return asdict(self) | {"origin": list(self.origin)} | ({"local_crs": self.local_crs} if self.crs else {})
+        plain = asdict(self) | {"origin": list(self.origin), "affine": list(map(list, self.affine))}
+        return plain | ({"local_crs": self.local_crs} if self.crs else {})
+
+    @staticmethod
+    def from_facts(facts: Mapping[str, Any]) -> LocalFrame:
+        """The frame that `facts` states."""
+        affine = tuple(map(tuple, facts.get("affine", ())))
+        return LocalFrame(facts["crs"], facts["scale_m"], tuple(facts["origin"]), facts["swapped"], affine)
+
+    def headings_rad(self, headings_rad: FloatArray) -> FloatArray:
+        """Headings [n] in this frame from headings from x towards y in that of the table."""
+        if not self.affine:
+            return headings_rad
+        ahead = np.array(self.affine)[:, :2] @ [np.cos(headings_rad), np.sin(headings_rad)]
+        return np.asarray(np.arctan2(ahead[1], ahead[0]))
 
 
 def _transformed(source: str, target: str, xy: FloatArray) -> FloatArray:
@@ -154,7 +176,8 @@ def plane_columns(of: Mapping[str, str], table: Table) -> tuple[str, str, bool]:
         if first in of and second in of:
             return of[first], of[second], geographic
     names = shown_names(list(table.frame.columns))
-    remedy = "name them by --columns x=...,y=... or lon=...,lat=..., cell=... for both in one text, or --positions FILE"
+    remedy = f"try --columns {suggested_columns(table, of, ('x', 'y'))} (or lon=,lat=, or cell= for both in one text), "
+    remedy += "or give --positions FILE"
     raise InputError(f"{table.files[0][0]}: no columns of positions among {names}; {remedy}")
 
 
@@ -201,7 +224,7 @@ def headings_rad(values: FloatArray, name: str, unit: str) -> tuple[FloatArray, 
 
     ``unit`` is ``deg``, ``rad``, ``compass`` (degrees clockwise from north), or "" to go by the name and the range.
     """
-    unit = unit or _heading_unit(values, name)
+    unit = unit or ("rad" if unit_of(name) == "rad" else _heading_unit(values, name))
     words = {"compass": "degrees clockwise from north", "deg": "degrees from x towards y", "rad": "radians"}
     if unit not in words:
         raise InputError(f"--heading-unit {one_line(unit)!r} is unknown; give one of {', '.join(words)}")
@@ -230,13 +253,21 @@ def place_numbers(keys: Mapping[str, Any], xy_m: FloatArray, place_m: float) -> 
 def with_positions(values: Table, positions: Table, stated: Mapping[str, str]) -> tuple[Table, str]:
     """A table with the columns of another one that has the positions of its rows, and how they were matched.
 
-    Rows are matched by a column that both tables have (a point's number), by time, between whose entries positions are
-    linear, or else by their order, in tables of equal length.
+    Rows are matched by a column that both tables have (a point's number) or ``file``, the name of their file, by time,
+    between whose entries positions are linear, or else by their order, in tables of equal length.
 
     Raises:
         InputError: the rows cannot be matched.
     """
     positions = _with_names(positions, stated)
+    if FILE in positions.frame and FILE not in values.frame:  # a place for each file
+        path = values.files[0][0]
+        known = positions.frame[FILE].astype(str).str.strip()
+        named = path.name if (known == path.name).any() else path.stem
+        if not (known == named).any():
+            text = f"no row has {FILE} {one_line(path.name)} ({one_line(listed(known))})"
+            raise DataFault(positions.files[0][0], f"{text}; give a row for each file")
+        values = replace(values, frame=values.frame.assign(**{FILE: named}))
     in_values, in_positions = list(values.frame.columns), list(positions.frame.columns)
     of = named_columns(in_positions, {key: name for key, name in stated.items() if name in in_positions})
     new = list(filter(None, map(of.get, PLACES)))
@@ -306,13 +337,15 @@ def with_cells(table: Table, column: str) -> Table:
     return replace(table, frame=table.frame.assign(**{name: parts[k] for k, name in enumerate(names)}))
 
 
-def seconds(table: Table, column: str) -> FloatArray:
-    """Times of a column in its unit, or in seconds where they are dates."""
+def seconds(table: Table, column: str, may_be_empty: bool = False) -> FloatArray:
+    """Times of a column in its unit, or in seconds where they are dates; NaN where they are empty and may be so."""
     if table.is_numeric(column):
         return table.numbers(column)
     pandas = package("pandas")
-    times = pandas.to_datetime(table.frame[column], errors="coerce", format="mixed", utc=True)
-    if len(wrong := np.flatnonzero(times.isna().to_numpy())):
+    texts = table.frame[column].astype("string").str.replace(DATE, r"\1-\2-\3 \4:\5:\6", regex=True)
+    times = pandas.to_datetime(texts, errors="coerce", format="mixed", utc=True)
+    empty = texts.isna().to_numpy(bool)
+    if len(wrong := np.flatnonzero(times.isna().to_numpy() & ~(empty & may_be_empty))):
         text = f"{one_line(column)} is {str(table.frame[column].iloc[wrong[0]])[:40]!r}"
         raise table.fault(f"{text}; give a time as a number or an ISO date", int(wrong[0]))
     return np.asarray((times - pandas.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(float))

@@ -24,6 +24,7 @@ LEAST_STD_DB = 0.05  # noise of a mean of whole dB is not below this
 FEWEST_COMPARED, LEAST_OFFSET_DB, OFFSET_STANDARD_ERRORS = 10, 2.0, 4.0
 """Places and receivers that files share, and the difference of their strengths, from which it is said: one in 16,000
 files differs by four standard errors by chance, and a quantisation to whole dB by less than 2 dB."""
+CELL_ID = re.compile(r"(\d{3})[-_]?(\d{1,3})[-_](\d+)[-_](\d+)")
 RESERVED = ("x", "y", "z", "heading", "frequency_hz", "run", "split")
 PREFIXES = ("rssi_", "count_", "std_")  # columns of the layout, which kept columns must not be taken for
 SEPARATOR = "|"
@@ -54,8 +55,11 @@ def normal_id(text: str) -> str:
 def id_key(name: str) -> str:
     """What ids of one receiver share: the digits of a hardware address in any case and notation, else the id.
 
-    An address may stand beside other words, as in ``02:00:00:00:00:01;Guest``.
+    An address may stand beside other words, as in ``02:00:00:00:00:01;Guest``. A cell is told by its country, network,
+    area and number, in whatever notation (``310260_7937_20161``).
     """
+    if cell := CELL_ID.fullmatch(name.strip()):
+        return "-".join(str(int(part)) for part in cell.groups())
     addresses = MAC.findall(name)
     digits = re.sub("[:_-]", "", addresses[0] if len(addresses) == 1 else name).lower()
     return digits if re.fullmatch("[0-9a-f]{12}", digits) else name

@@ -13,13 +13,14 @@ from ...core import DataFault, Receiver
 from ...core.angles import FloatArray
 from ...core.antenna import ANTENNA
 from ...core.carriers import FREQUENCY
-from ...core.files import listed
+from ...core.files import listed, one_line
 from ...datasets.folder_files import CsvTable
 from ...datasets.receivers_file import COLUMNS, TX_COLUMNS, read_antennas, read_orientations, receiver_of
 from ...datasets.unknown import RECEIVER, name_words
 from .files import Table
-from .forms import named_columns, shown_names, unit_of
+from .forms import PIXELS, named_columns, shown_names, unit_of
 from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale
+from .programs import CELL
 from .readings import id_key, normal_id
 
 POSES = tuple(name for name in COLUMNS if name not in ("id", "x", "y", "z", *TX_COLUMNS))
@@ -45,8 +46,9 @@ def read_receivers(
     if table is None:
         text = "positions of the receivers are unknown, their fields empty; --anchors FILE states them"
         return tuple(unknown.values()), [text]
-    table = _with_ids(table)
-    stated = _stated(table, frame, units, height_m, _measured(ids))
+    measured = _measured(ids)
+    table = _measured_cells(table, measured) if CELL in table.frame else _with_ids(table)
+    stated = _stated(table, frame, units, height_m, measured)
     if not unknown.keys() & stated.keys():
         text = f"none of its ids ({listed(list(stated))}) is measured ({listed(list(ids))})"
         raise DataFault(table.files[0][0], f"{text}; give the ids of the measurements, or omit --anchors")
@@ -62,6 +64,26 @@ def _measured(ids: Sequence[str]) -> dict[str, str]:
     parts = Counter(part for name in ids for part in _parts(name))
     by_part = {part: name for name in ids for part in _parts(name) if parts[part] == 1}
     return by_part | {id_key(name): name for name in ids}
+
+
+def _measured_cells(table: Table, measured: Mapping[str, str]) -> Table:
+    """Rows of a table of cells that are measured, with ids of as many parts as the measurements state.
+
+    Tables of a country have millions of cells.
+    """
+    numbers = {key.rpartition("-")[2] for key in measured}
+    identities = table.frame[CELL].dropna()
+    parts = identities[identities.str.rpartition("-")[2].isin(numbers)].str.split("-")
+    for count in (4, 3, 2, 1):  # country, network, area and cell, without the first ones
+        keys = parts.map(lambda part, count=count: id_key("-".join(part[-count:])))
+        chosen = keys[keys.isin(list(measured))]
+        if chosen.duplicated().any():
+            text = f"cell {chosen[chosen.duplicated()].iloc[0]} is in several areas"
+            raise DataFault(table.files[0][0], f"{text}; give the measurements columns mcc, mnc, lac and cellid")
+        if len(chosen):
+            return replace(table, frame=table.frame.loc[chosen.index].assign(id=chosen))
+    named = listed([f"{one_line(name)}" for name in table.frame[CELL].dropna()])
+    raise DataFault(table.files[0][0], f"no cell ({named}) is measured ({listed(measured)}); omit --anchors")
 
 
 def _parts(name: str) -> set[str]:
@@ -111,7 +133,10 @@ def _stated_positions(table: Table, frame: LocalFrame, units: str, height_m: flo
     if geographic and not frame.crs:
         text = "longitude and latitude, but the positions of the measurements are in metres"
         raise DataFault(table.files[0][0], f"{text}; give both in one reference system", line=1)
-    if not frame.crs and (unit := unit_of(first) or units):
+    unit = unit_of(first) or units
+    if frame.affine and unit not in PIXELS:  # where the rows are registered to
+        frame = LocalFrame(scale_m=unit_scale(unit, "--units"))
+    elif not frame.crs and unit and unit not in PIXELS:
         frame = replace(frame, scale_m=unit_scale(unit, "--units"))
     plane_m = frame.local_m(np.column_stack([table.numbers(name) for name in (first, second)]))
     heights_m = np.full(len(table), height_m)

@@ -29,6 +29,7 @@ from .pictures import (
     PICTURE_SUFFIXES,
     SHEET_SUFFIXES,
     WHITE,
+    Sheet,
     read_pixels,
     read_sheet,
 )
@@ -264,7 +265,8 @@ def _no_rows(path: Path, why: str) -> InputError:
     return InputError(f"{path}: --row-0 is for an occupancy grid in an NPZ file, and {why}; leave it out")
 
 
-def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
+def _scaled_picture(path: Path, resolution_m: float | None) -> tuple[Path, float, Sheet | None]:
+    """Picture of a plan, side of its pixels, and the YAML of a ROS map that is it, names it or lies beside it."""
     is_sheet = path.suffix.lower() in SHEET_SUFFIXES
     file, sheet = path if is_sheet else path.with_suffix(".yaml"), None
     if file.is_file():
@@ -272,6 +274,22 @@ def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
         path, resolution_m = inside(path.parent, sheet.image, path) if is_sheet else path, sheet.resolution
     if resolution_m is None:
         raise InputError(f"{path}: a picture has no resolution; give the side of a pixel in metres (--resolution)")
+    return path, resolution_m, sheet
+
+
+def picture_scale(path: Path, resolution_m: float | None = None) -> tuple[int, float, FloatArray]:
+    """Rows of a plan's picture, side of its pixels, and position [2] of its lower left corner, metres.
+
+    Raises:
+        InputError: no picture that can be read, or no resolution.
+    """
+    path, resolution_m, sheet = _scaled_picture(path, resolution_m)
+    corner_m = np.zeros(2) if sheet is None else np.array(sheet.origin[:2])
+    return len(read_pixels(path, LARGEST_PICTURE).grey), resolution_m, corner_m
+
+
+def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
+    path, resolution_m, sheet = _scaled_picture(path, resolution_m)
     pixels = read_pixels(path, LARGEST_PICTURE)
     probability = pixels.probability(sheet)
     if sheet is not None:
