@@ -16,7 +16,7 @@ from wrf_mi.datasets import load, write_spectrum_folder
 from wrf_mi.runs.api import open_run, train
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, load_trace, open_scene, trace_paths
-from wrf_mi.tracing.tracer import GAIN_DB, cross_polarized
+from wrf_mi.tracing.tracer import GAIN_DB, TRIED, check_polarization, cross_polarized
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.trainer import Trainer
 
@@ -119,6 +119,17 @@ def test_only_cross_polarised_receivers_are_found(polar):
     found = cross_polarized(traced, polar)
     assert list(found) == ["gateway2"]
     assert found["gateway2"] > GAIN_DB
+
+
+def test_a_few_stated_receivers_tell_the_polarisation_of_a_building(polar, caplog):
+    """Each receiver takes a search; whoever has not stated where one is has not stated its antenna either."""
+    crossed = [replace(array(0, Antenna(polarization="H")), name=f"point{k}") for k in range(TRIED + 4)]
+    check_polarization(polar, places(), crossed, Antenna())
+    assert f"{TRIED} of {TRIED} receivers" in caplog.text
+    caplog.clear()
+    estimated = [replace(receiver, position_std_m=np.ones(3)) for receiver in crossed]
+    check_polarization(polar, places(), estimated, Antenna())
+    assert not caplog.text
 
 
 def test_each_receiver_is_traced_with_its_antenna(polar):

@@ -169,7 +169,7 @@ def warn_of_cross_polarization(traced: TraceResult, scene: Any) -> None:
 
 
 def check_polarization(scene: Any, tx_pos_m: FloatArray, receivers: Sequence[Receiver], tx_antenna: Antenna) -> None:
-    """Trace a few of the transmitters [n, 3], metres, and warn of cross-polarised receivers among a few of those stated.
+    """Trace a few of the transmitters [n, 3], metres, and warn of cross-polarised ones among a few stated receivers.
 
     Whoever has not stated where a receiver is has not stated its antenna either.
     """
