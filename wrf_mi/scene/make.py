@@ -211,7 +211,9 @@ class _Source:
         if self.scan is None:
             return self.parts
         try:
-            surfaces = surfaces_from_points(self.scan.points_m, self.scan.viewpoints_m, self.scan.viewpoint)
+            surfaces = surfaces_from_points(
+                self.scan.points_m, self.scan.viewpoints_m, self.scan.viewpoint, walked=self.scan.walked
+            )
         except InputError as error:
             raise InputError(f"{self.file}: {error}") from None
         if up is None and not _has_floor(surfaces):

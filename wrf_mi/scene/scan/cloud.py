@@ -14,7 +14,16 @@ from scipy import ndimage
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..mesh.outline import Raster, fill_blind, fill_shadows, join, outline, triangulated
+from ..mesh.outline import (
+    Raster,
+    fill_blind,
+    fill_shadows,
+    join,
+    levels_completed,
+    outline,
+    shadows,
+    triangulated,
+)
 from ..mesh.planes import UPRIGHT, WALL_HEIGHT_M, Face, Mask, Plane, kinds, near, over, storey, with_axes
 from ..mesh.surfaces import KINDS, Kind, Surface, number_names
 from .planes import BAND, Thinned, find_planes, fit, layers, thin
@@ -33,6 +42,9 @@ TOLERANCE_RANGE_RAD = np.radians(0.3), np.radians(4.0)
 LEAST_PART, LEAST_FILLED = 0.4, 0.5
 """Least height of a part of a wall whose rest things hide, in that of a wall, and least share of the rectangle about a
 wall of few points that it fills."""
+LEAST_STRIP_M = 0.2  # least height of the part of a wall above furniture, where no scanner's place is known
+ROUNDED_M = 0.03
+"""Error of a plane at its edges where depth of many places was fused: corners are rounded by a cell."""
 PASSES = 2
 MOST_OUTSIDE = 0.1  # share of a scanner's returns behind walls from which they are no strays through openings
 UNLIKE = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # factors for which different points have different sums
@@ -48,7 +60,11 @@ class _Piece(Face):
 
 
 def surfaces_from_points(
-    points_m: FloatArray, viewpoints_m: FloatArray | None = None, viewpoint: IntArray | None = None
+    points_m: FloatArray,
+    viewpoints_m: FloatArray | None = None,
+    viewpoint: IntArray | None = None,
+    *,
+    walked: bool = False,
 ) -> list[Surface]:
     """The planes of a room or building in a levelled point cloud: floor, ceiling, walls, furniture.
 
@@ -59,6 +75,7 @@ def surfaces_from_points(
         points_m: shape [n, 3], metres, z upwards; any origin.
         viewpoints_m: places of the scanners where they are known [k, 3].
         viewpoint: number of each point's place [n], -1 for none.
+        walked: whether they were seen from many places, as those of a phone: the origin is not tried as the place.
 
     Returns:
         Surfaces by kind, the largest first; several polygons may make up one. Vertices in the frame of the points.
@@ -75,7 +92,8 @@ def surfaces_from_points(
     places = np.empty((0, 3)) if viewpoints_m is None else viewpoints_m - shift
     cloud = thin(points)
     planes, noise = find_planes(cloud)
-    scan = _Scan(points.astype(np.float32), cloud, noise, sights_of(points, places, numbers, -shift))
+    sights = [] if walked else sights_of(points, places, numbers, -shift)
+    scan = _Scan(points.astype(np.float32), cloud, noise, sights)
     pieces, roles = scan.room(planes)
     if not pieces:
         raise InputError(f"no plane was found in {len(points_m)} points; give a denser scan of a room")
@@ -137,6 +155,8 @@ class _Scan:
             self._filled(piece, area, kind, walls, things, clutter_m)
             for piece, area, kind in zip(pieces, areas, roles, strict=True)
         ]
+        if not self.sights:
+            areas = levels_completed(planes, areas, roles, clutter_m, band_m)
         return [shapely.simplify(area, STRAIGHT_M) for area in join(planes, areas, reach)]
 
     def _filled(
@@ -144,7 +164,7 @@ class _Scan:
     ) -> Any:
         """Area of a piece with its shadows filled, but for its recesses."""
         if kind != "other":
-            area = self.without_shadows(piece.plane, area, walls, things)
+            area = self.without_shadows(piece.plane, area, kind, walls, things)
         area = fill_shadows(piece.plane, area, kind, clutter_m, self.noise_m)
         if kind == "floor":
             area = fill_blind(piece.plane, area, walls, self.points_m, BAND * self.noise_m)
@@ -154,7 +174,7 @@ class _Scan:
         """Planes and their parallel layers with the areas that free points cover, those of most points first."""
         pieces = list[_Piece]()
         points, noise_m, free = self.points_m, self.noise_m, self.free.copy()
-        for refined in _refined(planes, points, noise_m):
+        for refined in _refined(planes, points, noise_m, 0.0 if self.sights else ROUNDED_M):
             plane, parallel = layers(refined, points, free, noise_m)
             recesses = []
             for layer in parallel:
@@ -206,30 +226,39 @@ class _Scan:
 
     def _up_to_levels(self, piece: _Piece, roles: Mapping[Face, Kind]) -> _Piece:
         """An upright piece with the places that things hide between the floor and the ceiling."""
-        if not self.sights or piece.slope > UPRIGHT or np.ptp(piece.span_m) < LEAST_PART * WALL_HEIGHT_M:
+        least_m = LEAST_PART * WALL_HEIGHT_M if self.sights else LEAST_STRIP_M
+        if piece.slope > UPRIGHT or np.ptp(piece.span_m) < least_m:
             return piece
         levels = {face: role for face, role in roles.items() if role in ("floor", "ceiling")}
+        floor, ceiling = storey(piece, levels)
+        if not self.sights and piece.span_m[1] < ceiling - LEAST_STRIP_M:
+            return piece  # it ends below the ceiling: furniture, which what stands beside it would make a wall
         off = self.free & ~over(piece.plane, shapely.envelope(piece.area), self.points_m, BAND * self.noise_m)
         (left, low, right, high), middle = piece.area.bounds, piece.plane.lift(np.array(piece.area.centroid.coords[0]))
-        for height in storey(piece, levels):
+        for height in (floor, ceiling):
             if np.isfinite(height):
                 at = piece.area.centroid.y + height - middle[2]
                 low, high = min(low, at), max(high, at)
-        area = self.without_shadows(piece.plane, piece.area, (), off, shapely.box(left, low, right, high))
+        area = self.without_shadows(piece.plane, piece.area, "wall", (), off, shapely.box(left, low, right, high))
         return replace(piece, area=area)
 
     def without_shadows(
-        self, plane: Plane, area: Any, walls: Sequence[Face], things: Mask, within: Any | None = None
+        self, plane: Plane, area: Any, kind: Kind, walls: Sequence[Face], things: Mask, within: Any | None = None
     ) -> Any:
-        """An area with the places that things hide from all scanners, within its bounds or other ones."""
-        if not self.sights or area.is_empty:
+        """An area with the places that things hide, within its bounds or other ones.
+
+        Of scanners whose places are known, from all of them; else from one that looks at it straight.
+        """
+        if area.is_empty:
             return area
         within = shapely.envelope(area) if within is None else within
         raster = Raster.around(shapely.get_coordinates(within))
-        _, hidden = returns_and_shadows(
-            self.sights, plane, plane.lift(raster.centres_m), walls, BAND * self.noise_m, things
-        )
-        return raster.grown(area, raster.image(hidden) & raster.covered(within) & ~raster.covered(area))
+        if self.sights:
+            centres, band_m = plane.lift(raster.centres_m), BAND * self.noise_m
+            hidden = raster.image(returns_and_shadows(self.sights, plane, centres, walls, band_m, things)[1])
+        else:
+            hidden = shadows(raster, plane, kind, self.points_m[things], self.noise_m)
+        return raster.grown(area, hidden & raster.covered(within) & ~raster.covered(area))
 
     def outside(self, walls: Sequence[Face]) -> Mask:
         """Points that scanners saw through openings of walls; none of a scanner that saw much there.
@@ -245,15 +274,15 @@ class _Scan:
         return outside
 
 
-def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[Plane]:
-    """Planes fitted to all points, turned to right angles where these allow it, with their axes."""
+def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float, rounded_m: float) -> list[Plane]:
+    """Planes fitted to all points, turned to right angles where these and rounded corners allow it, with their axes."""
     index = [np.flatnonzero(near(plane, points, BAND * noise_m)) for plane in planes]
     claims = np.bincount(np.concatenate([np.empty(0, int), *index]), minlength=len(points))
     chosen = [points[_sole(rows, claims)] for rows in index]
     fitted = [fit(part, np.ones(len(part)), plane, noise_m) for part, plane in zip(chosen, planes, strict=True)]
     fitted = [
         fit(part, np.ones(len(part)), plane, noise_m, normal=plane.normal)
-        for part, plane in zip(chosen, _regular(fitted, noise_m), strict=True)
+        for part, plane in zip(chosen, _regular(fitted, max(noise_m, rounded_m)), strict=True)
     ]
     # The axes follow the most certain upright plane.
     heading = next((plane.normal for plane in fitted if abs(plane.normal[2]) < 1e-6), np.array([1.0, 0.0, 0.0]))
@@ -267,7 +296,7 @@ def _sole(rows: IntArray, claims: IntArray) -> IntArray:
     return sole if len(sole) > 0.2 * len(rows) else rows
 
 
-def _regular(planes: Sequence[Plane], noise_m: float) -> list[Plane]:
+def _regular(planes: Sequence[Plane], error_m: float) -> list[Plane]:
     """Planes turned to be level, upright, and parallel or square to earlier planes, each about its centre."""
     up = np.array([0.0, 0.0, 1.0])
     headings: list[FloatArray] = []
@@ -275,9 +304,8 @@ def _regular(planes: Sequence[Plane], noise_m: float) -> list[Plane]:
     for plane in planes:
         side = np.ptp(plane.flat(plane.patches_m.reshape(-1, 3)), axis=0).min()
         # A plane is turned only within the uncertainty of its points: three standard errors of its direction, or one
-        # standard deviation of the noise over its shorter side (edges and neighbours shift a fit by that much). A real
-        # slope stays.
-        error = max(ERRORS * plane.angle_error_rad, noise_m / max(side, noise_m))
+        # error of its edges over its shorter side (these and neighbours shift a fit by that much). A real slope stays.
+        error = max(ERRORS * plane.angle_error_rad, error_m / max(side, error_m))
         tolerance = float(np.clip(error, *TOLERANCE_RANGE_RAD))
         n = plane.normal
         if np.arccos(min(abs(n @ up), 1.0)) < tolerance:
