@@ -9,6 +9,7 @@ the room behind the wall.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ PICTURE = 128, 96  # pixels of a depth picture
 FIELD_DEG = 62.0  # its horizontal field of view
 RANGE_M = 5.0  # reach of a phone's LiDAR
 TRUNCATION, LEAST_SEEN, MOST_BLOCKS = 4.0, 1.0, 30_000
-"""Cells about a surface whose distance is fused, least number of pictures in which one was seen, most blocks of 16^3."""
+"""Cells about a surface whose distance is fused, least number of pictures with one, and most blocks of 16^3 cells."""
 GRAZING = np.cos(np.radians(82))  # flatter views return nothing
 
 
@@ -67,7 +68,9 @@ class Home:
     @property
     def area_m2(self) -> float:
         """Area of the floor, that below the inner walls of a flat, too."""
-        return float(self.rooms[0].area if len(self.rooms) == 1 else shapely.envelope(shapely.union_all(self.rooms)).area)
+        return float(
+            self.rooms[0].area if len(self.rooms) == 1 else shapely.envelope(shapely.union_all(self.rooms)).area
+        )
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,7 @@ _Edge = tuple[int, float, Span, int]
 
 def _edges(room: Any) -> Iterator[_Edge]:
     corners = np.asarray(shapely.get_coordinates(shapely.geometry.polygon.orient(room)))
-    for (x0, y0), (x1, y1) in zip(corners, corners[1:], strict=False):
+    for (x0, y0), (x1, y1) in pairwise(corners):
         if x0 == x1:
             yield 0, float(x0), (float(min(y0, y1)), float(max(y0, y1))), 1 if y1 > y0 else -1
         else:
@@ -284,8 +287,8 @@ class Errors:
     noise_m: float
     edge_m: float
     tilt_rad: float
-    drift_m: float = 0.004
-    drift_rad: float = np.radians(0.05)
+    drift_m: float = 0.003
+    drift_rad: float = float(np.radians(0.03))
     holes: int = 3
 
 

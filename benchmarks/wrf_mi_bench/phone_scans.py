@@ -23,7 +23,6 @@ from wrf_mi.scene.coordinates import turned
 from wrf_mi.scene.folder import FACTS_FILE, read_scene_folder
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.mesh.surfaces import Surface, level_area, moved
-from wrf_mi.tracing import open_scene
 
 from .comparison import command, kept_work, line, opened, say
 from .declared import lined

@@ -26,7 +26,7 @@ from .mesh.facets import planes_of_mesh
 from .mesh.files import SUFFIXES, read_mesh
 from .mesh.measured import is_measured
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
-from .mesh.surfaces import Surface, bounds, box_of, moved, sampled, with_area
+from .mesh.surfaces import Surface, bounds, box_of, main_extent, moved, sampled, with_area
 from .plan.geojson import GEOJSON_SUFFIXES, Extent
 from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES
 from .plan.sources import PlanGrid, Row0, read_layout, read_plan
@@ -46,6 +46,7 @@ PREVIEW_POINTS = 20_000
 Storey = tuple[float | None, float, float | None, Row0 | None, Extent | None]
 """Options of a plan: height of the ceiling, z of the floor, side of a cell, side where the first row lies, extent."""
 UNSTATED: Storey = (None, 0.0, None, None, None)  # these options where none is given
+LEAST_TURN_DEG = 0.1  # smaller angles between walls and axes are errors of the planes
 RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
 
@@ -128,6 +129,8 @@ def make_scene(
     source, turn = source.levelled(shift)
     surfaces = source.surfaces(up)
     motion, registered = shift, turn
+    if matrix is known_walls is measured is None and (along := source.along_walls(surfaces)) is not None:
+        motion, registered = along @ shift, along if turn is None else along @ turn
     if known_walls is not None:
         matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file))
         motion, registered = matrix @ shift, matrix if turn is None else matrix @ turn
@@ -226,6 +229,23 @@ class _Source:
         if all(surface.kind == "other" for surface in surfaces):
             logger.warning("%s: no floor, ceiling or wall among its planes; mesh needs the scan of a room", self.file)
         return surfaces
+
+    def along_walls(self, surfaces: Sequence[Surface]) -> FloatArray | None:
+        """Rotation [4, 4] about z that puts the axes of a phone's frame along the walls; None where none is due.
+
+        The frame of a survey or of a design is left as it is.
+        """
+        walls = [surface for surface in surfaces if surface.kind == "wall"]
+        if self.scan is None or not self.scan.walked or not walls:
+            return None
+        normal = main_extent(np.concatenate([wall.vertices_m[wall.faces] for wall in walls]))[0]
+        turn_deg = -float((np.degrees(np.arctan2(normal[1], normal[0])) + 45) % 90 - 45)
+        if abs(turn_deg) < LEAST_TURN_DEG:
+            return None
+        text = "%s: turned by %.1f degrees about the vertical, so that its axes run along the walls; scene.yml has the "
+        text += "rotation, which positions in the frame of the file need as well; --positions keeps the file's axes"
+        logger.warning(text, self.file, turn_deg)
+        return np.asarray(trimesh.transformations.rotation_matrix(np.radians(turn_deg), [0, 0, 1]))
 
     def sample(self, motion: FloatArray) -> dict[str, Any]:
         """Arguments of `write_scene` for a scan: moved points for the preview, and the number of all points."""

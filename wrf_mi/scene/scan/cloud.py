@@ -14,6 +14,7 @@ from scipy import ndimage
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
+from ..mesh.furnishings import BELOW_CEILING_M, furnishings, reached
 from ..mesh.outline import (
     Raster,
     fill_blind,
@@ -94,14 +95,22 @@ def surfaces_from_points(
     planes, noise = find_planes(cloud)
     sights = [] if walked else sights_of(points, places, numbers, -shift)
     scan = _Scan(points.astype(np.float32), cloud, noise, sights)
-    pieces, roles = scan.room(planes)
+    pieces, roles = scan.room(planes, sparse=not walked)
     if not pieces:
         raise InputError(f"no plane was found in {len(points_m)} points; give a denser scan of a room")
     areas = scan.closed(pieces, roles)
     logger.info("%d planes in %d points, noise %.1f mm", len(pieces), len(points), 1e3 * noise)
-    order = sorted(range(len(pieces)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))
+    names = list[str](roles)
+    if not scan.sights:
+        faces = reached([Face(piece.plane, area) for piece, area in zip(pieces, areas, strict=True)], roles)
+        if lost := sum(area.area for area in areas) - sum(face.area.area for face in faces):
+            logger.warning("%.1f m2 left out that a mirror or window shows beyond the floor", lost)
+        areas, names = [face.area for face in faces], furnishings(faces, roles)
+        roles = [kind if name == kind else "other" for name, kind in zip(names, roles, strict=True)]
+    order = [i for i in range(len(pieces)) if not areas[i].is_empty]
+    order.sort(key=lambda i: (KINDS.index(roles[i]), names[i], -areas[i].area))
     surfaces = []
-    for name, i in zip(number_names([roles[i] for i in order]), order, strict=True):
+    for name, i in zip(number_names([names[i] for i in order]), order, strict=True):
         vertices, faces = triangulated(areas[i])
         surfaces.append(Surface(name, roles[i], pieces[i].plane.lift(vertices) + shift, faces))
     return surfaces
@@ -118,21 +127,22 @@ class _Scan:
         self.points_m, self.cloud, self.noise_m, self.sights = points_m, cloud, noise_m, sights
         self.free = np.ones(len(points_m), bool)
 
-    def room(self, planes: Sequence[Plane]) -> tuple[list[_Piece], list[Kind]]:
-        """Pieces of planes and their roles, with walls of few points, without what lies behind walls."""
+    def room(self, planes: Sequence[Plane], sparse: bool) -> tuple[list[_Piece], list[Kind]]:
+        """Pieces of planes and their roles, with walls of few points if wanted, without what lies behind walls."""
         pieces, roles = self.roles(self.pieces(planes))
         walls = _walls(pieces, roles)
-        sparse = sparse_walls(self.cloud.all_m, [piece.plane for piece in walls], planes, self.noise_m)
+        wall_planes = [piece.plane for piece in walls]
+        few = sparse_walls(self.cloud.all_m, wall_planes, planes, self.noise_m) if sparse else []
         for number in range(PASSES):
             # Walls bound the room, and a wall that is found by few points bounds the others.
             outside = self.outside(walls)
             fresh = bool((outside & self.free).any())
-            if not fresh and not (sparse and number == 0):
+            if not fresh and not (few and number == 0):
                 break
             self.free = ~outside
-            second = self.roles(self.pieces([*planes, *sparse], walls))
-            sparse = [piece.plane for piece in second[0] if piece.plane.sparse]
-            if not fresh and not sparse:
+            second = self.roles(self.pieces([*planes, *few], walls))
+            few = [piece.plane for piece in second[0] if piece.plane.sparse]
+            if not fresh and not few:
                 break  # chance alignments alone, which must not move the others
             (pieces, roles), walls = second, _walls(*second)
         if not self.free.all():
@@ -231,7 +241,7 @@ class _Scan:
             return piece
         levels = {face: role for face, role in roles.items() if role in ("floor", "ceiling")}
         floor, ceiling = storey(piece, levels)
-        if not self.sights and piece.span_m[1] < ceiling - LEAST_STRIP_M:
+        if not self.sights and piece.span_m[1] < ceiling - BELOW_CEILING_M:
             return piece  # it ends below the ceiling: furniture, which what stands beside it would make a wall
         off = self.free & ~over(piece.plane, shapely.envelope(piece.area), self.points_m, BAND * self.noise_m)
         (left, low, right, high), middle = piece.area.bounds, piece.plane.lift(np.array(piece.area.centroid.coords[0]))
