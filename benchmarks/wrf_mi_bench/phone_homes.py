@@ -34,7 +34,7 @@ YAWS, PITCHES_DEG = 10, (-50.0, -15.0, 25.0)
 PICTURE = 128, 96  # pixels of a depth picture
 FIELD_DEG = 62.0  # its horizontal field of view
 RANGE_M = 5.0  # reach of a phone's LiDAR
-TRUNCATION, LEAST_SEEN, MOST_BLOCKS = 4.0, 1.0, 30_000
+TRUNCATION, LEAST_SEEN, MOST_BLOCKS = 2.0, 1.0, 30_000
 """Cells about a surface whose distance is fused, least number of pictures with one, and most blocks of 16^3 cells."""
 GRAZING = np.cos(np.radians(82))  # flatter views return nothing
 

@@ -225,8 +225,14 @@ def _middle(area: Any) -> FloatArray:
 
 
 def _seen_on(plane: Plane, other: Plane, area: Any) -> Any:
-    """The area of another plane in the coordinates of a plane."""
-    return shapely.transform(area, lambda uv: plane.flat(other.lift(uv)))
+    """The area of another plane in the coordinates of a plane that is not upright, above or below it."""
+
+    def above(uv: FloatArray) -> FloatArray:
+        x, y = other.lift(uv)[:, :2].T
+        z = (plane.offset_m - plane.normal[0] * x - plane.normal[1] * y) / plane.normal[2]
+        return plane.flat(np.stack([x, y, z], axis=1))
+
+    return shapely.make_valid(shapely.transform(area, above))
 
 
 def _is_hidden(gap: Any, flat_m: FloatArray) -> bool:

@@ -27,7 +27,7 @@ from ..mesh.outline import (
 )
 from ..mesh.planes import UPRIGHT, WALL_HEIGHT_M, Face, Mask, Plane, kinds, near, over, storey, with_axes
 from ..mesh.surfaces import KINDS, Kind, Surface, number_names
-from .planes import BAND, Thinned, find_planes, fit, layers, thin
+from .planes import BAND, CORE, NARROW_CORE, NARROW_RADIUS_M, NORMAL_RADIUS_M, Thinned, find_planes, fit, layers, thin
 from .sight import Sight, returns_and_shadows, sights_of, sparse_walls
 
 logger = logging.getLogger(__name__)
@@ -91,8 +91,8 @@ def surfaces_from_points(
     points = points_m[distinct] - shift
     numbers = np.full(len(points), -1) if viewpoint is None else viewpoint[distinct]
     places = np.empty((0, 3)) if viewpoints_m is None else viewpoints_m - shift
-    cloud = thin(points)
-    planes, noise = find_planes(cloud)
+    cloud = thin(points, NARROW_RADIUS_M if walked else NORMAL_RADIUS_M)
+    planes, noise = find_planes(cloud, NARROW_CORE if walked else CORE)
     sights = [] if walked else sights_of(points, places, numbers, -shift)
     scan = _Scan(points.astype(np.float32), cloud, noise, sights)
     pieces, roles = scan.room(planes, sparse=not walked)
@@ -174,7 +174,7 @@ class _Scan:
     ) -> Any:
         """Area of a piece with its shadows filled, but for its recesses."""
         if kind != "other":
-            area = self.without_shadows(piece.plane, area, kind, walls, things)
+            area = self.without_shadows(piece.plane, area, kind, walls, things, clutter_m)
         area = fill_shadows(piece.plane, area, kind, clutter_m, self.noise_m)
         if kind == "floor":
             area = fill_blind(piece.plane, area, walls, self.points_m, BAND * self.noise_m)
@@ -243,21 +243,32 @@ class _Scan:
         floor, ceiling = storey(piece, levels)
         if not self.sights and piece.span_m[1] < ceiling - BELOW_CEILING_M:
             return piece  # it ends below the ceiling: furniture, which what stands beside it would make a wall
-        off = self.free & ~over(piece.plane, shapely.envelope(piece.area), self.points_m, BAND * self.noise_m)
+        about, band_m = shapely.envelope(piece.area), BAND * self.noise_m
+        off = self.free & ~over(piece.plane, about, self.points_m, band_m)
+        clutter_m = self.cloud.points_m[~over(piece.plane, about, self.cloud.points_m, band_m)]
         (left, low, right, high), middle = piece.area.bounds, piece.plane.lift(np.array(piece.area.centroid.coords[0]))
         for height in (floor, ceiling):
             if np.isfinite(height):
                 at = piece.area.centroid.y + height - middle[2]
                 low, high = min(low, at), max(high, at)
-        area = self.without_shadows(piece.plane, piece.area, "wall", (), off, shapely.box(left, low, right, high))
+        within = shapely.box(left, low, right, high)
+        area = self.without_shadows(piece.plane, piece.area, "wall", (), off, clutter_m, within)
         return replace(piece, area=area)
 
     def without_shadows(
-        self, plane: Plane, area: Any, kind: Kind, walls: Sequence[Face], things: Mask, within: Any | None = None
+        self,
+        plane: Plane,
+        area: Any,
+        kind: Kind,
+        walls: Sequence[Face],
+        things: Mask,
+        clutter_m: FloatArray,
+        within: Any | None = None,
     ) -> Any:
         """An area with the places that things hide, within its bounds or other ones.
 
-        Of scanners whose places are known, from all of them; else from one that looks at it straight.
+        From the scanners, by the points that are things; where their places are not known, from straight before the
+        plane, by things among the thinned points, which have no strays.
         """
         if area.is_empty:
             return area
@@ -267,7 +278,7 @@ class _Scan:
             centres, band_m = plane.lift(raster.centres_m), BAND * self.noise_m
             hidden = raster.image(returns_and_shadows(self.sights, plane, centres, walls, band_m, things)[1])
         else:
-            hidden = shadows(raster, plane, kind, self.points_m[things], self.noise_m)
+            hidden = shadows(raster, plane, kind, clutter_m, self.noise_m)
         return raster.grown(area, hidden & raster.covered(within) & ~raster.covered(area))
 
     def outside(self, walls: Sequence[Face]) -> Mask:
