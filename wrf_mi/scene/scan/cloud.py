@@ -44,8 +44,9 @@ LEAST_PART, LEAST_FILLED = 0.4, 0.5
 """Least height of a part of a wall whose rest things hide, in that of a wall, and least share of the rectangle about a
 wall of few points that it fills."""
 LEAST_STRIP_M = 0.2  # least height of the part of a wall above furniture, where no scanner's place is known
-ROUNDED_M = 0.03
-"""Error of a plane at its edges where depth of many places was fused: corners are rounded by a cell."""
+DRIFT_M = 0.03
+"""Largest distance of sheets of one wall that were seen at other times of a walk, and error of planes at their edges
+where depth of many places was fused: corners are rounded by a cell."""
 PASSES = 2
 MOST_OUTSIDE = 0.1  # share of a scanner's returns behind walls from which they are no strays through openings
 UNLIKE = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # factors for which different points have different sums
@@ -94,7 +95,7 @@ def surfaces_from_points(
     cloud = thin(points, NARROW_RADIUS_M if walked else NORMAL_RADIUS_M)
     planes, noise = find_planes(cloud, NARROW_CORE if walked else CORE)
     sights = [] if walked else sights_of(points, places, numbers, -shift)
-    scan = _Scan(points.astype(np.float32), cloud, noise, sights)
+    scan = _Scan(points.astype(np.float32), cloud, noise, sights, DRIFT_M if walked else 0.0)
     pieces, roles = scan.room(planes, sparse=not walked)
     if not pieces:
         raise InputError(f"no plane was found in {len(points_m)} points; give a denser scan of a room")
@@ -121,11 +122,13 @@ def _walls(pieces: Sequence[_Piece], roles: Sequence[Kind]) -> list[_Piece]:
 
 
 class _Scan:
-    """Points [n, 3] of a scan, those that may belong to surfaces [n], the thinned cloud, their noise, the scanners."""
+    """Points [n, 3] of a scan, those that may belong to surfaces [n], the thinned cloud, noise, scanners, drift."""
 
-    def __init__(self, points_m: FloatArray, cloud: Thinned, noise_m: float, sights: Sequence[Sight]) -> None:
+    def __init__(
+        self, points_m: FloatArray, cloud: Thinned, noise_m: float, sights: Sequence[Sight], drift_m: float
+    ) -> None:
         self.points_m, self.cloud, self.noise_m, self.sights = points_m, cloud, noise_m, sights
-        self.free = np.ones(len(points_m), bool)
+        self.free, self.drift_m = np.ones(len(points_m), bool), drift_m
 
     def room(self, planes: Sequence[Plane], sparse: bool) -> tuple[list[_Piece], list[Kind]]:
         """Pieces of planes and their roles, with walls of few points if wanted, without what lies behind walls."""
@@ -184,8 +187,10 @@ class _Scan:
         """Planes and their parallel layers with the areas that free points cover, those of most points first."""
         pieces = list[_Piece]()
         points, noise_m, free = self.points_m, self.noise_m, self.free.copy()
-        for refined in _refined(planes, points, noise_m, 0.0 if self.sights else ROUNDED_M):
+        for refined in _refined(planes, points, noise_m, self.drift_m):
             plane, parallel = layers(refined, points, free, noise_m)
+            # Drift shows one wall as two sheets.
+            parallel = [layer for layer in parallel if abs(layer.plane.offset_m - plane.offset_m) > self.drift_m]
             recesses = []
             for layer in parallel:
                 area, cell = outline(layer.plane, points[layer.rows])
@@ -193,7 +198,7 @@ class _Scan:
                     pieces.append(_Piece(layer.plane, area, 3 * noise_m + cell))
                     free[layer.rows] = False
                     recesses += [] if layer.before else [area]
-            in_plane = near(plane, points, 2 * noise_m) & free
+            in_plane = near(plane, points, max(2 * noise_m, self.drift_m)) & free
             for layer in parallel:
                 in_plane[layer.rows] = layer.before  # a wall goes on behind a board
             rows = np.flatnonzero(in_plane)
@@ -295,7 +300,7 @@ class _Scan:
         return outside
 
 
-def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float, rounded_m: float) -> list[Plane]:
+def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float, drift_m: float) -> list[Plane]:
     """Planes fitted to all points, turned to right angles where these and rounded corners allow it, with their axes."""
     index = [np.flatnonzero(near(plane, points, BAND * noise_m)) for plane in planes]
     claims = np.bincount(np.concatenate([np.empty(0, int), *index]), minlength=len(points))
@@ -303,7 +308,7 @@ def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float, rounde
     fitted = [fit(part, np.ones(len(part)), plane, noise_m) for part, plane in zip(chosen, planes, strict=True)]
     fitted = [
         fit(part, np.ones(len(part)), plane, noise_m, normal=plane.normal)
-        for part, plane in zip(chosen, _regular(fitted, max(noise_m, rounded_m)), strict=True)
+        for part, plane in zip(chosen, _regular(fitted, max(noise_m, drift_m)), strict=True)
     ]
     # The axes follow the most certain upright plane.
     heading = next((plane.normal for plane in fitted if abs(plane.normal[2]) < 1e-6), np.array([1.0, 0.0, 0.0]))
