@@ -19,7 +19,17 @@ from numpy.typing import ArrayLike
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_names
-from .coordinates import STATING_UP, Y_UP, Up, check_extent, local_origin, require_fine, require_near, require_up
+from .coordinates import (
+    STATING_UP,
+    Y_UP,
+    Up,
+    check_extent,
+    local_origin,
+    require_clear_up,
+    require_fine,
+    require_near,
+    require_up,
+)
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .mesh.facets import planes_of_mesh
@@ -124,6 +134,7 @@ def make_scene(
     if origin_m is None and matrix is known_walls is measured is None:
         origin_m = local_origin(source.extent_m)
         shift = _shift(file, origin_m)
+    shift = shift @ source.turn
     if matrix is known_walls is None:  # before minutes are spent on a scan's planes
         require_near(trimesh.transform_points(source.extent_m, shift), file)
     source, turn = source.levelled(shift)
@@ -184,11 +195,17 @@ class _Source:
     parts: Sequence[Surface] = ()
     grid: PlanGrid | None = None
     scan: Scan | None = None
+    yaw_rad: float = 0.0
 
     @property
     def extent_m(self) -> FloatArray:
         """Lowest and highest coordinates [2, 3]."""
         return box_of(self.parts) if self.scan is None else bounds(self.scan.points_m)
+
+    @property
+    def turn(self) -> FloatArray:
+        """Rotation [4, 4] of a robot's map about z in the frame of its file."""
+        return np.asarray(trimesh.transformations.rotation_matrix(self.yaw_rad, [0, 0, 1]))
 
     def levelled(self, shift: FloatArray) -> tuple[_Source, FloatArray | None]:
         """The source with a scan made level about the origin to which a matrix [4, 4] shifts; its rotation or None."""
@@ -272,6 +289,7 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
             return _Source(file, _split(raw, file, up))
         logger.warning("%s: its faces are uneven as those of a scan, and are read as points of its planes", file)
         scan = sampled_scan(raw)
+        require_clear_up(scan.points_m, file, up)
     else:
         scan = read_scan(files, units, up)
     require_stated_metres(files, units)
@@ -319,7 +337,9 @@ def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> 
         raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
     plan = read_plan(file, resolution_m, row_0, extent_m)
     walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, name=str(file))
-    return _Source(file, walls, plan if isinstance(plan, PlanGrid) and plan.free.any() else None)
+    if not isinstance(plan, PlanGrid):
+        return _Source(file, walls)
+    return _Source(file, walls, plan if plan.free.any() else None, yaw_rad=plan.yaw_rad)
 
 
 def _split(raw: Sequence[Surface], file: Path, up: Up | None) -> list[Surface]:
