@@ -228,7 +228,7 @@ def _levels(rooms: Sequence[Any], at: float) -> Mesh:
 
 def _furniture(room: Any, doors: Any, height: float, rng: np.random.Generator) -> tuple[list[Mesh], list[Any]]:
     """Pieces along the walls and a table, and their areas in plan (shapely)."""
-    pieces, taken = [], []
+    pieces, taken = list[Mesh](), list[Any]()
     edges = [edge for edge in _edges(room) if np.ptp(edge[2]) > 1.0]
     wanted = max(3, int(room.area / 2.5))
     for _ in range(60):
@@ -310,12 +310,12 @@ def phone_scan(place: Home, seed: int) -> tuple[Mesh, FloatArray, Errors]:
     core, block = o3d.core, (errors.edge_m, 16, MOST_BLOCKS, o3d.core.Device("CPU:0"))
     volume = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight"), (core.float32,) * 2, ((1), (1)), *block)
     lens, depths = core.Tensor(cast.intrinsic), (1.0, RANGE_M, TRUNCATION)
-    drift, motions, start = np.eye(4), [], None
+    drift, motions, starts = np.eye(4), list[FloatArray](), list[FloatArray]()
     for area in place.free:
         spots = places_of(shapely.buffer(area, -0.1), max(4, round(area.area / PLACE_M2)), rng)
         for x, y in spots:
             height = rng.uniform(*HAND_M)
-            start = np.array([x, y, height]) if start is None else start
+            starts.append(np.array([x, y, height]))
             step = trimesh.transformations.rotation_matrix(rng.normal(0, errors.drift_rad), [0, 0, 1], [x, y, 0])
             step[:3, 3] += rng.normal(0, errors.drift_m, 3)
             drift = step @ drift
@@ -339,7 +339,7 @@ def phone_scan(place: Home, seed: int) -> tuple[Mesh, FloatArray, Errors]:
     lean = Rotation.from_rotvec(errors.tilt_rad * np.array([np.cos(axis), np.sin(axis), 0.0]))
     to_phone = np.eye(4)
     to_phone[:3, :3] = (lean * turn).as_matrix()
-    to_phone[:3, 3] = -to_phone[:3, :3] @ start
+    to_phone[:3, 3] = -to_phone[:3, :3] @ starts[0]
     to_file = Y_UP @ to_phone
     mesh.apply_transform(to_file)
     mean = np.mean(motions, axis=0)

@@ -9,6 +9,7 @@ from wrf_mi.scene.coordinates import require_clear_up
 from wrf_mi.scene.mesh.furnishings import furnishings, reached
 from wrf_mi.scene.mesh.outline import Raster, levels_completed, shadows
 from wrf_mi.scene.mesh.planes import Face, Plane, with_axes
+from wrf_mi.scene.mesh.surfaces import Kind
 
 
 def face(normal, offset_m, *corners_m):
@@ -54,7 +55,7 @@ def test_floors_are_completed_below_the_ceiling_but_not_above_a_stairwell():
     holes = shapely.transform(shapely.union_all([bed, stairs]), lambda xy: FLOOR.plane.flat(np.c_[xy, 0 * xy[:, :1]]))
     seen = shapely.difference(FLOOR.area, holes)
     steps = np.random.default_rng(1).uniform((4, 3, -1.5), (5, 4, -0.2), (2000, 3))
-    planes, roles = [FLOOR.plane, CEILING.plane], ["floor", "ceiling"]
+    planes, roles = [FLOOR.plane, CEILING.plane], list[Kind](("floor", "ceiling"))
     floor, ceiling = levels_completed(planes, [seen, CEILING.area], roles, steps, 0.03)
     assert floor.area == pytest.approx(19, abs=0.02)
     assert ceiling.area == pytest.approx(20, abs=0.02)

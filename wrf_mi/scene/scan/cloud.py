@@ -103,10 +103,10 @@ def surfaces_from_points(
     logger.info("%d planes in %d points, noise %.1f mm", len(pieces), len(points), 1e3 * noise)
     names = list[str](roles)
     if not scan.sights:
-        faces = reached([Face(piece.plane, area) for piece, area in zip(pieces, areas, strict=True)], roles)
-        if lost := sum(area.area for area in areas) - sum(face.area.area for face in faces):
+        cleared = reached([Face(piece.plane, area) for piece, area in zip(pieces, areas, strict=True)], roles)
+        if lost := sum(area.area for area in areas) - sum(face.area.area for face in cleared):
             logger.warning("%.1f m2 left out that a mirror or window shows beyond the floor", lost)
-        areas, names = [face.area for face in faces], furnishings(faces, roles)
+        areas, names = [face.area for face in cleared], furnishings(cleared, roles)
         roles = [kind if name == kind else "other" for name, kind in zip(names, roles, strict=True)]
     order = [i for i in range(len(pieces)) if not areas[i].is_empty]
     order.sort(key=lambda i: (KINDS.index(roles[i]), names[i], -areas[i].area))
