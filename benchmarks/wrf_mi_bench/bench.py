@@ -99,6 +99,7 @@ _OWN: Mapping[str, Check] = {
     "image-method": _here("traced paths against MATLAB", "trace:newrf", CONFERENCE, OFFICE),
     "scan-to-paths": _here("mesh from a scan", "scene:scans", CONFERENCE, OFFICE),
     "large-scan": _here("mesh from a scan", "scene:large_scan", OFFICE),
+    "phone-scans": _here("mesh from a phone's scan", "phone_scans:main", table="phone_scans:table", **_STORED),
     "flat-plan": _here("mesh of a flat", "scene:flat_plan", FLAT),
     "stress": _here("numbers under stress", "stress:main", quick="stress:quick"),
     "pareto": _here("run time against error", "table_pages:pareto", resumes=True, table="table_pages:front_table"),

@@ -6,6 +6,7 @@ were measured by hand.
 
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,14 +64,7 @@ def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, see
         seconds = time.perf_counter() - start
         memory = peak_memory_mb()
         other = open_scene(measured.folder, frequency_hz)
-        end = Receiver("fixed end", fixed, np.array([0.0, 0.0, 0.0, 1.0]))
-        options = TraceOptions(transmission=False, depth=2, rays=1 << 20, seed=seed)
-        truth, ours = (trace_paths(scene, chosen, end, options).paths for scene in (original, other))
-    matched = match(truth, ours)
-    shares = {
-        name: {"power": _power_share(paths, which), "paths": len(which) / max(len(paths), 1)}
-        for name, paths, which in (("recall", truth, matched[0]), ("precision", ours, matched[1]))
-    }
+        agreement = path_agreement(original, other, [(fixed, chosen)], seed)
     return {
         "room": file.stem,
         "points": len(points),
@@ -79,17 +73,41 @@ def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, see
         "poses": poses,
         "surfaces": measured.counts["surfaces"],
         "receivers": len(chosen),
-        "paths_room": len(truth),
-        "paths_made": len(ours),
-        **shares,
-        "recall_by_reflections": {
-            depth: _power_share(truth, matched[0], truth.bounces == depth)
-            for depth in range(int(truth.bounces.max(initial=0)) + 1)
-        },
+        **agreement,
         "make_seconds": seconds,
         "peak_memory_mb": memory,
         "memory_mb": psutil.Process().memory_info().rss / 1e6,
     }
+
+
+def path_agreement(
+    original: Any, made: Any, ends: Sequence[tuple[FloatArray, FloatArray]], seed: int, rays: int = 1 << 20
+) -> dict[str, Any]:
+    """Recall and precision of `scan_to_paths` of a made scene in the frame of the original one (``sionna.rt.Scene``).
+
+    ``ends`` are fixed ends [3], each with positions [n, 3] of the other end.
+    """
+    options = TraceOptions(transmission=False, depth=2, rays=rays, seed=seed)
+    sums = {name: np.zeros((4, options.depth + 1)) for name in ("recall", "precision")}
+    for fixed, moving in ends:
+        end = Receiver("fixed end", fixed, np.array([0.0, 0.0, 0.0, 1.0]))
+        truth, ours = (trace_paths(scene, moving, end, options).paths for scene in (original, made))
+        for total, paths, which in zip(sums.values(), (truth, ours), match(truth, ours), strict=True):
+            for row, some in ((0, which), (2, slice(None))):
+                depth, power = paths.bounces[some], paths.length_m[some] ** -2.0
+                total[row] += np.bincount(depth, power, options.depth + 1)
+                total[row + 1] += np.bincount(depth, minlength=options.depth + 1)
+    shares = {
+        name: {"power": _share(total[0].sum(), total[2].sum()), "paths": _share(total[1].sum(), total[3].sum())}
+        for name, total in sums.items()
+    }
+    by_reflections = {depth: _share(*sums["recall"][[0, 2], depth]) for depth in range(options.depth + 1)}
+    numbers = {"paths_room": int(sums["recall"][3].sum()), "paths_made": int(sums["precision"][3].sum())}
+    return {**numbers, **shares, "recall_by_reflections": by_reflections}
+
+
+def _share(part: float, whole: float) -> float:
+    return float(part / whole) if whole else 0.0
 
 
 def match(truth: Paths, ours: Paths) -> tuple[IntArray, IntArray]:
@@ -134,14 +152,6 @@ def spread(places: FloatArray, count: int) -> FloatArray:
         distance = np.min([np.linalg.norm(places - place, axis=1) for place in chosen], axis=0)
         chosen.append(places[np.argmax(distance)])
     return np.stack(chosen)
-
-
-def _power_share(paths: Paths, which: IntArray, among: Any = None) -> float:
-    """Share of the power, of paths of a mask, that some of them carry."""
-    power = paths.length_m**-2.0
-    if among is not None:
-        power = power * among
-    return float(power[which].sum() / power.sum()) if power.sum() else 0.0
 
 
 def _clearance(triangles: FloatArray) -> Any:

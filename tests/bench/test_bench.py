@@ -21,7 +21,7 @@ from wrf_mi.core.registry import resolve
 RESULTS = CHECKOUT / "benchmarks" / "results"
 NEEDS_NO_DATA = {
     *("traced-and-splatted", "scaling", "operator", "stress", "pareto", "rooms", "phase-error"),
-    *("closed-forms", "elsewhere", "gpu", "sentinels", "new-carriers", "moved", "far-scans"),
+    *("closed-forms", "elsewhere", "gpu", "sentinels", "new-carriers", "moved", "far-scans", "phone-scans"),
 }
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
@@ -35,7 +35,7 @@ ON_PAGE = {
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
 NOT_LISTED = (
     *("scaling", "stress", "sentinels", "new-carriers", "new-receivers"),
-    *("elsewhere", "traced-and-splatted", "flat-plan", "phase-error", "training"),
+    *("elsewhere", "traced-and-splatted", "flat-plan", "phase-error", "training", "phone-scans"),
 )
 """Checks of many rows, or that the prose of a page summarises."""
 OTHER_BLOCKS = ("checks", *IN_RESULTS)

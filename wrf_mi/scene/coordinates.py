@@ -70,6 +70,8 @@ SHAFT, SHAFT_HEIGHT = 2.0, 2.0
 """Largest length of a shaft or stairwell in its widths, and its least height in its lengths."""
 TALL = 1.4  # least ratio of the extents along z and y of data that look as if y were up
 BROAD = 1.2  # least ratio of the areas seen along y and z of such data; corridors with a tall end have less
+CLEARLY_MORE, TILTED_M = 1.3, 0.5
+"""Least ratio of the areas seen along z and y of a room of which z is surely up, and height that a tilt adds."""
 FLOOR_M = 0.05  # largest height of a floor that counts as zero
 CELLS = 40  # cells along the longest side, in which areas are seen
 CORE = (0.005, 0.995)
@@ -147,6 +149,24 @@ def _up_text(points_m: FloatArray, name: str | Path) -> str:
     size = f"{sides[0]:.3g} m along y, {sides[1]:.3g} m along z of the file"
     text = f"{name}: looks as if {other} were up ({size}), and is read with {up} up"
     return f"{text}; state it by wrf-mi mesh --up {other}"
+
+
+def require_clear_up(points_m: FloatArray, name: str | Path, stated: Up | None) -> None:
+    """Refuse points [n, 3], z up, of a phone's scan that may be of a room with y up, in a file that states no axis.
+
+    Phones write either. The axis is clear where y is no height of a room, or z is one along which far more area is
+    seen.
+    """
+    if stated is not None or Path(name).suffix.lower() in STATING_UP:
+        return
+    low, high = extent(points_m)
+    _, along_y, along_z = high - low
+    cell = ((points_m[:: len(points_m) // MOST_POINTS + 1] - low) / ((high - low).max() / CELLS)).astype(int)
+    seen_along_y, seen_along_z = (len(np.unique(cell[:, axes], axis=0)) for axes in ([0, 2], [0, 1]))
+    is_clear = along_z >= ROOM_HEIGHT_M[0] and seen_along_z > CLEARLY_MORE * seen_along_y
+    if ROOM_HEIGHT_M[0] <= along_y <= ROOM_HEIGHT_M[1] + TILTED_M and not is_clear:
+        text = f"{name}: {along_y:.1f} m along y and {along_z:.1f} m along z of a phone's scan may both be the height"
+        raise InputError(f"{text} of a room; state the axis that is up by wrf-mi mesh --up y or --up z")
 
 
 def check_extent(points_m: FloatArray, name: str | Path) -> None:

@@ -19,14 +19,24 @@ from numpy.typing import ArrayLike
 from ..core import InputError
 from ..core.angles import FloatArray
 from ..core.array_files import stored_names
-from .coordinates import STATING_UP, Y_UP, Up, check_extent, local_origin, require_fine, require_near, require_up
+from .coordinates import (
+    STATING_UP,
+    Y_UP,
+    Up,
+    check_extent,
+    local_origin,
+    require_clear_up,
+    require_fine,
+    require_near,
+    require_up,
+)
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .mesh.facets import planes_of_mesh
 from .mesh.files import SUFFIXES, read_mesh
 from .mesh.measured import is_measured
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
-from .mesh.surfaces import Surface, bounds, box_of, moved, sampled, with_area
+from .mesh.surfaces import Surface, bounds, box_of, main_extent, moved, sampled, with_area
 from .plan.geojson import GEOJSON_SUFFIXES, Extent
 from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES
 from .plan.sources import PlanGrid, Row0, read_layout, read_plan
@@ -46,6 +56,7 @@ PREVIEW_POINTS = 20_000
 Storey = tuple[float | None, float, float | None, Row0 | None, Extent | None]
 """Options of a plan: height of the ceiling, z of the floor, side of a cell, side where the first row lies, extent."""
 UNSTATED: Storey = (None, 0.0, None, None, None)  # these options where none is given
+LEAST_TURN_DEG = 0.1  # smaller angles between walls and axes are errors of the planes
 RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
 
@@ -123,11 +134,14 @@ def make_scene(
     if origin_m is None and matrix is known_walls is measured is None:
         origin_m = local_origin(source.extent_m)
         shift = _shift(file, origin_m)
+    shift = shift @ source.turn
     if matrix is known_walls is None:  # before minutes are spent on a scan's planes
         require_near(trimesh.transform_points(source.extent_m, shift), file)
     source, turn = source.levelled(shift)
     surfaces = source.surfaces(up)
     motion, registered = shift, turn
+    if matrix is known_walls is measured is None and (along := source.along_walls(surfaces)) is not None:
+        motion, registered = along @ shift, along if turn is None else along @ turn
     if known_walls is not None:
         matrix = register_walls(wall_points(moved(surfaces, shift)), known_walls, str(file))
         motion, registered = matrix @ shift, matrix if turn is None else matrix @ turn
@@ -181,11 +195,17 @@ class _Source:
     parts: Sequence[Surface] = ()
     grid: PlanGrid | None = None
     scan: Scan | None = None
+    yaw_rad: float = 0.0
 
     @property
     def extent_m(self) -> FloatArray:
         """Lowest and highest coordinates [2, 3]."""
         return box_of(self.parts) if self.scan is None else bounds(self.scan.points_m)
+
+    @property
+    def turn(self) -> FloatArray:
+        """Rotation [4, 4] of a robot's map about z in the frame of its file."""
+        return np.asarray(trimesh.transformations.rotation_matrix(self.yaw_rad, [0, 0, 1]))
 
     def levelled(self, shift: FloatArray) -> tuple[_Source, FloatArray | None]:
         """The source with a scan made level about the origin to which a matrix [4, 4] shifts; its rotation or None."""
@@ -211,7 +231,9 @@ class _Source:
         if self.scan is None:
             return self.parts
         try:
-            surfaces = surfaces_from_points(self.scan.points_m, self.scan.viewpoints_m, self.scan.viewpoint)
+            surfaces = surfaces_from_points(
+                self.scan.points_m, self.scan.viewpoints_m, self.scan.viewpoint, walked=self.scan.walked
+            )
         except InputError as error:
             raise InputError(f"{self.file}: {error}") from None
         if up is None and not _has_floor(surfaces):
@@ -224,6 +246,23 @@ class _Source:
         if all(surface.kind == "other" for surface in surfaces):
             logger.warning("%s: no floor, ceiling or wall among its planes; mesh needs the scan of a room", self.file)
         return surfaces
+
+    def along_walls(self, surfaces: Sequence[Surface]) -> FloatArray | None:
+        """Rotation [4, 4] about z that puts the axes of a phone's frame along the walls; None where none is due.
+
+        The frame of a survey or of a design is left as it is.
+        """
+        walls = [surface for surface in surfaces if surface.kind == "wall"]
+        if self.scan is None or not self.scan.walked or not walls:
+            return None
+        normal = main_extent(np.concatenate([wall.vertices_m[wall.faces] for wall in walls]))[0]
+        turn_deg = -float((np.degrees(np.arctan2(normal[1], normal[0])) + 45) % 90 - 45)
+        if abs(turn_deg) < LEAST_TURN_DEG:
+            return None
+        text = "%s: turned by %.1f degrees about the vertical, so that its axes run along the walls; scene.yml has the "
+        text += "rotation, which positions in the frame of the file need as well; --positions keeps the file's axes"
+        logger.warning(text, self.file, turn_deg)
+        return np.asarray(trimesh.transformations.rotation_matrix(np.radians(turn_deg), [0, 0, 1]))
 
     def sample(self, motion: FloatArray) -> dict[str, Any]:
         """Arguments of `write_scene` for a scan: moved points for the preview, and the number of all points."""
@@ -250,6 +289,7 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
             return _Source(file, _split(raw, file, up))
         logger.warning("%s: its faces are uneven as those of a scan, and are read as points of its planes", file)
         scan = sampled_scan(raw)
+        require_clear_up(scan.points_m, file, up)
     else:
         scan = read_scan(files, units, up)
     require_stated_metres(files, units)
@@ -297,7 +337,9 @@ def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> 
         raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
     plan = read_plan(file, resolution_m, row_0, extent_m)
     walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, name=str(file))
-    return _Source(file, walls, plan if isinstance(plan, PlanGrid) and plan.free.any() else None)
+    if not isinstance(plan, PlanGrid):
+        return _Source(file, walls)
+    return _Source(file, walls, plan if plan.free.any() else None, yaw_rad=plan.yaw_rad)
 
 
 def _split(raw: Sequence[Surface], file: Path, up: Up | None) -> list[Surface]:

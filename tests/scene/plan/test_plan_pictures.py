@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 from calling import refused
 from made_plans import read_grid
 from PIL import Image
@@ -203,12 +204,11 @@ def test_transparent_cells_of_mode_scale_are_unmapped(tmp_path):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("origin: [0, 0, nan]", "origin is .*nan.; give finite x and y in metres and a yaw of 0"),
+        ("origin: [0, 0, nan]", "origin is .*nan.; give finite x and y in metres and a yaw in radians"),
         ("origin: [0, .inf, 0]", "origin is .* give finite x and y"),
         ("origin: [0, 0]", r"setting origin: expected a list of 3 values, got \[0"),
         ("origin: 0", "setting origin: expected a list of 3 values, got 0"),
         ("origin:", "it needs origin"),
-        ("origin: [0, 0, 0.5]", "origin is .*0.5.; give .* a yaw of 0"),
         ("resolution: -0.05", "resolution: -0.05 is out of range, choose more than 0"),
         ("resolution: .nan", "resolution: nan is out of range, choose more than 0"),
         ("resolution: true", "setting resolution: expected float, got True"),
@@ -227,3 +227,13 @@ def test_values_of_a_ros_map_that_are_unusable_are_refused_by_name(tmp_path, lin
     with pytest.raises(InputError, match=message):
         read_plan(sheet)
     refused(["mesh", sheet, "--wall-height", "2.5", "--out", tmp_path / "scene"], message, capsys)
+
+
+def test_the_yaw_of_a_ros_map_turns_it_about_its_lower_left_corner(tmp_path):
+    plan = write_map(tmp_path, robot_map())
+    straight = floor_area(make_scene(plan, tmp_path / "straight", height_m=2.5).folder)
+    turned_map = write_map(tmp_path, robot_map(), YAML.replace("[-1.0, -5.0, 0.0]", "[2.0, 3.0, 0.4]"))
+    turned = floor_area(make_scene(turned_map, tmp_path / "turned", height_m=2.5).folder)
+    expected = shapely.affinity.rotate(straight, 0.4, origin=tuple(LOW_M), use_radians=True)
+    expected = shapely.affinity.translate(expected, *(np.array([2.0, 3.0]) - LOW_M))
+    assert shapely.symmetric_difference(turned, expected).area < 1e-3 * expected.area

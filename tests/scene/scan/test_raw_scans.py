@@ -7,6 +7,7 @@ from calling import refused
 from made_rooms import Mesh, attic, by_kind, closed_box, joined, l_shape, sampled, sheet
 from wrf_mi_scenes.build_laboratory import box
 
+from wrf_mi.apps.checking import check_scene
 from wrf_mi.core.yaml_files import read_yaml
 from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.make import make_scene
@@ -167,6 +168,26 @@ def test_mesh_of_a_phone_becomes_the_planes_of_a_scan(tmp_path, caplog, halvings
     assert [len(group) for group in by_kind(surfaces).values()] == [1, 1, 4, 0]
     assert sum(s.mesh.area for s in surfaces) == pytest.approx(86.8, rel=0.01)
     assert "uneven as those of a scan" in caplog.text
+
+
+def test_axes_of_a_phones_scan_are_turned_along_the_walls(tmp_path, caplog):
+    turned = trimesh.transformations.rotation_matrix(np.radians(25), (0, 0, 1))
+    uneven(closed_box(z=2.6), 0.008).apply_transform(turned).export(tmp_path / "scan.ply")
+    surfaces = surfaces_of(tmp_path / "scan.ply", tmp_path, up="z")
+    np.testing.assert_allclose(sorted(np.ptp(box_of(surfaces), axis=0)), [2.6, 4, 5], atol=CLOSE_M)
+    assert "turned by -25.0 degrees" in caplog.text or "turned by 65.0 degrees" in caplog.text
+    motion = np.array(read_yaml(tmp_path / "scene" / "scene.yml")["registration"])
+    np.testing.assert_allclose(motion @ turned, np.eye(4), atol=np.radians(TURN_DEG))
+
+
+def test_check_names_the_command_that_makes_planes_of_a_phones_scan(tmp_path):
+    file = tmp_path / "scan.obj"
+    uneven(closed_box(z=2.6), 0.008).export(file)
+    (finding,) = check_scene(file).of_level("warning")
+    assert finding.kind == "uneven"
+    assert f"wrf-mi mesh {file} --out SCENE --up y, or --up z" in finding.remedy
+    uneven(closed_box(z=2.6), 0.0).export(file)
+    assert not check_scene(file).of_level("warning")
 
 
 # --- terraces

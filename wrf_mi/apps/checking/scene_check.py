@@ -22,6 +22,7 @@ from ...scene.coordinates import (
     HIGHEST_M,
     LARGEST_M,
     SMALLEST_M,
+    STATING_UP,
     UNITS_M,
     Y_UP,
     Up,
@@ -36,7 +37,8 @@ from ...scene.folder import FACTS_FILE, scene_file
 from ...scene.make import has_faces
 from ...scene.materials import FILE as MATERIALS_FILE
 from ...scene.materials import read_materials, thicknesses
-from ...scene.mesh.surfaces import sampled
+from ...scene.mesh.measured import is_measured
+from ...scene.mesh.surfaces import Surface, sampled
 from ...scene.scan.las_units import stated_units, units_remedy, units_text
 from ...scene.scan.points import read_points
 from ...scene.scattering import take_scattering
@@ -314,6 +316,13 @@ def _coordinates(
     # A mesh may be cut out of a larger one and have strays; a scene file was made to be traced.
     wrong = list(_units(corners.reshape(-1, 3), path, BUILDING if path.suffix.lower() != ".xml" else SCENE))
     yield from wrong or ([] if frame.up else _up(sampled(corners), path))
+    mesh = Surface("", "other", corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+    if path.suffix.lower() != ".xml" and not path.is_dir() and is_measured([mesh]):
+        stated = frame.up or path.suffix.lower() in STATING_UP
+        up = f" --up {frame.up}" if frame.up else "" if stated else " --up y, or --up z"
+        command = f"wrf-mi mesh {path} --out SCENE{up}"
+        text = "faces are uneven as those of a phone's scan, and have few reflections"
+        yield Finding("uneven", path, "", text, f"make planes of them: {command}")
 
 
 def _distances(parts: Sequence[ShapePart], carriers_hz: Sequence[float]) -> Iterator[Finding]:

@@ -56,6 +56,7 @@ KINDS: Mapping[str, tuple[Level, str]] = {
     "stated-units": ("warning", "LAS or LAZ whose header states other units than those that it is read in"),
     "coarse-steps": ("fault", "scan whose coordinates are rounded to steps too coarse for planes"),
     "up-axis": ("warning", "mesh or scan that looks as if y were up"),
+    "uneven": ("warning", "mesh of a phone's scan, whose uneven faces have few reflections"),
     "format": ("note", "mesh format that plain Sionna RT does not open"),
     "material-range": ("fault", "material that ITU-R P.2040 does not have at the carrier"),
     "below-range": ("warning", "material below its range, for which this package has constants and Sionna RT none"),

@@ -15,7 +15,7 @@ from shapely import affinity
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from .planes import STOREY_M, Face, Mask, Plane
+from .planes import LEVEL, STOREY_M, Face, Mask, Plane
 from .surfaces import Kind
 
 CELL_RANGE_M = (0.04, 0.25)
@@ -33,6 +33,7 @@ SMALL_HOLE_M2 = 0.1
 SMALLEST_M2 = 0.04
 RECTANGLE_SHARE, GROWN_SHARE = 0.88, 0.96
 """Least share of its tightest rectangle that a rectangular area fills; also of one with places told by beams."""
+NOTCH_M = 0.4  # least width of a notch
 SCAN_LINES = 31
 SHADOW_CELL_M = 0.1
 BEFORE_M = {"wall": 1.2, "floor": 2.5, "ceiling": 2.5}
@@ -61,7 +62,12 @@ def outline(plane: Plane, points_m: FloatArray) -> tuple[Any, float]:
     index = ((flat - low) / cell).astype(int)
     count = np.bincount(np.ravel_multi_index(tuple(index.T), tuple(bins)), minlength=bins.prod()).reshape(bins)
     area = boxes(_covered(count, cell), low, cell)
-    parts = [_rectangle(part) or part.simplify(1.2 * cell) for part in polygons(area)]
+    # A notch of a floor or ceiling is a corner of the building; of a wall, something stands before it.
+    is_level = abs(plane.normal[2]) > LEVEL
+    parts = [
+        (None if is_level and _is_notched(part) else _rectangle(part)) or part.simplify(1.2 * cell)
+        for part in polygons(area)
+    ]
     # Edges are moved inwards because a cell that the edge crosses counts as a whole.
     return shapely.buffer(shapely.union_all(parts), -EDGE_SHARE * cell, join_style="mitre"), cell
 
@@ -158,11 +164,82 @@ def fill_shadows(plane: Plane, area: Any, kind: Kind, points_m: FloatArray, nois
     for gap in polygons(shapely.difference(shapely.envelope(area), area)):
         if gap.area < SMALLEST_GAP_M2:
             continue
-        inside = flat[shapely.contains_xy(gap, flat)]
-        cells = len(np.unique(np.floor(inside / SHADOW_CELL_M), axis=0))
-        if cells * SHADOW_CELL_M**2 >= HIDDEN_SHARE * gap.area:
+        if _is_hidden(gap, flat):
             filled.append(gap)
     return shapely.union_all(filled, grid_size=GRID_M)
+
+
+def shadows(raster: Raster, plane: Plane, kind: Kind, points_m: FloatArray, noise_m: float) -> Mask:
+    """Cells of a floor, ceiling or wall before which points [n, 3] of things lie, along its normal."""
+    distance = np.abs(plane.distance(points_m))
+    before = (distance > max(0.05, 4 * noise_m)) & (distance < BEFORE_M[kind])
+    cell = np.floor((plane.flat(points_m[before]) - raster.low_m) / raster.cell_m).astype(int)
+    cell = cell[((cell >= 0) & (cell < raster.shape)).all(axis=1)]
+    hidden = np.zeros(raster.shape, bool)
+    hidden[tuple(cell.T)] = True
+    return np.asarray(ndimage.binary_closing(np.pad(hidden, 1), np.ones((3, 3)))[1:-1, 1:-1])
+
+
+def levels_completed(
+    planes: Sequence[Plane], areas: Sequence[Any], roles: Sequence[Kind], points_m: FloatArray, band_m: float
+) -> list[Any]:
+    """Areas with floors completed below their ceilings, and ceilings above their floors.
+
+    What stands on a floor hides it, but not the ceiling above. A gap behind which points [n, 3] lie, such as a
+    stairwell, is left, and so is one beside no floor or ceiling.
+    """
+    areas = list(areas)
+    levels = [(kind, float(planes[i].lift(_middle(areas[i]))[2]), i) for i, kind in enumerate(roles)]
+    floors_m = np.array([height for kind, height, _ in levels if kind == "floor"])
+    for kind, other, side in (("floor", "ceiling", 1), ("ceiling", "floor", -1)):
+        own = [(height, i) for each, height, i in levels if each == kind]
+        for height, number in own:
+            plane = planes[number]
+            opposite = [
+                i
+                for each, at, i in levels
+                if each == other and side * (at - height) > STOREY_M and not _between(floors_m, height, at).any()
+            ]
+            covered, seen = (
+                shapely.union_all([_seen_on(plane, planes[i], areas[i]) for i in chosen])
+                for chosen in ([i for _, i in own], opposite)
+            )
+            behind = -plane.distance(points_m) * np.sign(plane.normal[2]) * side
+            flat = plane.flat(points_m[(behind > band_m) & (behind < STOREY_M)])
+            gaps = polygons(opened(shapely.difference(seen, covered), SEAM_M))
+            gaps = [gap for gap in gaps if gap.area > SMALLEST_GAP_M2 and not _is_hidden(gap, flat)]
+            beside = [gap for gap in gaps if shapely.distance(gap, areas[number]) < RASTER_M]
+            if beside:
+                areas[number] = merged([areas[number], *beside])
+    return areas
+
+
+def _between(heights: FloatArray, first: float, second: float) -> Mask:
+    """Which heights lie between two others, a storey's from both."""
+    low, high = min(first, second), max(first, second)
+    return (heights > low + STOREY_M) & (heights < high)
+
+
+def _middle(area: Any) -> FloatArray:
+    return np.array(area.centroid.coords[0] if not area.is_empty else (np.nan, np.nan))
+
+
+def _seen_on(plane: Plane, other: Plane, area: Any) -> Any:
+    """The area of another plane in the coordinates of a plane that is not upright, above or below it."""
+
+    def above(uv: FloatArray) -> FloatArray:
+        x, y = other.lift(uv)[:, :2].T
+        z = (plane.offset_m - plane.normal[0] * x - plane.normal[1] * y) / plane.normal[2]
+        return plane.flat(np.stack([x, y, z], axis=1))
+
+    return shapely.make_valid(shapely.transform(area, above))
+
+
+def _is_hidden(gap: Any, flat_m: FloatArray) -> bool:
+    """Whether points [n, 2], those of things before or behind it, cover most of a gap."""
+    inside = flat_m[shapely.contains_xy(gap, flat_m)]
+    cells = len(np.unique(np.floor(inside / SHADOW_CELL_M), axis=0))
+    return bool(cells * SHADOW_CELL_M**2 >= HIDDEN_SHARE * gap.area)
 
 
 def polygons(area: Any) -> list[Any]:
@@ -300,6 +377,12 @@ def _covered(count: NDArray[Any], cell: float) -> Mask:
     density = np.bincount(label.ravel(), weights=count.ravel())[1:] / size
     stray = (size < STRAY_SIZE * size.sum()) & (density < STRAY_DENSITY * np.median(count[mask]))
     return mask & ~np.concatenate([[False], stray])[label]
+
+
+def _is_notched(part: Any) -> bool:
+    """Whether a broad part of the tightest rectangle about a polygon lies outside."""
+    outside = shapely.difference(part.minimum_rotated_rectangle, shapely.polygons(part.exterior))
+    return bool(opened(outside, NOTCH_M / 2).area > NOTCH_M**2)
 
 
 def _rectangle(part: Any, share: float = RECTANGLE_SHARE) -> Any | None:

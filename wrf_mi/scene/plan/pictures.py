@@ -42,7 +42,7 @@ class Sheet(CheckedSettings):
     """Content of the YAML of a ROS map, by the names that map_server gives it.
 
     Attributes:
-        origin: lower left corner x, y in metres, and the yaw of the map in radians, which has to be zero.
+        origin: lower left corner x, y in metres, and the yaw of the map about it in radians, counter-clockwise.
         resolution: side of a cell, metres.
         image: name of the picture.
         free_thresh: probability below which a cell is free.
@@ -63,7 +63,7 @@ class Sheet(CheckedSettings):
 def read_sheet(file: Path, resolution_m: float | None) -> Sheet:
     """The YAML of a ROS map, whose resolution a stated one overrides.
 
-    `InputError`: a missing or unusable value, by its name, or a map that is turned.
+    `InputError`: a missing or unusable value, by its name.
     """
     facts = {name: value for name, value in read_yaml(file).items() if name in names_of(Sheet)}
     facts |= {} if resolution_m is None else {"resolution": resolution_m}
@@ -73,9 +73,8 @@ def read_sheet(file: Path, resolution_m: float | None) -> Sheet:
         sheet = settings_from(Sheet, facts, str(file))
     except InputError as error:  # ranges are those of any settings, whose file is not known there
         raise InputError(f"{file}, {str(error).removeprefix(f'{file}, ')}") from None
-    if not np.isfinite(sheet.origin).all() or sheet.origin[2]:
-        text = f"origin is {list(sheet.origin)}; give finite x and y in metres and a yaw of 0, and register the scene"
-        raise InputError(f"{file}: {text}")
+    if not np.isfinite(sheet.origin).all():
+        raise InputError(f"{file}: origin is {list(sheet.origin)}; give finite x and y in metres and a yaw in radians")
     if sheet.free_thresh >= sheet.occupied_thresh:
         text = f"free_thresh is {sheet.free_thresh:g} and occupied_thresh {sheet.occupied_thresh:g}"
         raise InputError(f"{file}: {text}; give that of free cells first, the lower one")

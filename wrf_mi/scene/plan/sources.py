@@ -57,12 +57,14 @@ class PlanGrid:
         free: cells seen empty, same shape; without any, openings and hidden places are unknown.
         resolution_m: side of a cell.
         origin_m: lower left corner, shape [2].
+        yaw_rad: angle by which the map is turned about (0, 0) in the frame of its file.
     """
 
     occupied: Mask
     free: Mask
     resolution_m: float
     origin_m: FloatArray
+    yaw_rad: float = 0.0
 
     @property
     def unmapped(self) -> Mask:
@@ -147,8 +149,8 @@ def read_plan(
       (log odds of free cells are negative).
     - ``.npz`` with points ``xy_m`` [n, 2], LiDAR returns in a horizontal plane.
     - ``.png``, ``.pgm``, ``.jpg``: a picture, dark where occupied, transparent pixels on white, with or without the
-      ``.yaml`` of a ROS map beside it, which may be given in its place (`wrf_mi.scene.plan.pictures.read_sheet`); its
-      yaw has to be zero. Without a YAML, and with other greys than those of map_saver, lines thinner than
+      ``.yaml`` of a ROS map beside it, which may be given in its place (`wrf_mi.scene.plan.pictures.read_sheet`).
+      Without a YAML, and with other greys than those of map_saver, lines thinner than
       `THINNEST_WALL_M` are not walls (`without_thin_lines`), and a picture with colours has no unmapped cells.
     - ``.csv`` with the header ``x,y``: wall vertices (`read_layout`).
     - ``.geojson``, ``.json``: outlines of rooms in longitude and latitude (`wrf_mi.scene.plan.geojson.read_geojson`).
@@ -294,7 +296,10 @@ def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
     probability = pixels.probability(sheet)
     if sheet is not None:
         thresholds = sheet.free_thresh, sheet.occupied_thresh
-        return grid_from_probability(probability, resolution_m, "top", sheet.origin[:2], str(path), thresholds)
+        x, y, yaw = sheet.origin
+        origin = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x  # in the turned frame
+        grid = grid_from_probability(probability, resolution_m, "top", origin, str(path), thresholds)
+        return replace(grid, yaw_rad=yaw)
     if pixels.coloured:  # a drawing: what is no line is ground, of whatever colour
         probability = np.where(probability > OCCUPIED_PROBABILITY, 1.0, 0.0)
     grid = grid_from_probability(probability, resolution_m, "top", name=str(path))

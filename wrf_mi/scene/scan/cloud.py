@@ -14,10 +14,20 @@ from scipy import ndimage
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ..mesh.outline import Raster, fill_blind, fill_shadows, join, outline, triangulated
+from ..mesh.furnishings import BELOW_CEILING_M, furnishings, reached
+from ..mesh.outline import (
+    Raster,
+    fill_blind,
+    fill_shadows,
+    join,
+    levels_completed,
+    outline,
+    shadows,
+    triangulated,
+)
 from ..mesh.planes import UPRIGHT, WALL_HEIGHT_M, Face, Mask, Plane, kinds, near, over, storey, with_axes
 from ..mesh.surfaces import KINDS, Kind, Surface, number_names
-from .planes import BAND, Thinned, find_planes, fit, layers, thin
+from .planes import BAND, CORE, NARROW_CORE, NARROW_RADIUS_M, NORMAL_RADIUS_M, Thinned, find_planes, fit, layers, thin
 from .sight import Sight, returns_and_shadows, sights_of, sparse_walls
 
 logger = logging.getLogger(__name__)
@@ -33,6 +43,10 @@ TOLERANCE_RANGE_RAD = np.radians(0.3), np.radians(4.0)
 LEAST_PART, LEAST_FILLED = 0.4, 0.5
 """Least height of a part of a wall whose rest things hide, in that of a wall, and least share of the rectangle about a
 wall of few points that it fills."""
+LEAST_STRIP_M = 0.2  # least height of the part of a wall above furniture, where no scanner's place is known
+DRIFT_M = 0.03
+"""Largest distance of sheets of one wall that were seen at other times of a walk, and error of planes at their edges
+where depth of many places was fused: corners are rounded by a cell."""
 PASSES = 2
 MOST_OUTSIDE = 0.1  # share of a scanner's returns behind walls from which they are no strays through openings
 UNLIKE = np.array([1.0, np.sqrt(2.0), np.sqrt(3.0)])  # factors for which different points have different sums
@@ -48,7 +62,11 @@ class _Piece(Face):
 
 
 def surfaces_from_points(
-    points_m: FloatArray, viewpoints_m: FloatArray | None = None, viewpoint: IntArray | None = None
+    points_m: FloatArray,
+    viewpoints_m: FloatArray | None = None,
+    viewpoint: IntArray | None = None,
+    *,
+    walked: bool = False,
 ) -> list[Surface]:
     """The planes of a room or building in a levelled point cloud: floor, ceiling, walls, furniture.
 
@@ -59,6 +77,7 @@ def surfaces_from_points(
         points_m: shape [n, 3], metres, z upwards; any origin.
         viewpoints_m: places of the scanners where they are known [k, 3].
         viewpoint: number of each point's place [n], -1 for none.
+        walked: whether they were seen from many places, as those of a phone: the origin is not tried as the place.
 
     Returns:
         Surfaces by kind, the largest first; several polygons may make up one. Vertices in the frame of the points.
@@ -73,17 +92,26 @@ def surfaces_from_points(
     points = points_m[distinct] - shift
     numbers = np.full(len(points), -1) if viewpoint is None else viewpoint[distinct]
     places = np.empty((0, 3)) if viewpoints_m is None else viewpoints_m - shift
-    cloud = thin(points)
-    planes, noise = find_planes(cloud)
-    scan = _Scan(points.astype(np.float32), cloud, noise, sights_of(points, places, numbers, -shift))
-    pieces, roles = scan.room(planes)
+    cloud = thin(points, NARROW_RADIUS_M if walked else NORMAL_RADIUS_M)
+    planes, noise = find_planes(cloud, NARROW_CORE if walked else CORE)
+    sights = [] if walked else sights_of(points, places, numbers, -shift)
+    scan = _Scan(points.astype(np.float32), cloud, noise, sights, DRIFT_M if walked else 0.0)
+    pieces, roles = scan.room(planes, sparse=not walked)
     if not pieces:
         raise InputError(f"no plane was found in {len(points_m)} points; give a denser scan of a room")
     areas = scan.closed(pieces, roles)
     logger.info("%d planes in %d points, noise %.1f mm", len(pieces), len(points), 1e3 * noise)
-    order = sorted(range(len(pieces)), key=lambda i: (KINDS.index(roles[i]), -areas[i].area))
+    names = list[str](roles)
+    if not scan.sights:
+        cleared = reached([Face(piece.plane, area) for piece, area in zip(pieces, areas, strict=True)], roles)
+        if lost := sum(area.area for area in areas) - sum(face.area.area for face in cleared):
+            logger.warning("%.1f m2 left out that a mirror or window shows beyond the floor", lost)
+        areas, names = [face.area for face in cleared], furnishings(cleared, roles)
+        roles = [kind if name == kind else "other" for name, kind in zip(names, roles, strict=True)]
+    order = [i for i in range(len(pieces)) if not areas[i].is_empty]
+    order.sort(key=lambda i: (KINDS.index(roles[i]), names[i], -areas[i].area))
     surfaces = []
-    for name, i in zip(number_names([roles[i] for i in order]), order, strict=True):
+    for name, i in zip(number_names([names[i] for i in order]), order, strict=True):
         vertices, faces = triangulated(areas[i])
         surfaces.append(Surface(name, roles[i], pieces[i].plane.lift(vertices) + shift, faces))
     return surfaces
@@ -94,27 +122,30 @@ def _walls(pieces: Sequence[_Piece], roles: Sequence[Kind]) -> list[_Piece]:
 
 
 class _Scan:
-    """Points [n, 3] of a scan, those that may belong to surfaces [n], the thinned cloud, their noise, the scanners."""
+    """Points [n, 3] of a scan, those that may belong to surfaces [n], the thinned cloud, noise, scanners, drift."""
 
-    def __init__(self, points_m: FloatArray, cloud: Thinned, noise_m: float, sights: Sequence[Sight]) -> None:
+    def __init__(
+        self, points_m: FloatArray, cloud: Thinned, noise_m: float, sights: Sequence[Sight], drift_m: float
+    ) -> None:
         self.points_m, self.cloud, self.noise_m, self.sights = points_m, cloud, noise_m, sights
-        self.free = np.ones(len(points_m), bool)
+        self.free, self.drift_m = np.ones(len(points_m), bool), drift_m
 
-    def room(self, planes: Sequence[Plane]) -> tuple[list[_Piece], list[Kind]]:
-        """Pieces of planes and their roles, with walls of few points, without what lies behind walls."""
+    def room(self, planes: Sequence[Plane], sparse: bool) -> tuple[list[_Piece], list[Kind]]:
+        """Pieces of planes and their roles, with walls of few points if wanted, without what lies behind walls."""
         pieces, roles = self.roles(self.pieces(planes))
         walls = _walls(pieces, roles)
-        sparse = sparse_walls(self.cloud.all_m, [piece.plane for piece in walls], planes, self.noise_m)
+        wall_planes = [piece.plane for piece in walls]
+        few = sparse_walls(self.cloud.all_m, wall_planes, planes, self.noise_m) if sparse else []
         for number in range(PASSES):
             # Walls bound the room, and a wall that is found by few points bounds the others.
             outside = self.outside(walls)
             fresh = bool((outside & self.free).any())
-            if not fresh and not (sparse and number == 0):
+            if not fresh and not (few and number == 0):
                 break
             self.free = ~outside
-            second = self.roles(self.pieces([*planes, *sparse], walls))
-            sparse = [piece.plane for piece in second[0] if piece.plane.sparse]
-            if not fresh and not sparse:
+            second = self.roles(self.pieces([*planes, *few], walls))
+            few = [piece.plane for piece in second[0] if piece.plane.sparse]
+            if not fresh and not few:
                 break  # chance alignments alone, which must not move the others
             (pieces, roles), walls = second, _walls(*second)
         if not self.free.all():
@@ -137,6 +168,8 @@ class _Scan:
             self._filled(piece, area, kind, walls, things, clutter_m)
             for piece, area, kind in zip(pieces, areas, roles, strict=True)
         ]
+        if not self.sights:
+            areas = levels_completed(planes, areas, roles, clutter_m, band_m)
         return [shapely.simplify(area, STRAIGHT_M) for area in join(planes, areas, reach)]
 
     def _filled(
@@ -144,7 +177,7 @@ class _Scan:
     ) -> Any:
         """Area of a piece with its shadows filled, but for its recesses."""
         if kind != "other":
-            area = self.without_shadows(piece.plane, area, walls, things)
+            area = self.without_shadows(piece.plane, area, kind, walls, things, clutter_m)
         area = fill_shadows(piece.plane, area, kind, clutter_m, self.noise_m)
         if kind == "floor":
             area = fill_blind(piece.plane, area, walls, self.points_m, BAND * self.noise_m)
@@ -154,8 +187,10 @@ class _Scan:
         """Planes and their parallel layers with the areas that free points cover, those of most points first."""
         pieces = list[_Piece]()
         points, noise_m, free = self.points_m, self.noise_m, self.free.copy()
-        for refined in _refined(planes, points, noise_m):
+        for refined in _refined(planes, points, noise_m, self.drift_m):
             plane, parallel = layers(refined, points, free, noise_m)
+            # Drift shows one wall as two sheets.
+            parallel = [layer for layer in parallel if abs(layer.plane.offset_m - plane.offset_m) > self.drift_m]
             recesses = []
             for layer in parallel:
                 area, cell = outline(layer.plane, points[layer.rows])
@@ -163,7 +198,7 @@ class _Scan:
                     pieces.append(_Piece(layer.plane, area, 3 * noise_m + cell))
                     free[layer.rows] = False
                     recesses += [] if layer.before else [area]
-            in_plane = near(plane, points, 2 * noise_m) & free
+            in_plane = near(plane, points, max(2 * noise_m, self.drift_m)) & free
             for layer in parallel:
                 in_plane[layer.rows] = layer.before  # a wall goes on behind a board
             rows = np.flatnonzero(in_plane)
@@ -206,30 +241,50 @@ class _Scan:
 
     def _up_to_levels(self, piece: _Piece, roles: Mapping[Face, Kind]) -> _Piece:
         """An upright piece with the places that things hide between the floor and the ceiling."""
-        if not self.sights or piece.slope > UPRIGHT or np.ptp(piece.span_m) < LEAST_PART * WALL_HEIGHT_M:
+        least_m = LEAST_PART * WALL_HEIGHT_M if self.sights else LEAST_STRIP_M
+        if piece.slope > UPRIGHT or np.ptp(piece.span_m) < least_m:
             return piece
         levels = {face: role for face, role in roles.items() if role in ("floor", "ceiling")}
-        off = self.free & ~over(piece.plane, shapely.envelope(piece.area), self.points_m, BAND * self.noise_m)
+        floor, ceiling = storey(piece, levels)
+        if not self.sights and piece.span_m[1] < ceiling - BELOW_CEILING_M:
+            return piece  # it ends below the ceiling: furniture, which what stands beside it would make a wall
+        about, band_m = shapely.envelope(piece.area), BAND * self.noise_m
+        off = self.free & ~over(piece.plane, about, self.points_m, band_m)
+        clutter_m = self.cloud.points_m[~over(piece.plane, about, self.cloud.points_m, band_m)]
         (left, low, right, high), middle = piece.area.bounds, piece.plane.lift(np.array(piece.area.centroid.coords[0]))
-        for height in storey(piece, levels):
+        for height in (floor, ceiling):
             if np.isfinite(height):
                 at = piece.area.centroid.y + height - middle[2]
                 low, high = min(low, at), max(high, at)
-        area = self.without_shadows(piece.plane, piece.area, (), off, shapely.box(left, low, right, high))
+        within = shapely.box(left, low, right, high)
+        area = self.without_shadows(piece.plane, piece.area, "wall", (), off, clutter_m, within)
         return replace(piece, area=area)
 
     def without_shadows(
-        self, plane: Plane, area: Any, walls: Sequence[Face], things: Mask, within: Any | None = None
+        self,
+        plane: Plane,
+        area: Any,
+        kind: Kind,
+        walls: Sequence[Face],
+        things: Mask,
+        clutter_m: FloatArray,
+        within: Any | None = None,
     ) -> Any:
-        """An area with the places that things hide from all scanners, within its bounds or other ones."""
-        if not self.sights or area.is_empty:
+        """An area with the places that things hide, within its bounds or other ones.
+
+        From the scanners, by the points that are things; where their places are not known, from straight before the
+        plane, by things among the thinned points, which have no strays.
+        """
+        if area.is_empty:
             return area
         within = shapely.envelope(area) if within is None else within
         raster = Raster.around(shapely.get_coordinates(within))
-        _, hidden = returns_and_shadows(
-            self.sights, plane, plane.lift(raster.centres_m), walls, BAND * self.noise_m, things
-        )
-        return raster.grown(area, raster.image(hidden) & raster.covered(within) & ~raster.covered(area))
+        if self.sights:
+            centres, band_m = plane.lift(raster.centres_m), BAND * self.noise_m
+            hidden = raster.image(returns_and_shadows(self.sights, plane, centres, walls, band_m, things)[1])
+        else:
+            hidden = shadows(raster, plane, kind, clutter_m, self.noise_m)
+        return raster.grown(area, hidden & raster.covered(within) & ~raster.covered(area))
 
     def outside(self, walls: Sequence[Face]) -> Mask:
         """Points that scanners saw through openings of walls; none of a scanner that saw much there.
@@ -245,15 +300,15 @@ class _Scan:
         return outside
 
 
-def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float) -> list[Plane]:
-    """Planes fitted to all points, turned to right angles where these allow it, with their axes."""
+def _refined(planes: Sequence[Plane], points: FloatArray, noise_m: float, drift_m: float) -> list[Plane]:
+    """Planes fitted to all points, turned to right angles where these and rounded corners allow it, with their axes."""
     index = [np.flatnonzero(near(plane, points, BAND * noise_m)) for plane in planes]
     claims = np.bincount(np.concatenate([np.empty(0, int), *index]), minlength=len(points))
     chosen = [points[_sole(rows, claims)] for rows in index]
     fitted = [fit(part, np.ones(len(part)), plane, noise_m) for part, plane in zip(chosen, planes, strict=True)]
     fitted = [
         fit(part, np.ones(len(part)), plane, noise_m, normal=plane.normal)
-        for part, plane in zip(chosen, _regular(fitted, noise_m), strict=True)
+        for part, plane in zip(chosen, _regular(fitted, max(noise_m, drift_m)), strict=True)
     ]
     # The axes follow the most certain upright plane.
     heading = next((plane.normal for plane in fitted if abs(plane.normal[2]) < 1e-6), np.array([1.0, 0.0, 0.0]))
@@ -267,7 +322,7 @@ def _sole(rows: IntArray, claims: IntArray) -> IntArray:
     return sole if len(sole) > 0.2 * len(rows) else rows
 
 
-def _regular(planes: Sequence[Plane], noise_m: float) -> list[Plane]:
+def _regular(planes: Sequence[Plane], error_m: float) -> list[Plane]:
     """Planes turned to be level, upright, and parallel or square to earlier planes, each about its centre."""
     up = np.array([0.0, 0.0, 1.0])
     headings: list[FloatArray] = []
@@ -275,9 +330,8 @@ def _regular(planes: Sequence[Plane], noise_m: float) -> list[Plane]:
     for plane in planes:
         side = np.ptp(plane.flat(plane.patches_m.reshape(-1, 3)), axis=0).min()
         # A plane is turned only within the uncertainty of its points: three standard errors of its direction, or one
-        # standard deviation of the noise over its shorter side (edges and neighbours shift a fit by that much). A real
-        # slope stays.
-        error = max(ERRORS * plane.angle_error_rad, noise_m / max(side, noise_m))
+        # error of its edges over its shorter side (these and neighbours shift a fit by that much). A real slope stays.
+        error = max(ERRORS * plane.angle_error_rad, error_m / max(side, error_m))
         tolerance = float(np.clip(error, *TOLERANCE_RANGE_RAD))
         n = plane.normal
         if np.arccos(min(abs(n @ up), 1.0)) < tolerance:

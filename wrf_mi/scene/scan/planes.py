@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, stats
 from scipy.signal import find_peaks
 from scipy.spatial import cKDTree
 from skimage.filters import apply_hysteresis_threshold
@@ -30,6 +30,8 @@ VOXEL_M = 0.03  # edge of the cells: a desk's side still has several
 MOST_VOXELS = 600_000  # the cells of a large building grow until there are no more: bounds time and memory
 NORMAL_RADIUS_M, NORMAL_NEIGHBOURS, FEWEST_NEIGHBOURS = 0.15, 50, 16
 """Radius of the points that tell a normal, and the most and fewest of them; the fewest reach farther where need be."""
+NARROW_RADIUS_M = 0.08
+"""The same of a scan that is as dense everywhere: a wider one reaches the other side of a partition of 10 cm."""
 FEW_SHARE = 0.1  # least share of means with fewer neighbours of a scan that becomes sparse far from its scanner
 STRAY_NEIGHBOURS, STRAY_RATIO = 20, 2.0
 """A mean farther from its neighbours than usual by this many standard deviations is a stray."""
@@ -40,6 +42,10 @@ SEARCH_M = 0.10  # half thickness of a patch in which parallel layers, such as b
 BAND = 3.0  # points within this many standard deviations belong to a plane
 REPEAT = 5.0  # a later plane nearer than this to a parallel plane, in standard deviations, consists of its strays
 PLANAR_SHARE = 0.6  # a patch with fewer of its points in its layers is bent: a chair, a curtain
+CORE, NARROW_CORE = 0.95, 0.5
+"""Share of the points about a patch by which the noise is told. The tails count: noise along the ray is smaller across
+a surface seen at a grazing angle, so the sum over all angles has wide tails. The vertices of a mesh have none, and half
+of them are no points of the other side of a partition."""
 NOISE_RANGE_M = (0.002, 0.04)  # range of the noise: scanner on a tripod to phone
 LAYER_SHARE = 0.2  # least density of a layer relative to the densest layer of its patch
 LAYER_CORE = (0.02, 0.98)  # quantiles of a layer's points that bound it along each axis; the rest may be strays
@@ -81,8 +87,8 @@ class Thinned:
     all_m: FloatArray
 
 
-def thin(points_m: FloatArray) -> Thinned:
-    """Thin a cloud [n, 3] in metres to at most `MOST_VOXELS` means, drop strays and estimate normals."""
+def thin(points_m: FloatArray, radius_m: float = NORMAL_RADIUS_M) -> Thinned:
+    """Thin a cloud [n, 3] in metres to at most `MOST_VOXELS` means, drop strays and estimate normals in a radius."""
     o3d = extra_package("open3d")
     voxel = VOXEL_M
     mean, count = _cells(points_m, voxel)
@@ -93,7 +99,7 @@ def thin(points_m: FloatArray) -> Thinned:
     cloud, rows = cloud.remove_statistical_outlier(STRAY_NEIGHBOURS, STRAY_RATIO)
     if len(rows) < STRAY_NEIGHBOURS:
         raise InputError(f"only {len(rows)} points have neighbours; give a denser point cloud")
-    radius, points = NORMAL_RADIUS_M * voxel / VOXEL_M, np.array(cloud.points)
+    radius, points = radius_m * voxel / VOXEL_M, np.array(cloud.points)
     cloud.translate(OFF_ROUND_M)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius, NORMAL_NEIGHBOURS))
     normals = np.array(cloud.normals)
@@ -114,16 +120,16 @@ def _cells(points_m: FloatArray, voxel_m: float) -> tuple[FloatArray, FloatArray
     return np.stack([np.bincount(inverse, points_m[:, axis]) / count for axis in range(3)], axis=1), count
 
 
-def find_planes(cloud: Thinned) -> tuple[list[Plane], float]:
+def find_planes(cloud: Thinned, core: float = CORE) -> tuple[list[Plane], float]:
     """The planes of a thinned cloud, those of most points first, and the standard deviation of points from them,
-    metres.
+    metres: that of a normal distribution with their distances in a share of the points.
     """
     planes: list[Plane] = []
     free = np.ones(len(cloud.points_m), bool)
     noise = 0.0
     for spread_deg in NORMAL_SPREADS_DEG:
         boxes = _patches(cloud, free, spread_deg)
-        noise = noise or _noise(cloud, boxes)
+        noise = noise or _noise(cloud, boxes, core)
         layers_of_boxes = (layer for box in boxes for layer in _patch_layers(cloud, free, box, noise))
         candidates = [layer for layer in layers_of_boxes if not repeats(layer, planes, REPEAT * noise)]
         if not candidates:
@@ -248,7 +254,7 @@ def _inner(plane: Plane, cloud: Thinned, free: Mask) -> tuple[FloatArray, FloatA
     return plane.distance(cloud.points_m[inside]), cloud.count[inside]
 
 
-def _noise(cloud: Thinned, boxes: Sequence[Any]) -> float:
+def _noise(cloud: Thinned, boxes: Sequence[Any], core: float) -> float:
     """Standard deviation of points from the planes, metres: over the ten largest patches, weighted by area."""
     sized = sorted((_box_plane(box) for box in boxes), key=lambda pair: -pair[1])[:10]
     widths, areas = [], []
@@ -258,9 +264,8 @@ def _noise(cloud: Thinned, boxes: Sequence[Any]) -> float:
         if np.count_nonzero(around) < FEWEST_VOXELS:
             continue
         offsets, count = _inner(_fit_near(cloud, around, plane, NOISE_RANGE_M[1] / 2), cloud, everywhere)
-        # 95 % of a normal distribution lies within 1.96 standard deviations. The tails count: noise along the ray is
-        # smaller across a surface seen at a grazing angle, so the sum over all angles has wide tails.
-        widths.append(np.quantile(np.abs(offsets), 0.95, weights=count, method="inverted_cdf") / 1.96)
+        width = np.quantile(np.abs(offsets), core, weights=count, method="inverted_cdf")
+        widths.append(width / stats.norm.ppf((1 + core) / 2))
         areas.append(area)
     if not widths:
         return NOISE_RANGE_M[0]

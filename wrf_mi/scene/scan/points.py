@@ -49,9 +49,9 @@ STRAY_NEIGHBOURS = 20  # a surface has more returns about each of its own
 STRAY_REACH = 0.05  # radius in which they lie, relative to the distance from the middle of the scan
 FAR_OUT = 3.0
 """Quartile ranges beyond a quartile from which values are far out (Tukey 1977, "Exploratory data analysis")."""
-SAMPLES_PER_FACE, SAMPLES_PER_M2, MOST_SAMPLES = 2, 150, 3_000_000
+SAMPLES_PER_FACE, SAMPLES_PER_M2, MOST_SAMPLES = 2, (150, 2500), 3_000_000
 """Points drawn on a mesh: of more on a face, whose noise is the same, medians would look like layers of a wall; of
-fewer on a square metre no plane is found. The most of them are as many as a large scan has."""
+fewer on a square metre no plane is found, more cost time alone. The most of them are as many as a large scan has."""
 PTX_LINES = 8  # lines of a PTX after columns and rows: position and axes of the scanner, and its pose
 
 Part = tuple[FloatArray, FloatArray | None]
@@ -66,11 +66,13 @@ class Scan:
         points_m: shape [n, 3], metres, z up.
         viewpoints_m: places of the scanners that files state [k, 3], metres.
         viewpoint: number of the viewpoint of each point [n], -1 where it is not stated.
+        walked: whether they were seen on a walk, so that the origin is no place of a scanner.
     """
 
     points_m: FloatArray
     viewpoints_m: FloatArray
     viewpoint: IntArray
+    walked: bool = False
 
 
 def read_points(path: str | Path, units: str | None = None, up: Up | None = None) -> FloatArray:
@@ -133,9 +135,9 @@ def _strays(points: FloatArray, file: Path) -> Mask:
 def sampled_scan(surfaces: Sequence[Surface]) -> Scan:
     """Points on the faces of a measured mesh."""
     corners = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
-    least = int(SAMPLES_PER_M2 * trimesh.triangles.area(corners).sum())
-    count = min(MOST_SAMPLES, max(SAMPLES_PER_FACE * len(corners), least))
-    return Scan(sampled(corners, count), np.empty((0, 3)), np.full(count, -1))
+    least, most = (int(density * trimesh.triangles.area(corners).sum()) for density in SAMPLES_PER_M2)
+    count = min(MOST_SAMPLES, max(min(SAMPLES_PER_FACE * len(corners), most), least))
+    return Scan(sampled(corners, count), np.empty((0, 3)), np.full(count, -1), walked=True)
 
 
 def _parts(file: Path) -> list[Part]:
