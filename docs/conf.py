@@ -47,7 +47,9 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
 autodoc_inherit_docstrings = False  # an attribute that is None would have the docstring of the type of its base's
-autodoc_default_options = {"members": True, "show-inheritance": False}
+# scikit-learn adds these to its estimators, with references to its own site.
+MADE_BY_SKLEARN = "set_predict_request, set_score_request"
+autodoc_default_options = {"members": True, "show-inheritance": False, "exclude-members": MADE_BY_SKLEARN}
 autosummary_generate = True
 # Names of wrf_mi have pages of their own, which those of the packages do not repeat.
 autosummary_context = {"own_pages": ", ".join(wrf_mi.__all__)}

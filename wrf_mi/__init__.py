@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .runs.api import Run, open_run, resume, train
     from .runs.compare import compare
     from .runs.other_models import score_predictions
+    from .runs.regressor import WrfRegressor
     from .runs.scenes import Scene
     from .scene.edit import Move
     from .synthetic import load_record as load
@@ -36,6 +37,7 @@ _HOME = {
     "Scene": "runs.scenes",
     "Split": "core",
     "TraceOptions": "tracing",
+    "WrfRegressor": "runs.regressor",
     "check_data": "apps.checking",
     "compare": "runs.compare",
     "fetch": "datasets",

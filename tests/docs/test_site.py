@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -98,3 +99,38 @@ def test_workflows_have_pinned_actions_few_rights_and_existing_targets(path):
     used = re.findall(r"uses: (.+)$", text, re.MULTILINE)
     assert used
     assert all(PINNED.fullmatch(action) for action in used), used
+
+
+HOUSE = CHECKOUT / ".github"
+FORMS = sorted((HOUSE / "ISSUE_TEMPLATE").glob("*.yml"))
+
+
+@pytest.mark.parametrize("path", FORMS, ids=lambda path: path.stem)
+def test_issue_forms_have_the_keys_that_github_needs(path):
+    """With other keys, or an identifier that is used twice, GitHub does not show the form."""
+    form = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert set(form) <= {"name", "description", "title", "labels", "assignees", "projects", "type", "body"}
+    assert form["name"]
+    assert form["description"]
+    identifiers = [field["id"] for field in form["body"]]
+    assert len(set(identifiers)) == len(identifiers)
+    for field in form["body"]:
+        assert field["type"] in {"input", "textarea", "dropdown", "checkboxes"}
+        assert field["attributes"]["label"]
+    assert any(field.get("validations", {}).get("required") for field in form["body"])
+
+
+def test_links_of_house_files_lead_to_files():
+    for page in HOUSE.glob("*.md"):
+        for target in re.findall(r"\]\(([^)#]+)", page.read_text(encoding="utf-8")):
+            assert (HOUSE / target).is_file(), f"{page.name}: {target}"
+
+
+def test_container_has_all_that_the_package_is_built_from():
+    text = (HOUSE / "Containerfile").read_text(encoding="utf-8")
+    copied = [source for line in re.findall(r"^COPY (.+)$", text, re.MULTILINE) for source in line.split()[:-1]]
+    assert all((CHECKOUT / source).exists() for source in copied)
+    settings = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))
+    needed = settings["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    needed += ["pyproject.toml", "Makefile", ".ci", settings["project"]["readme"]]
+    assert [path for path in needed if not any(Path(path).is_relative_to(source) for source in copied)] == []

@@ -246,8 +246,14 @@ def score_run(run: Path, config: RunConfig, parts: Sequence[FittedPart], scores:
 
     Returns:
         The metrics. With a part that trains on all rows ``n_train`` is their number, and ``cross_validated`` states the
-        folds of the scores: ``folds`` and their mean ``n_train``.
+        folds of the scores: ``folds`` and their mean ``n_train``. Without test rows in any part there are no scores,
+        and no ``predictions.npz``.
     """
+    if not scores:
+        counts = {"task": config.task, "n_train": len(parts[-1].split.all_train), "n_test": 0}
+        unscored = _header(run, config, parts) | counts
+        write_metrics(run, unscored)
+        return unscored
     metrics, arrays = scores[0] if len(scores) == 1 else pool(scores)
     final = parts[-1]
     if not len(final.split.test):
@@ -328,6 +334,11 @@ def _header(folder: Path, config: RunConfig, parts: Sequence[FittedPart]) -> dic
 def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any]) -> None:
     """Write ``predictions.npz`` and then ``metrics.json``, which marks the run as finished."""
     write_predictions(folder / PREDICTIONS, {key: values for key, values in arrays.items() if key not in NOT_STORED})
+    write_metrics(folder, metrics)
+
+
+def write_metrics(folder: Path, metrics: dict[str, Any]) -> None:
+    """Write ``metrics.json``, which marks the run as finished."""
     write_atomically(folder / METRICS, json.dumps(metrics, indent=1) + "\n")
 
 

@@ -205,6 +205,8 @@ def _read_metrics(path: Path) -> dict[str, Any]:
     missing = f"{path.parent}: no {METRICS}, so no finished run; finish it with train --resume"
     with readable(path, missing, REMEDY):
         metrics = json.loads(path.read_text())
+    if metrics.get("n_test") == 0:
+        raise InputError(f"{path.parent}: no test rows, so no scores; train it with a split that has some (--split)")
     needed = ("task", "model", "split", "n_train", "n_test", "ms_per_sample", "train_seconds", "peak_memory_mb")
     _require(path, metrics, needed)
     if metrics["task"] not in TASKS:
