@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ from commands import Command
 from traced_rooms import LENGTH, SHOEBOX, WIDTH, receiver
 from wrf_mi_scenes.build_laboratory import sheet
 
-from wrf_mi.apps.maps import locate_calibration
+from wrf_mi.apps.maps import api, locate_calibration
+from wrf_mi.apps.maps.api import radio_map
 from wrf_mi.apps.maps.grid import candidates_of
 from wrf_mi.apps.maps.locate import locate
 from wrf_mi.apps.maps.locate_calibration import FILE, FOLDER
@@ -26,6 +28,7 @@ from wrf_mi.scene.materials import Materials
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.stages import strengths as of_strengths
 from wrf_mi.stages.fitted import FittedMixture
+from wrf_mi.stages.stage import Option
 from wrf_mi.tracing import TraceOptions, power_map
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi.training.session import Interrupted
@@ -130,6 +133,32 @@ def test_estimates_of_chunks_are_those_of_predictions_one_by_one(anew, traced, m
         np.testing.assert_allclose(located.probability[row], probability, atol=SINGLE_DB)
         expected_m = np.linalg.norm(places[:, None] - places, axis=2) @ probability
         np.testing.assert_allclose(located.tx_pos_m[row], places[expected_m.argmin()])
+
+
+def test_chunks_of_a_map_are_small_only_where_paths_are_traced(run, tmp_path, monkeypatch):
+    """Paths of all receivers are traced together; of a local mean that many chunks would take most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        direct = of_strengths.DIRECT
+        patch.setattr(of_strengths.Mean, "options", lambda self, *given: [Option(direct, partial(self._fit, direct))])
+        data, scene = run.folder.parent / "data", str(run.problem.scene)
+        settings = ("stages=mean,residual",)
+        local = train(data, "hybrid", out=tmp_path / "run", scene=scene, settings=settings)
+    of_chunk, sizes = api._of_chunk, list[int]()
+
+    def counted(run: Run, fitted: Any, positions_m: np.ndarray, *more: Any) -> dict[str, Any]:
+        sizes.append(len(positions_m))
+        return of_chunk(run, fitted, positions_m, *more)
+
+    monkeypatch.setattr(api, "_of_chunk", counted)
+    monkeypatch.setattr(api, "CHUNK_SIZE", 30)
+    for each, most in ((run, 10), (local, 30)):
+        sizes.clear()
+        mapped = radio_map(each, step_m=1.0)
+        assert max(sizes) == most
+        y, x = (axis.ravel() for axis in np.meshgrid(mapped["y"], mapped["x"], indexing="ij"))
+        places = np.column_stack([x, y, np.full(len(x), float(mapped["height"]))])
+        for number, power in enumerate(mapped["power_dbm"].values.reshape(3, -1)):
+            np.testing.assert_allclose(each.predict(places, number).mean, power, atol=SINGLE_DB)
 
 
 def test_estimates_are_as_near_as_noise_allows(anew: Run) -> None:
