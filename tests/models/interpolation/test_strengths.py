@@ -238,6 +238,10 @@ def test_stops_are_thinned_where_factors_would_fill_the_memory(turning, monkeypa
     model = fit_strengths(turning[0], np.arange(150))
     assert len(model.field.stops.poses) == 50
     assert np.median(np.abs(errors(model, turning[0], np.arange(150, 200)))) < 1.5
+    # A receiver's factor has the stops alone that it received: a third of them each fill as much.
+    observed = np.where(np.arange(300) % 3 == np.arange(3)[:, None], turning[0].observation, np.nan)
+    model = fit_strengths(replace(turning[0], observation=observed), np.arange(150))
+    assert len(model.field.stops.poses) == 150
 
 
 def test_folds_exclude_neighbours_in_time() -> None:

@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 HEADINGS = 8  # headings over which the prediction is averaged where the heading is unknown
 CHUNK = 1024  # transmitters predicted together, which bounds the memory of their covariances with the rows
 MOST_COVARIANCES = 2e8
-"""Covariances between stops over all receivers, whose factors take 1.6 GB; with more, stops are thinned."""
+"""Covariances between the stops of each receiver, of all, whose factors take 1.6 GB; with more, stops are thinned."""
 ROBUST_ROUNDS = 2  # rounds of weights for Student-t noise, by the residuals of the one before
 LEAST_HEARD = 4  # receivers with more than a few rows that tell how well the others are predicted from them
 NO_SHADOW_DB = 1e-3  # standard deviation of shadowing where there is none: it has to be above zero
@@ -335,7 +335,9 @@ def _measured(record: Record, rows: IntArray, headings: bool) -> Measured:
 
 def _stops(measured: Measured) -> Stops:
     stops = stops_of(measured, STOP_M, STOP_RAD, STOP_ROWS)
-    return stops.thinned(int(np.sqrt(MOST_COVARIANCES / len(measured.value_dbm))))
+    # Of each receiver the stops that it received count: the hundreds of a building hear a few per cent of them.
+    covariances = np.square(np.isfinite(stops.value_dbm).sum(axis=1, dtype=float)).sum()
+    return stops.thinned(int(len(stops.poses) * min(1.0, np.sqrt(MOST_COVARIANCES / max(covariances, 1.0)))))
 
 
 def _prior(record: Record, measured: Measured, power_map: Traced | None, settings: StrengthSettings) -> PriorMean:
