@@ -222,7 +222,8 @@ def test_first_stage_of_a_training_that_went_further_is_continued_with_all_rows(
 def test_reports_of_held_out_rows_are_those_of_a_fit_without_them() -> None:
     rows, report = np.array([7, 3, 5]), np.arange(3.0)
     reports = HeldOutReports(np.array([0, 0, 1]), rows, report)
-    graph: Any = SimpleNamespace(receivers=None, uses_heading=None, carriers_hz=None, run_sd_db=None, held_out=reports)
+    told = dict.fromkeys(("receivers", "uses_heading", "carriers_hz", "run_sd_db"))
+    graph: Any = SimpleNamespace(**told, traces=True, held_out=reports)
     side = paths.FittedPaths(graph, None)
     assert side.predict_rows(np.array([3, 7]), 0) is None, "a fit to all rows has other predictions"
     side.reports = reports

@@ -31,22 +31,8 @@ SENT = frozenset({"tx", "txpower", "sent", "transmit", "transmitted", "eirp"})
 BESIDE = frozenset({"db", "received", "rx", "mean", "average", "avg", "median", "value", "measured"})
 """Words beside those of strengths in the name of a column that belongs to no particular receiver."""
 RECEIVER = (
-    *(
-        "bssid",
-        "mac",
-        "address",
-        "uuid",
-        "receiver",
-        "rx",
-        "anchor",
-        "gateway",
-        "ap",
-        "beacon",
-        "cell",
-        "cellid",
-        "station",
-    ),
-    *("pci", "node", "device", "ssid", "id", "name"),
+    *("bssid", "mac", "address", "uuid", "receiver", "rx", "anchor", "gateway", "ap", "beacon", "cell"),
+    *("cellid", "station", "pci", "node", "device", "ssid", "id", "name"),
 )
 """Words in the names of columns that tell receivers apart, the most particular first."""
 

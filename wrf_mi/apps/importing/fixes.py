@@ -28,8 +28,7 @@ def without_stale(table: Table, stated: Mapping[str, str]) -> Table:
     if not {"time", "seen"} <= of.keys():
         return table
     written, seen = (seconds(table, of[name], may_be_empty=True) for name in ("time", "seen"))
-    largest = float(np.nanmax(np.abs(written), initial=0.0))
-    age_s = (written - seen) / next((ticks for least, ticks in TICKS.items() if largest > least), 1.0)
+    age_s = (written - seen) / _ticks(written)
     file, name = table.files[0][0].name, of["seen"]
     if np.isfinite(age_s).any() and abs(float(np.nanmedian(age_s))) > CLOCKS_S:
         return replace(table, notes=(*table.notes, f"{file}: {name} is of another clock than {of['time']}: not used"))
@@ -38,6 +37,12 @@ def without_stale(table: Table, stated: Mapping[str, str]) -> Table:
     times = np.where(np.isfinite(seen), seen, written)[~stale]
     frame = table.frame[~stale].assign(**{of["time"]: times})
     return replace(table, frame=frame, notes=(*table.notes, f"{note} {STALE_S:g} s ({name}): left out"))
+
+
+def _ticks(times: FloatArray) -> float:
+    """Ticks in a second of times [n]."""
+    largest = float(np.nanmax(np.abs(times), initial=0.0))
+    return next((ticks for least, ticks in TICKS.items() if largest > least), 1.0)
 
 
 def with_fixes(table: Table, stated: Mapping[str, str]) -> Table:
@@ -93,9 +98,8 @@ def _interpolated(table: Table, of: Mapping[str, str], is_fix: NDArray[np.bool_]
         gap = max(gap, float(np.diff(time_s[fixes]).max(initial=0.0)))
         for name in names:
             values[name][rows] = np.interp(time_s[rows], time_s[fixes], values[name][fixes])
-    ticks = next((count for least, count in TICKS.items() if np.nanmax(np.abs(time_s), initial=0.0) > least), 1.0)
     text = f"{table.files[0][0].name}: positions are in rows of their own ({np.count_nonzero(is_fix & ~heard)}): linear"
-    text += f" between them in time, at most {gap / ticks:.3g} s apart"
+    text += f" between them in time, at most {gap / _ticks(time_s):.3g} s apart"
     if outside := int(np.count_nonzero(heard & ~within)):
         text += f"; {outside} readings before or after them are left out"
     return replace(table, frame=table.frame.assign(**values)[within], notes=(*table.notes, text))
