@@ -21,25 +21,17 @@ from ...core.files import listed, one_line, readable
 from ...core.memory import require_memory
 from ...datasets.folder_files import SINGLE_MAX
 from ...datasets.receivers_file import plain_id
+from . import fields
 from .documents import event_log_of, read_document, read_events, read_messages
-from .fields import MINUS, plain_numbers, thousandths, with_units, without_groups
 from .programs import CELL, POSE_NAMES, QUATERNION, Frame, cell_parts, headerless_form, program_of
-from .separators import NUMBER, SEPARATORS, SPACES, decimal_mark, is_row, separator_below, separator_of, split_line
 from .workbooks import read_sheets
 
 COMMENTS = ("#", "%", "//")
 SAMPLE = 50  # lines from which separator and decimal mark are read
 TEXT_MEMORY, FIELD_MEMORY = 6, 16  # bytes of memory for each byte of a text file and its lines, and for each field
 THIN = "remove columns or thin its rows"
-EMPTY = (
-    "-",
-    "--",
-    "?",
-    "not detected",
-    "not heard",
-    "no signal",
-    "n.d.",
-)  # fields that are empty beside those that pandas knows (NaN, NA, null, None)
+EMPTY = ("-", "--", "?", "not detected", "not heard", "no signal", "n.d.")
+"""Fields that are empty beside those that pandas knows (NaN, NA, null, None)."""
 MOST_FIELDS = 12  # names of columns that a message has at most
 DOCUMENTS = (".json", ".geojson", ".jsonl", ".ndjson", ".yaml", ".yml")
 TRY_COLUMNS = "--columns x=X,y=Y,id=BSSID,rssi=RSSI (names of its columns)"
@@ -101,7 +93,7 @@ class Table:
         texts = values if values.dtype.kind in "biuf" else values.astype(str).str.strip()
         numbers = package("pandas").to_numeric(texts, errors="coerce")
         if texts is not values and (numbers.isna() & values.notna()).any():
-            plain = plain_numbers(texts.where(values.notna()).dropna()).reindex(texts.index)
+            plain = fields.plain_numbers(texts.where(values.notna()).dropna()).reindex(texts.index)
             numbers = package("pandas").to_numeric(plain, errors="coerce")
         numbers = numbers.to_numpy(float, na_value=np.nan)
         wrong = np.isnan(numbers) & values.notna().to_numpy() | (np.abs(numbers) > SINGLE_MAX) & np.isfinite(numbers)
@@ -168,7 +160,7 @@ def read_table(path: str | Path, sheet: str = "", as_is: bool = False) -> Table:
     frame.columns = [str(name).strip() for name in frame.columns]
     _check_names(path, list(frame.columns))
     _check_size(path, len(frame), frame.shape[1])
-    table = Table(with_units(frame), ((path, len(frame)),), (f"{path.name}: {len(frame)} rows{note}",))
+    table = Table(fields.with_units(frame), ((path, len(frame)),), (f"{path.name}: {len(frame)} rows{note}",))
     return _of_program(table, as_is)
 
 
@@ -260,28 +252,28 @@ def _read_text(path: Path, sheet: str) -> Table:
     rows, note_of_tables = _chosen_table(path, rows, first, sheet)
 
     # Separator and decimal mark, without lines above the header.
-    separator, above = separator_below([line for _, line in rows[:SAMPLE]])
+    separator, above = fields.separator_below([line for _, line in rows[:SAMPLE]])
     rows = rows[above:]
-    sample = [split_line(line, separator) for _, line in rows[: SAMPLE - above]]
-    decimal = decimal_mark(sample)
+    sample = [fields.split_line(line, separator) for _, line in rows[: SAMPLE - above]]
+    decimal = fields.decimal_mark(sample)
 
     # The header is the first line, the comment above it, or absent.
     header, named = "in its first line", sample[0]
-    if is_row(named, decimal):
-        header, named = "in a comment", split_line(comment.lstrip("#%/ "), separator)
-        if len(named) != len(sample[0]) or is_row(named, decimal):
+    if fields.is_row(named, decimal):
+        header, named = "in a comment", fields.split_line(comment.lstrip("#%/ "), separator)
+        if len(named) != len(sample[0]) or fields.is_row(named, decimal):
             header, named = "absent", [str(number + 1) for number in range(len(sample[0]))]
     names = [name.strip() or f"column_{number + 1}" for number, name in enumerate(named)]
     _check_names(path, names)
 
     # Fields: pandas fills missing ones silently.
     program = program_of(names)
-    for index, (number, line) in enumerate(rows) if separator != SPACES else ():
-        if (fields := line.count(separator) + 1) != len(names) and '"' not in line:
-            if program is not None and program.free in names and fields > len(names):
-                rows[index] = number, _quoted(line, separator, names.index(program.free), fields - len(names))
+    for index, (number, line) in enumerate(rows) if separator != fields.SPACES else ():
+        if (count := line.count(separator) + 1) != len(names) and '"' not in line:
+            if program is not None and program.free in names and count > len(names):
+                rows[index] = number, _quoted(line, separator, names.index(program.free), count - len(names))
                 continue
-            text = f"{fields} fields, but the first line has {len(names)}"
+            text = f"{count} fields, but the first line has {len(names)}"
             shown = one_line(", ".join(names[:MOST_FIELDS]))
             remedy = "correct or remove the line, or write a row for each reading with a header and give"
             raise DataFault(path, f"{text} ({shown}); {remedy} {TRY_COLUMNS}", line=number)
@@ -293,23 +285,23 @@ def _read_text(path: Path, sheet: str) -> Table:
         options |= {"header": None, "index_col": False, "na_values": EMPTY, "skipinitialspace": True}
         frame = package("pandas").read_csv(io.StringIO(content), **options, low_memory=False)
         note_of_marks = ""
-        if doubtful := thousandths(frame):
+        if doubtful := fields.thousandths(frame):
             texts = package("pandas").read_csv(io.StringIO(content), **options, usecols=doubtful, dtype=str)
-            frame, note_of_marks = without_groups(path, frame, texts, decimal)
+            frame, note_of_marks = fields.without_groups(path, frame, texts, decimal)
 
     # What was recognised, in words.
-    form = f"separated by {SEPARATORS.get(separator, 'blanks')}" + ", decimal comma" * (decimal == ",")
+    form = f"separated by {fields.SEPARATORS.get(separator, 'blanks')}" + ", decimal comma" * (decimal == ",")
     form += f", encoding {encoding}" * (encoding != "utf-8-sig")
     note = f"{path.name}: {len(frame)} rows, {form}, header {header}"
     note += f"; {above} lines above it are left out" * bool(above) + note_of_tables + note_of_marks
-    return Table(with_units(frame), ((path, len(frame)),), (note,), header != "absent")
+    return Table(fields.with_units(frame), ((path, len(frame)),), (note,), header != "absent")
 
 
 def _quoted(line: str, separator: str, column: int, surplus: int) -> str:
     """A line whose field of free text has the separator in it, with this field in quotes."""
-    fields = line.split(separator)
-    text = separator.join(fields[column : column + surplus + 1]).strip()
-    return separator.join([*fields[:column], f'"{text}"', *fields[column + surplus + 1 :]])
+    parts = line.split(separator)
+    text = separator.join(parts[column : column + surplus + 1]).strip()
+    return separator.join([*parts[:column], f'"{text}"', *parts[column + surplus + 1 :]])
 
 
 def _chosen_table(
@@ -319,9 +311,13 @@ def _chosen_table(
 
     A table begins with a header, which is the first line or follows a blank one.
     """
-    headers = {row: split_line(rows[row][1], separator_of([rows[row][1]])[0]) for row in sorted({0, *first})}
+    headers = {
+        row: fields.split_line(rows[row][1], fields.separator_of([rows[row][1]])[0]) for row in sorted({0, *first})
+    }
     starts = [
-        row for row, names in headers.items() if row == 0 or (len(names) > 1 and not any(map(NUMBER.fullmatch, names)))
+        row
+        for row, names in headers.items()
+        if row == 0 or (len(names) > 1 and not any(map(fields.NUMBER.fullmatch, names)))
     ]
     if len(headers[0]) == 1:  # lines above the header
         starts = starts[:1]
@@ -330,7 +326,7 @@ def _chosen_table(
     counts = {name: len(lines) - 1 for name, lines in tables.items()}
     if len(tables) == 1:
         return rows, ""
-    known = [name for name, lines in tables.items() if program_of(split_line(lines[0][1], ","))]
+    known = [name for name, lines in tables.items() if program_of(fields.split_line(lines[0][1], ","))]
     name = _chosen_sheet(path, counts, sheet or (known[0] if known else ""))
     others = listed([f"{one_line(other)} ({counts[other]} rows)" for other in tables if other != name])
     return tables[name], f"; tables that are left out, by their first column (--sheet): {others}"
@@ -345,7 +341,7 @@ def _of_rows(path: Path, rows: Sequence[Mapping[str, Any]], image: str = "", lef
     _check_size(path, len(frame), frame.shape[1])
     note = f"{path.name}: {len(frame)} rows" + f", points of {image}" * bool(image)
     note += f"; {left_out} lines of other topics are left out" * bool(left_out)
-    return Table(with_units(frame), ((path, len(frame)),), (note,), image=image)
+    return Table(fields.with_units(frame), ((path, len(frame)),), (note,), image=image)
 
 
 def _decoded(path: Path) -> tuple[str, str]:
@@ -358,5 +354,5 @@ def _decoded(path: Path) -> tuple[str, str]:
     for encoding in ["utf-8-sig", "cp1252"] if wide is None else [wide]:
         with suppress(UnicodeDecodeError):
             text = content.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
-            return encoding, text.replace(MINUS, "-")
+            return encoding, text.replace(fields.MINUS, "-")
     raise DataFault(path, "not text; save it as UTF-8")

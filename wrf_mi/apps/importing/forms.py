@@ -12,20 +12,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 
+import numpy as np
+
 from ...core import DataFault, InputError
 from ...core.files import listed, one_line
 from ...datasets.unknown import STRENGTH, long_columns, name_words, preferred
-from .column_names import DIGITS, QUANTITIES, SERVING, ColumnName, unit_of
+from ...scene.coordinates import is_geographic
+from .column_names import DIGITS, LOWEST_DBM, METRES, NEVER_STRENGTHS, PIXELS, QUANTITIES, SERVING, ColumnName, unit_of
 from .files import Frame, Table, package
-from .suggestions import has_addresses, is_dbm, planar_columns, suggested_columns, tells_receivers
+from .programs import MAC
 
 AFFIXES = ("", "coord", "coordinate", "pos", "position", "loc", "location", "point", "p", "gt", "true", "tag")
 """Words before or after x, y and z in names of coordinates."""
-AXES = {
-    "x": "|easting|east|ecoord|rechtswert|este|ostwert",
-    "y": "|northing|north|ncoord|hochwert|norte|nordwert",
-    "z": "|height",
-}
+AXES = {"x": "|easting|east|ecoord|rechtswert|este", "y": "|northing|north|ncoord|hochwert|norte", "z": "|height"}
 MEANINGS = {
     **{axis: "|".join(f"{affix}{axis}|{axis}{affix}" for affix in AFFIXES) + other for axis, other in AXES.items()},
     "lat": "lat|latitude|gpslat|gpslatitude|currentlatitude|latitud|breite|breitengrad",
@@ -42,6 +41,24 @@ MEANINGS = {
 STATED = (*MEANINGS, "id", "rssi", "cell")  # meanings of `parsed_columns`
 ROWS = "write a row for each reading"
 MOST_TEXTS = 0.5  # share of negative numbers above which a text in a column is a fault
+BESIDE = QUANTITIES | {
+    "channel",
+    "frequency",
+    "freq",
+    "time",
+    "timestamp",
+    "speed",
+    "accuracy",
+    "altitude",
+    "id",
+    "index",
+}
+"""Words in the names of columns that are no positions."""
+AXIS_WORDS = (
+    ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"}),
+    ({"x", "east", "easting", "este"}, {"y", "north", "northing", "norte"}),
+)
+"""Words in the names of columns of both axes."""
 FEWEST_SLOTS = 2
 MOST_SHOWN = 6
 
@@ -123,26 +140,81 @@ def _refuse_pooling(table: Table, columns: Columns, receivers: Sequence[str]) ->
     """Refuse columns of strengths of several receivers, which another column names."""
     if not columns.strengths or receivers:
         return
-    one_column = len(columns.strengths) == 1
-    tellers = [name for name in columns.kept if tells_receivers(table, name)]
-    if one_column and not tellers:  # names that differ from row to row at one place
-        pair = next((pair for pair in (("x", "y"), ("lon", "lat")) if set(pair) <= columns.of.keys()), None)
-        plane = [columns.of[name] for name in pair] if pair else planar_columns(table, columns.of)
-        keys = [*plane, *(columns.of[name] for name in ("time",) if name in columns.of)]
+    strength, of = next(iter(columns.strengths)), columns.of
+    tellers = [name for name in columns.kept if _tells_receivers(table, name)]
+    if len(columns.strengths) > 1:
+        tellers = [name for name in tellers if _has_addresses(table, name) and table.frame[name].nunique() > 1]
+    elif not tellers:  # names that differ from row to row at one place
+        pair = next((pair for pair in (("x", "y"), ("lon", "lat")) if set(pair) <= of.keys()), ())
+        keys = [of[name] for name in (*pair, "time") if name in of] + ([] if pair else _planar(table, of))
         texts = [name for name in columns.kept if table.frame[name].astype(str).str.contains("[A-Za-z]").all()]
-        groups = [table.frame.groupby(keys)[name].nunique() for name in texts if keys]
-        tellers = [name for name, counts in zip(texts, groups, strict=False) if counts.median() > 1]
-    tellers = (
-        tellers
-        if one_column
-        else [name for name in tellers if has_addresses(table, name) and table.frame[name].nunique() > 1]
-    )
+        tellers = [name for name in texts if keys and table.frame.groupby(keys)[name].nunique().median() > 1]
     if tellers:
-        strength = next(iter(columns.strengths))
         text = f"{one_line(tellers[0])} has names, {one_line(strength)} strengths"
-        stated = columns.of | {"id": tellers[0], "rssi": strength}
+        stated = of | {"id": tellers[0], "rssi": strength}
         remedy = f"give --columns {suggested_columns(table, stated)}, or --receivers {shlex.quote(one_line(strength))}"
         raise DataFault(table.files[0][0], f"{text}: readings of several receivers, or of one; {remedy}", line=1)
+
+
+def suggested_columns(table: Table, of: Mapping[str, str], meanings: Sequence[str] = ("x", "y", "id", "rssi")) -> str:
+    """Text of ``--columns`` for a table, by the values of its columns; "" where a meaning has no likely one.
+
+    Positions are left out where no two columns may be them.
+    """
+    free = [name for name in table.frame.columns if name not in of.values()]
+    numeric = [name for name in free if table.is_numeric(name)]
+    texts = [name for name in free if name not in numeric]
+    addresses = [name for name in texts if _has_addresses(table, name)]
+    tellers = [name for name in texts if _tells_receivers(table, name)]
+    repeated = [name for name in texts if 1 < table.frame[name].nunique() < len(table)]
+    strengths = [name for name in numeric if _is_dbm(table, name)]
+    planar = _planar(table, of)
+    likely = {"x": planar, "y": planar[1:], "id": [*addresses, *tellers, *repeated], "rssi": strengths}
+    chosen = {meaning: of.get(meaning) or next(iter(likely[meaning]), "") for meaning in meanings}
+    if {"x", "y"} <= of.keys() or {"lon", "lat"} <= of.keys() or not (chosen.get("x") and chosen.get("y")):
+        chosen = {meaning: name for meaning, name in chosen.items() if meaning not in ("x", "y")}
+    elif is_geographic(np.column_stack([table.numbers(chosen[axis]) for axis in "xy"])):  # as most tables order them
+        chosen = {{"x": "lat", "y": "lon"}.get(meaning, meaning): name for meaning, name in chosen.items()}
+    if not chosen or not all(chosen.values()):
+        return ""
+    return shlex.quote(one_line(",".join(f"{meaning}={name}" for meaning, name in chosen.items())))
+
+
+def _planar(table: Table, of: Mapping[str, str]) -> list[str]:
+    """Two columns of numbers that may be positions in a plane, by their names or else values; none without."""
+    numeric = [name for name in table.frame.columns if name not in of.values() and table.is_numeric(name)]
+    for pair in AXIS_WORDS:
+        named = [[name for name in numeric if name_words(name) & words] for words in pair]
+        if all(named):
+            return [max(group, key=lambda name: table.frame[name].nunique()) for group in named]
+    names = [name for name in numeric if table.frame[name].nunique() > 1 and not _is_dbm(table, name)]
+    names = [name for name in names if not name_words(name) & BESIDE]
+    names = [name for name in names if unit_of(name) in ("", *METRES, *PIXELS, "deg", "degrees")]
+    for name in names if len(names) > 2 else ():  # counts and times
+        values = table.numbers(name)
+        if len(names) > 2 and (values == np.round(values)).all() and (np.diff(values) >= 0).all():
+            names = [other for other in names if other != name]
+    return names[:2] if len(names) > 1 else []
+
+
+def _has_addresses(table: Table, name: str) -> bool:
+    """Whether a column has hardware addresses."""
+    texts = table.frame[name].dropna().astype(str).str.strip()
+    return bool(texts.str.fullmatch(MAC.pattern, case=False).any())
+
+
+def _tells_receivers(table: Table, name: str) -> bool:
+    """Whether a column has addresses, or several names under a heading of receivers."""
+    return _has_addresses(table, name) or (ColumnName(name).is_identity and table.frame[name].nunique() > 1)
+
+
+def _is_dbm(table: Table, name: str) -> bool | None:
+    """Whether a column holds strengths; None where nothing was heard."""
+    if not table.is_numeric(name):
+        return False
+    values = np.unique(table.numbers(name))
+    values = values[~np.isnan(values) & ~np.isin(values, list(NEVER_STRENGTHS)) & (values > LOWEST_DBM)]
+    return bool(values[-1] < 0) if len(values) else None
 
 
 def shown_names(names: Sequence[str]) -> str:
@@ -181,7 +253,7 @@ def _readings(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Colu
         return None
     chosen = {"id": of.get("id", long[0]), "rssi": of.get("rssi", long[1])}
     if "id" not in of and "ssid" in name_words(chosen["id"]):  # a network that several access points have
-        addresses = [name for name in table.frame.columns if is_free(name) and has_addresses(table, name)]
+        addresses = [name for name in table.frame.columns if is_free(name) and _has_addresses(table, name)]
         chosen["id"] = addresses[0] if addresses else chosen["id"]
     return Columns(chosen | {meaning: name for meaning, name in of.items() if name not in chosen.values()})
 
@@ -209,7 +281,7 @@ def _by_values(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Col
     by_stem: dict[str, list[bool | None]] = {}
     names = [] if patterns else [name for name in table.frame.columns if name not in of.values()]
     for name in names:
-        by_stem.setdefault(ColumnName(name).stem, []).append(is_dbm(table, name))
+        by_stem.setdefault(ColumnName(name).stem, []).append(_is_dbm(table, name))
     stems = {stem for stem, verdicts in by_stem.items() if any(verdicts) and False not in verdicts}
     columns = map(ColumnName, names)
     return _wide(of, [column.text for column in columns if column.stem in stems and not column.words & QUANTITIES])

@@ -16,8 +16,7 @@ from ...core.files import listed, one_line
 from ...scene.coordinates import LATITUDE, LONGITUDE, is_geographic, local_projection
 from .column_names import METRES, unit_of
 from .files import Table, package
-from .forms import named_columns, shown_names
-from .suggestions import suggested_columns
+from .forms import named_columns, shown_names, suggested_columns
 
 DEGREES = "EPSG:4326"
 FAR_M = 10_000.0  # largest coordinate without a shift: single precision resolves a millimetre to 16 km
@@ -278,13 +277,15 @@ def with_positions(values: Table, positions: Table, stated: Mapping[str, str]) -
     if not is_path:
         return _interpolated(values, time, positions, other_time, new)
     # Paths of several devices: each at its own times.
-    frames, key = [], shared[0]
-    for name, rows in values.frame.groupby(key, sort=False):
-        of_name = positions.frame[positions.frame[key].astype(str) == str(name)]
-        if not len(of_name):
-            raise DataFault(positions.files[0][0], f"no row has {one_line(key)} {one_line(name)}; give its positions")
-        pair = replace(values, frame=rows), replace(positions, frame=of_name)
-        frames.append(_interpolated(pair[0], time, pair[1], other_time, new)[0].frame)
+    key = shared[0]
+    if lacking := set(values.frame[key]) - set(positions.frame[key]):
+        raise DataFault(positions.files[0][0], f"no row has {one_line(key)} {one_line(lacking.pop())}; give its path")
+    paths = positions.frame.groupby(key)
+    pairs = [(rows, paths.get_group(name)) for (name,), rows in values.frame.groupby([key])]
+    frames = [
+        _interpolated(replace(values, frame=rows), time, replace(positions, frame=path), other_time, new)[0].frame
+        for rows, path in pairs
+    ]
     frame = package("pandas").concat(frames).sort_index(kind="stable")
     return replace(values, frame=frame), f"by time, linear between positions of one {one_line(key)}"
 

@@ -214,10 +214,7 @@ EVENT_LOGS = (
         kind=0,
         time=1,
         radios={"WIFI": "WIFI"},
-        fields={
-            "POSI": {"lat": 3, "lon": 4, "floor": 5},
-            "WIFI": {"ssid": 3, "bssid": 4, "rssi": -1},
-        },
+        fields={"POSI": {"lat": 3, "lon": 4, "floor": 5}, "WIFI": {"ssid": 3, "bssid": 4, "rssi": -1}},
     ),
 )
 """Logs of the Indoor Location Competition 2.0, and of the IPIN competitions, whose WIFI has a frequency or not."""

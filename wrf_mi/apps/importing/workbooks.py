@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -51,12 +50,10 @@ def _header(rows: list[list[Any]]) -> tuple[int, list[str] | None]:
         if len(names) < max(2, FILLED * widest) or not all(isinstance(name, str) for name in names):
             continue
         above = rows[number - 1] if number else [None] * len(row)
-        count = Counter(names)
-        texts = [
-            f"{upper} {cell}" if count[cell] > 1 and upper is not None else cell
-            for upper, cell in zip(above, row, strict=True)
+        named = [
+            f"{upper} {cell}" if names.count(cell) > 1 and upper is not None else cell or f"column_{index}"
+            for index, (upper, cell) in enumerate(zip(above, row, strict=True), start=1)
         ]
-        named = [text or f"column_{index + 1}" for index, text in enumerate(texts)]
         if len(set(named)) == len(named):
             return number, named
     return 0, None
