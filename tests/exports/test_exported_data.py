@@ -333,7 +333,7 @@ def assert_rounded(rounded: np.ndarray, read: np.ndarray) -> None:
     assert distance_m.min(axis=1).max() < COMPRESSED_M
     same = distance_m.argmin(axis=1)
     alpha = [1 / (1 + np.exp(-part["opacity"].astype(float))) for part in (rounded[same], read)]
-    np.testing.assert_allclose(*alpha, atol=1 / 255)
+    np.testing.assert_allclose(alpha[0], alpha[1], atol=1 / 255)
     turns = [np.stack([part[f"rot_{k}"] for k in range(4)]) for part in (rounded[same], read)]
     np.testing.assert_allclose(np.abs((turns[0] * turns[1]).sum(axis=0)), 1, atol=1e-5)
     for column, bits in [(f"scale_{k}", 10) for k in range(3)] + [(f"f_dc_{k}", 8) for k in range(3)]:

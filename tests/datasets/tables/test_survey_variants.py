@@ -52,7 +52,7 @@ def test_marks_of_thousands_are_no_decimals(case: str, tmp_path: Path) -> None:
 
 
 def test_decimals_of_three_digits_stay_decimals(tmp_path: Path) -> None:
-    text = "x,y,bssid,rssi\n" + "".join(f"{x + 0.125:g},{x:g},a,-50\n" for x in (1.0, 2.0, 2.875, 4.875))
+    text = "x,y,bssid,rssi\n" + "".join(f"{x + 0.125:g},{x:g},a,{-50 - x:g}\n" for x in (1.0, 2.0, 2.875, 4.875))
     assert set(strengths(imported(tmp_path, written(tmp_path, "t.csv", text)).record)["a"]) == {
         (1.125, 1.0),
         (2.125, 2.0),
@@ -129,6 +129,7 @@ def readings(header: str, *beside: str) -> str:
 
 
 TABLES = {
+    "tags that move": readings("x,y,tag_mac,node,rssi", "de:ad:be:ef:00:01"),
     "network before address": readings("x,y,ssid,hw,rssi", "net"),
     "access point": readings("X,Y,Access Point,Signal (dBm)"),
     "noise in dBm": readings("X,Y,Noise (dBm),BSSID,Signal (dBm)", "-95"),
@@ -177,6 +178,10 @@ REFUSED = {
         + f"{A},net,-50,48,11\n" * 3
         + f"{A},a, b,-50,48,11\n",
         r"line 6: 6 fields, but the first line has 5 \(MAC, SSID",
+    ),
+    "two phones": (
+        f"x,y,phone_mac,AP1,AP2\n0,0,{A},-50,-51\n1,0,{B},-60,-61\n",
+        r"phone_mac has names, AP1 strengths.*, or --columns run=phone_mac \(what moved\)",
     ),
     "roles": (
         "BSSID,Power,LocalTime,GPSTime,Latitude,Longitude,Type\na,-50,1,1,48,11,AP\nb,-60,1,1,48,11,Client\n",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -109,9 +110,9 @@ def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, A
     comments = [f"Gaussians of a radio field ({run.config.model}) for the transmitter at {where} m; metres, z up"]
     comments.append(f"colour: magnitude of the signal, viridis over {RANGE_DB:g} dB below the strongest")
     comments.append("signal_re_k + j signal_im_k: complex signals; time factor exp(+j omega t)")
-    is_packed = out.name.lower().endswith(PACKED)
-    write_atomically(out, _ply(comments, **(_packed(columns) if is_packed else {"vertex": columns})))
-    return {"Gaussians": len(columns["x"])} | ({} if is_packed else {"properties": len(columns)})
+    elements = _packed(columns) if out.name.lower().endswith(PACKED) else {"vertex": columns}
+    write_atomically(out, _ply(comments, **elements))
+    return {"Gaussians": len(columns["x"]), "properties": len(elements["vertex"])}
 
 
 def _ply(comments: Sequence[str], **elements: Mapping[str, FloatArray]) -> bytes:
@@ -125,7 +126,7 @@ def _ply(comments: Sequence[str], **elements: Mapping[str, FloatArray]) -> bytes
     return "\n".join([*header, "end_header", ""]).encode() + content
 
 
-def _packed(columns: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatArray]]:
+def _packed(columns: Mapping[str, FloatArray]) -> dict[str, dict[str, Any]]:
     """Elements of PlayCanvas' compressed PLY: bounds of each 256 neighbours, and attributes as shares of them.
 
     https://github.com/playcanvas/splat-transform; `columns` as of `splat_columns`, whose further ones it cannot hold.
@@ -142,12 +143,9 @@ def _packed(columns: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatArray
     least, most = (bounds.astype(np.float32) for bounds in (chunks.min(axis=2), chunks.max(axis=2)))
     size = np.where(most > least, most - least, 1)[..., None]
     shares = ((chunks - least[..., None]) / size).clip(0, 1).reshape(len(values), -1)[:, :count]
-    bounds = [
-        (f"{name}_{axis}", row)
-        for k in (0, 3, 6)
-        for name, rows in (("min", least), ("max", most))
-        for axis, row in zip(BOUNDED[k : k + 3], rows[k : k + 3], strict=True)
-    ]
+    bounds: dict[str, Any] = {}
+    for k, (name, rows) in product((0, 3, 6), (("min", least), ("max", most))):
+        bounds |= {f"{name}_{BOUNDED[row]}": rows[row] for row in range(k, k + 3)}
     # Of a quaternion of length 1 its largest component is left out, which is made positive.
     rotation = np.stack([columns[f"rot_{k}"] for k in range(4)])[:, order]
     largest = np.abs(rotation).argmax(axis=0)
@@ -160,10 +158,10 @@ def _packed(columns: Mapping[str, FloatArray]) -> dict[str, dict[str, FloatArray
         "packed_scale": _bits(shares[3:6], 11, 10, 11),
         "packed_color": _bits([*shares[6:], alpha], 8, 8, 8, 8),
     }
-    return {"chunk": dict(bounds), "vertex": packed}
+    return {"chunk": bounds, "vertex": packed}
 
 
-def _bits(shares: Iterable[FloatArray], *widths: int) -> FloatArray:
+def _bits(shares: Iterable[FloatArray], *widths: int) -> Any:
     """Numbers in 0..1 side by side in 32 bits, the first one in the highest."""
     numbers = np.zeros((), np.uint32)
     for values, width in zip(shares, widths, strict=True):

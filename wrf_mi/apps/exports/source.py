@@ -131,8 +131,7 @@ def write_pictures(source: Source, out: Path, options: ExportOptions) -> dict[st
     if record.task.name != "spectrum":
         raise InputError(f"{source.name}: a data set of {record.task}; format png takes spectra")
     white_db = 20 * np.log10(record.observation.max() or 1.0)
-    with np.errstate(divide="ignore"):
-        share = 1 + (20 * np.log10(record.observation) - white_db) / PICTURE_DB
+    share = 1 + (20 * np.log10(record.observation.clip(np.finfo(np.float32).tiny)) - white_db) / PICTURE_DB
     with atomic_folder(out, options.replace) as part:
         for receiver, images in zip(record.receivers, np.rint(255 * share.clip(0, 1)).astype(np.uint8), strict=True):
             (part / receiver.name).mkdir()

@@ -119,8 +119,9 @@ def are_groups(texts: Frame, mark: str) -> bool | None:
     texts = texts.dropna().str.strip()
     is_marked = texts.str.contains(mark, regex=False)
     marked, is_whole = texts[is_marked], texts[~is_marked].str.fullmatch(r"[+-]?[1-9]\d{0,2}")
-    if not (len(marked) and is_whole.any() and marked.str.fullmatch(rf"[+-]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+").all()):
-        return False
+    is_grouped = marked.str.fullmatch(rf"[+-]?[1-9]\d{{0,2}}(?:\{mark}\d{{3}})+")
+    if texts.str.startswith("-").all() or not (len(marked) and is_whole.any() and is_grouped.all()):
+        return False  # strengths are all negative
     if marked.str.endswith("0").any() or marked.str.count(rf"\{mark}").max() > 1:
         return True
     return None if marked.nunique() >= FEWEST_GROUPS else False

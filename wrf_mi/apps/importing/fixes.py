@@ -92,8 +92,7 @@ def _interpolated(table: Table, of: Mapping[str, str], is_fix: NDArray[np.bool_]
         within[rows] = (time_s[rows] >= time_s[fixes[0]]) & (time_s[rows] <= time_s[fixes[-1]])
         gap = max(gap, float(np.diff(time_s[fixes]).max(initial=0.0)))
         if "floor" in of:  # that of the fix before
-            before = fixes[np.searchsorted(time_s[fixes], time_s[rows], side="right").clip(1) - 1]
-            floors[rows] = floors[before]
+            floors[rows] = floors[fixes[np.searchsorted(time_s[fixes], time_s[rows], side="right").clip(1) - 1]]
         for name in names:
             values[name][rows] = np.interp(time_s[rows], time_s[fixes], values[name][fixes])
     text = f"{table.files[0][0].name}: positions are in rows of their own ({np.count_nonzero(is_fix & ~heard)}): linear"

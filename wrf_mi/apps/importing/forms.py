@@ -121,28 +121,23 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
             return columns
     if len(names) == 1:
         raise DataFault(table.files[0][0], f"no table; {ROWS} with a header, such as x,y,bssid,rssi", line=1)
-    for name in names:  # a text among strengths
-        numbers = package("pandas").to_numeric(table.frame[name], errors="coerce")
-        if (
-            name not in of.values()
-            and table.frame[name].dtype.kind not in "biufM"
-            and numbers.lt(0).mean() > MOST_TEXTS
-        ):
+    for name, values in table.frame.drop(columns=list(of.values()), errors="ignore").items():
+        is_text = values.dtype.kind not in "biufM"  # one among strengths
+        if is_text and package("pandas").to_numeric(values, errors="coerce").lt(0).mean() > MOST_TEXTS:
             table.numbers(name)
     text, suggested = f"no column of signal strengths among {shown_names(names)}", suggested_columns(table, of)
     remedy = f"try --columns {suggested}" if suggested else f"{ROWS}, with strengths in dBm"
-    raise DataFault(
-        table.files[0][0], f"{text}; {remedy}, or --receivers 'PATTERN*' for a column of each receiver", line=1
-    )
+    remedy += ", or --receivers 'PATTERN*' for a column of each receiver"
+    raise DataFault(table.files[0][0], f"{text}; {remedy}", line=1)
 
 
 def _refuse_pooling(table: Table, columns: Columns, receivers: Sequence[str]) -> None:
     """Refuse columns of strengths of several receivers, which another column names."""
     if not columns.strengths or receivers:
         return
-    strength, of = next(iter(columns.strengths)), columns.of
+    strength, of, one = next(iter(columns.strengths)), columns.of, len(columns.strengths) == 1
     tellers = [name for name in columns.kept if _tells_receivers(table, name)]
-    if len(columns.strengths) > 1:
+    if not one:
         tellers = [name for name in tellers if _has_addresses(table, name) and table.frame[name].nunique() > 1]
     elif not tellers:  # names that differ from row to row at one place
         pair = next((pair for pair in (("x", "y"), ("lon", "lat")) if set(pair) <= of.keys()), ())
@@ -152,7 +147,8 @@ def _refuse_pooling(table: Table, columns: Columns, receivers: Sequence[str]) ->
     if tellers:
         text = f"{one_line(tellers[0])} has names, {one_line(strength)} strengths"
         stated = of | {"id": tellers[0], "rssi": strength}
-        remedy = f"give --columns {suggested_columns(table, stated)}, or --receivers {shlex.quote(one_line(strength))}"
+        other = f"--receivers {shlex.quote(strength)}" if one else f"--columns run={tellers[0]} (what moved)"
+        remedy = f"give --columns {suggested_columns(table, stated)}, or {one_line(other)}"
         raise DataFault(table.files[0][0], f"{text}: readings of several receivers, or of one; {remedy}", line=1)
 
 
@@ -248,8 +244,9 @@ def _readings(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Colu
         return name not in of.values() or column.plain == "level"
 
     alias = {of[meaning]: word for meaning, word in (("id", "bssid"), ("rssi", "rssi")) if meaning in of}
-    long = long_columns([alias.get(name, name) for name in table.frame.columns if name in alias or is_free(name)])
-    if long is None:
+    names = [alias.get(name, name) for name in table.frame.columns if name in alias or is_free(name)]
+    anchors = [name for name in names if "tag" not in name_words(name) or ColumnName(name).is_strength]  # tags move
+    if (long := long_columns(anchors) or long_columns(names)) is None:
         return None
     chosen = {"id": of.get("id", long[0]), "rssi": of.get("rssi", long[1])}
     if "id" not in of and "ssid" in name_words(chosen["id"]):  # a network that several access points have

@@ -29,8 +29,8 @@ def read_sheets(path: Path) -> dict[str, tuple[Frame, int]]:
                 sheets[name] = pandas.read_excel(book, sheet_name=name), 0
                 continue
             frame = pandas.read_excel(book, sheet_name=name, header=None, skiprows=above + 1)
-            frame = frame.reindex(columns=cells.columns).set_axis(names, axis=1)
-            sheets[name] = frame.dropna(how="all").reset_index(drop=True), above
+            frame = frame.reindex(columns=cells.columns).set_axis(names, axis=1).dropna(how="all")
+            sheets[name] = frame.reset_index(drop=True), above
     return sheets
 
 
