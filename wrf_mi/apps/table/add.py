@@ -19,6 +19,7 @@ from ...runs.compare_page import command
 from ...runs.folder import CONFIG, PREDICTIONS, RunConfig, is_finished, known_config, stored_versions
 from ...runs.other_models import score_predictions
 from ...runs.results import REMEDY, STD_MEAN, Results, read_run
+from ...runs.sweep import dataset_files
 from ...synthetic import load_record
 from .entries import ALL_ROWS, entry_of, predictions_digest, read_entries, write_entry
 from .sources import faults_of, read_sources, source_of
@@ -64,17 +65,16 @@ def add_entry(
         folder = Path(predictions)
         if (folder / CONFIG).exists():
             run, known = _of_run(folder)
-            data = data or run.dataset
+            source, _ = source_of(table, data or run.dataset)
             stated = known | stated
             method = method or str(run.metrics["model"])
         else:
             if data is None or method is None:
                 raise InputError(f"{predictions}: predictions of another program need --dataset and --method")
-            folder = Path(place) / "run"
-            score_predictions(data, predictions, folder, method, split, n_train, seed)
+            folder, (source, record) = Path(place) / "run", source_of(table, data)
+            score_predictions(record, predictions, folder, method, split, n_train, seed)
             run = read_run(folder)
             stated = {"split": split, "share": ALL_ROWS if n_train is None else n_train, "seed": seed} | stated
-        source, _ = source_of(table, data)
         if (config := known_config(folder)) is not None:
             stated = {"command": command(config_in_table(config, source.name), Path("RUN"))} | stated
         digest = predictions_digest(run)
@@ -118,6 +118,8 @@ def faults(table: Path) -> Iterator[str]:
     records: dict[str, Any] = {}
     for source in sources.values():
         try:
+            if not dataset_files(source.name):  # it would be traced for minutes
+                continue
             records[source.name] = load_record(source.name)
         except InputError:
             continue

@@ -144,7 +144,7 @@ def table_page(table: Path) -> str:
     asked = {question: groups for question, groups in questions.items() if groups}
     links = " · ".join(f'<a href="#q{number}">{escaped(question)}</a>' for number, question in enumerate(asked))
     body = f"""<h1>Radio fields on the same held-out rows</h1>
-<p>Predictions of any program, scored by wrf_mi on fixed test rows, beside the best constant prediction and simple models.
+<p>Predictions of any program, scored by wrf_mi on fixed test rows, beside the best constant and simple models.
 Times are of the machine that is named; compare them on equal ones. Entries come by <code>wrf-mi table add</code>.</p>
 <nav>{links} · <a href="#published">Stated by papers</a> · <a href="#data">Data</a></nav>
 {"".join(_question(number, *item) for number, item in enumerate(asked.items()))}
