@@ -72,6 +72,7 @@ def test_examples_of_how_to_pages_run(tmp_path, monkeypatch):
         form = receivers.ObservationSpec("power-pixel", (4, 8))
         assert kind.of(form, run.record.receivers[0]).how == "power"
         assert names["main"]()["rows"]
+        names["test_nearest_is_better_than_a_constant"](tmp_path / "test")
     finally:
         for registry, known in ((models.MODELS, before[0]), (receivers.RECEIVERS, before[1])):
             for name in set(registry) - known:
