@@ -120,7 +120,7 @@ def write_scene(
 
 def _complete(materials: Materials, surfaces: Sequence[Surface]) -> Materials:
     """Materials of all surfaces; `InputError` for those of a surface that is not among them."""
-    kinds = {surface.name: surface.kind for surface in surfaces}
+    kinds = {surface.name: surface.material or surface.kind for surface in surfaces}
     if len(kinds) < len(surfaces):
         raise ValueError("write_scene: two surfaces have the same name")
     if unknown := [name for name in materials.surfaces if name not in kinds]:

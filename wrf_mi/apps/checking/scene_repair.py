@@ -18,8 +18,9 @@ from ...core.angles import FloatArray
 from ...core.files import atomic_folder, listed, write_atomically
 from ...scene.coordinates import FARTHEST_M, Up
 from ...scene.folder import FACTS_FILE, XML_FILE, plain_name
+from ...scene.material_names import ascii_name
 from ...tracing.sionna.scenes import plain_ply
-from .material_repair import ODD, MaterialRepair, ascii_name
+from .material_repair import ODD, MaterialRepair
 from .scene_check import Checked, check_scene, checked, opened
 from .scene_findings import NAMED, Finding, SceneReport
 from .scene_geometry import ShapePart

@@ -7,7 +7,7 @@ of a ROS map, is its top (largest y); an NPZ file states on which side its row 0
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -22,6 +22,9 @@ from ...core.array_files import stored_arrays
 from ...core.files import inside, listed, one_line, text_lines
 from ...core.types import IntArray
 from ...datasets.folder_files import read_columns
+from .buildings import Buildings
+from .dxf import read_dxf
+from .faces import PlanLines
 from .geojson import GEOJSON_SUFFIXES, Extent, read_geojson
 from .pictures import (
     FREE_PROBABILITY,
@@ -44,6 +47,7 @@ NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m")  # arrays of numbers 
 POINT_CELL_M = 0.05  # side of the cells that points are counted in, as usual for maps of indoor robots
 LARGEST_GRID_CELLS = 4_000_000  # 100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away
 THINNEST_WALL_M = 0.05  # thinner lines of a drawing are door leaves, dimensions and letters
+PLANS = ".npz, .png, .pgm, .jpg, .yaml, .csv, .xyz, .geojson, .osm or .dxf"
 LARGEST_PICTURE = 4 * LARGEST_GRID_CELLS
 """Most cells of an occupancy grid that is stated as such: the walls of more take hours to find."""
 
@@ -140,8 +144,14 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None) -> Plan
 
 
 def read_plan(
-    path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None, extent_m: Extent | None = None
-) -> PlanGrid | FloatArray:
+    path: str | Path,
+    resolution_m: float | None = None,
+    row_0: Row0 | None = None,
+    extent_m: Extent | None = None,
+    units: str | None = None,
+    layers: Sequence[str] = (),
+    level: str | None = None,
+) -> PlanGrid | PlanLines | Buildings | FloatArray:
     """Any file that shows a plan, recognised by its ending and its content.
 
     - ``.npz`` with ``log_odds`` [rows, columns], ``row_0`` ("top" or "bottom"), ``resolution_m``, and optionally
@@ -153,7 +163,9 @@ def read_plan(
       Without a YAML, and with other greys than those of map_saver, lines thinner than
       `THINNEST_WALL_M` are not walls (`without_thin_lines`), and a picture with colours has no unmapped cells.
     - ``.csv`` with the header ``x,y``: wall vertices (`read_layout`).
-    - ``.geojson``, ``.json``: outlines of rooms in longitude and latitude (`wrf_mi.scene.plan.geojson.read_geojson`).
+    - ``.geojson``, ``.json``, ``.osm``: outlines of rooms or buildings in longitude and latitude, and data of
+      OpenStreetMap (`wrf_mi.scene.plan.geojson.read_geojson`).
+    - ``.dxf``: lines on layers of walls, doors and windows (`wrf_mi.scene.plan.dxf.read_dxf`).
     - ``.xyz``, ``.txt``: points in two columns x, y (metres), separated by spaces, tabs or commas; # begins a comment.
 
     Args:
@@ -161,26 +173,38 @@ def read_plan(
         resolution_m: side of a cell of a grid; overrides that of the file.
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
         extent_m: width and height of the plan in GeoJSON.
+        units: unit of the coordinates of a DXF; None: that which it states.
+        layers: layers of walls in a DXF.
+        level: level of the rooms of OpenStreetMap, or ``buildings``.
 
     Returns:
-        A grid, whose cells are nowhere free where the file holds points, wall vertices [n, 2], or the straight pieces
-        of outlines [n, 2, 2].
+        A grid, whose cells are nowhere free where the file holds points, wall vertices [n, 2], lines or buildings.
 
     Raises:
-        InputError: missing, unreadable or incomplete, points with the times of their scans, ``row_0`` for a file
-            whose format fixes it, or ``extent_m`` for a file in metres.
+        InputError: missing, unreadable or incomplete, points with the times of their scans, or an option that does
+            not belong to the format of the file.
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: missing; give a plan as .npz, .png, .pgm, .jpg, .yaml, .csv, .xyz or .geojson")
+        raise InputError(f"{path}: missing; give a plan as {PLANS}")
     suffix = path.suffix.lower()
     if row_0 is not None and suffix != ".npz":
         fixed = suffix in (*PICTURE_SUFFIXES, *SHEET_SUFFIXES)
         raise _no_rows(path, "the first row of a picture is its top" if fixed else "this file has no rows of cells")
-    if suffix in GEOJSON_SUFFIXES:
-        return read_geojson(path, extent_m)
-    if extent_m is not None:
-        raise InputError(f"{path}: --extent is for plans in longitude and latitude (GeoJSON); leave it out")
+    is_map, is_dxf = suffix in GEOJSON_SUFFIXES, suffix == ".dxf"
+    for option, value, fits, of in (
+        ("--extent", extent_m, is_map, "plans in longitude and latitude (GeoJSON, OpenStreetMap)"),
+        ("--level", level, is_map, "plans of OpenStreetMap"),
+        ("--layers", layers or None, is_dxf, "DXF"),
+        ("--units", None if units == "m" else units, is_dxf, "plans in DXF; other plans are in metres"),
+        ("--resolution", resolution_m, not (is_map or is_dxf), "plans of cells, pixels or points"),
+    ):
+        if value is not None and not fits:
+            raise InputError(f"{path}: {option} is for {of}; leave it out")
+    if is_map:
+        return read_geojson(path, extent_m, level)
+    if is_dxf:
+        return read_dxf(path, units, layers)
     if suffix in (*PICTURE_SUFFIXES, *SHEET_SUFFIXES):
         return _read_picture(path, resolution_m)
     match suffix:
@@ -190,7 +214,7 @@ def read_plan(
             return read_layout(path)
         case ".xyz" | ".txt":
             return _grid_of_points(path, _read_text(path), resolution_m)
-    raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .jpg, .yaml, .csv, .xyz or .geojson")
+    raise InputError(f"{path}: unknown ending; a plan is {PLANS}")
 
 
 def read_layout(path: str | Path) -> FloatArray:
