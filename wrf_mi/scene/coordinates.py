@@ -57,7 +57,7 @@ LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From z up to y up: x, y, z become x, z, -y."""
 Y_UP_SUFFIXES = (".glb", ".gltf")  # files whose specification has y up (glTF 2.0, section 3.4)
-STATING_UP = (*Y_UP_SUFFIXES, ".dae", ".usd", ".usda", ".usdc", ".usdz")  # files that state the axis that is up
+STATING_UP = (*Y_UP_SUFFIXES, ".dae", ".usd", ".usda", ".usdc", ".usdz", ".ifc")  # files that state the axis that is up
 FARTHEST_M = 2.0**14
 """Distance from the origin from which numbers of single precision, in which scenes are traced, are 2 mm apart."""
 LOST_M = 0.005  # steps of single precision in a file from which it is refused: nothing brings back what it has rounded

@@ -29,11 +29,13 @@ from .coordinates import (
     require_fine,
     require_near,
     require_up,
+    source_file,
 )
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .mesh.facets import planes_of_mesh
 from .mesh.files import SUFFIXES, read_mesh
+from .mesh.ifc import read_ifc
 from .mesh.measured import is_measured
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
 from .mesh.surfaces import Surface, bounds, box_of, main_extent, moved, sampled, with_area
@@ -287,6 +289,10 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
         return _read_plan(file, units, up, storey)
     if storey != UNSTATED:
         raise InputError(f"{file}: no plan; leave out the options of plans, from --wall-height to --level")
+    if file.suffix.lower() == ".ifc":
+        if units is not None or up is not None:
+            raise InputError(f"{file}: states its unit and has z up; leave out --units and --up")
+        return _Source(file, read_ifc(source_file(file, None, "a model in IFC")))
     if has_faces(file):
         raw = read_mesh(file, units, up)
         require_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in raw])), file, up)

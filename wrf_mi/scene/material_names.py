@@ -13,7 +13,16 @@ WORDS: Mapping[str, str] = {
     **{"ceilingtile": "ceiling_board", "drywall": "plasterboard", "gypsum": "plasterboard", "window": "glass"},
     **{"steel": "metal", "alumin": "metal", "iron": "metal", "timber": "wood", "asphalt": "asphalt_concrete"},
     **{"gips": "plasterboard", "platre": "plasterboard", "beton": "concrete", "ziegel": "brick", "mauerwerk": "brick"},
-    **{"brique": "brick", "masonry": "brick", "stahl": "metal", "holz": "wood", "bois": "wood", "glas": "glass"},
+    **{
+        "brique": "brick",
+        "masonry": "brick",
+        "stahl": "metal",
+        "stahlbeton": "concrete",
+        "holz": "wood",
+        "bois": "wood",
+        "glas": "glass",
+    },
+    **dict.fromkeys(("metalstud", "steelstud", "woodstud"), "plasterboard"),  # what such walls are clad with
 }
 """Words in names, without separators and accents, and the material of ITU-R P.2040 that they mean."""
 

@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ...core import InputError
 from .options import DATASET, SCENE, Arguments, add_antennas, add_command, add_rows, antenna_options, comma_numbers
 from .output import Watch, show
@@ -75,7 +77,10 @@ def mesh_command(a: Arguments) -> int:
     kinds = {name: named_kind(name, entry) for name, entry in scene.materials.surfaces.items()}
     counts = {kind: list(kinds.values()).count(kind) for kind in KINDS}
     floors = [name for name, kind in kinds.items() if kind == "floor"]
-    floor_m2 = sum(part.area for name in floors for part in mesh_parts(scene.folder / "meshes" / f"{name}.ply"))
+    parts = [part for name in floors for part in mesh_parts(scene.folder / "meshes" / f"{name}.ply")]
+    # Seen from above; a slab has an upper and a lower side.
+    level_m2 = [float(np.abs(part.face_normals[:, 2]) @ part.area_faces) for part in parts]
+    floor_m2 = sum(area / (1 + part.is_watertight) for area, part in zip(level_m2, parts, strict=True))
     facts: dict[str, Any] = {
         "scene": str(scene.folder),
         "xml": str(scene.xml),

@@ -109,7 +109,7 @@ def building_surfaces(buildings: Buildings, height_m: float | None, floor_m: flo
             ends = np.repeat(edges[rows], 2, axis=1)[:, [0, 2, 3, 1]]
             z = np.stack([edge_base[rows], edge_base[rows], edge_top[rows], edge_top[rows]], axis=1) + floor_m
             corners = np.concatenate([ends, z[..., None]], axis=-1).reshape(-1, 3)
-            halves = (4 * np.arange(len(rows))[:, None, None] + [[0, 1, 2], [0, 2, 3]]).reshape(-1, 3)
+            halves = (4 * np.arange(len(rows))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
             surfaces.append(Surface(wall, "wall", corners, halves, of_wall))
     return surfaces
 

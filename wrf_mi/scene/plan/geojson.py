@@ -103,7 +103,8 @@ def _polygons(geometry: Any) -> list[Any]:
 
 
 def _is_building(tags: Mapping[str, str]) -> bool:
-    return any(tags.get(key, "no") not in ("no", "None") for key in ("building", "building:part"))
+    stated = [tags.get(key, "no") for key in ("building", "building:part")]
+    return "indoor" not in tags and any(value not in ("no", "None") for value in stated)
 
 
 def _levels(tags: Mapping[str, str]) -> list[str]:
