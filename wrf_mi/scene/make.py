@@ -39,9 +39,10 @@ from .mesh.ifc import read_ifc
 from .mesh.measured import is_measured
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
 from .mesh.surfaces import Surface, bounds, box_of, main_extent, moved, sampled, with_area
+from .plan.faces import PlanLines
 from .plan.geojson import GEOJSON_SUFFIXES, Extent
-from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES
-from .plan.sources import PlanGrid, Row0, read_layout, read_plan
+from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES, PlanDrawing
+from .plan.sources import PlanGrid, Row0, plan_pixels, read_layout, read_plan
 from .plan.storey import layout_walls, plan_surfaces
 from .plan.walked import warn_of_places, with_walked_floor
 from .positions import check_positions, in_plan, placed, read_positions, reflections
@@ -54,7 +55,7 @@ from .scan.points import Scan, read_scan, sampled_scan
 logger = logging.getLogger(__name__)
 
 PLAN_SUFFIXES = (*PICTURE_SUFFIXES, *SHEET_SUFFIXES, *GEOJSON_SUFFIXES, ".csv", ".dxf")
-PREVIEW_POINTS = 20_000
+PREVIEW_POINTS, PREVIEW_PIXELS = 20_000, 1500
 Storey = tuple[float | None, float, float | None, Row0 | None, Extent | None, Sequence[str], str | None]
 """Options of a plan: height of the ceiling, z of the floor, side of a cell, side where the first row lies, extent,
 layers of walls, and level."""
@@ -171,7 +172,8 @@ def make_scene(
         materials=materials,
         registration=registered,
         replace=replace,
-        **source.sample(motion),
+        positions_m=measured,
+        **source.drawn(motion),
     )
     return read_scene_folder(out)
 
@@ -203,6 +205,7 @@ class _Source:
     grid: PlanGrid | None = None
     scan: Scan | None = None
     yaw_rad: float = 0.0
+    drawing: PlanDrawing | None = None
 
     @property
     def extent_m(self) -> FloatArray:
@@ -271,10 +274,10 @@ class _Source:
         logger.warning(text, self.file, turn_deg)
         return np.asarray(trimesh.transformations.rotation_matrix(np.radians(turn_deg), [0, 0, 1]))
 
-    def sample(self, motion: FloatArray) -> dict[str, Any]:
-        """Arguments of `write_scene` for a scan: moved points for the preview, and the number of all points."""
+    def drawn(self, motion: FloatArray) -> dict[str, Any]:
+        """Arguments of `write_scene`: plan or moved points of a scan for the preview, and the number of all points."""
         if self.scan is None:
-            return {}
+            return {"drawing_below": self.drawing and replaced(self.drawing, motion=motion)}
         count = len(self.scan.points_m)
         # At random: every k-th point would show the scanner's pattern.
         chosen = np.random.default_rng(1).integers(count, size=min(PREVIEW_POINTS, count))
@@ -343,10 +346,16 @@ def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> 
     if up is not None:
         raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
     plan = read_plan(file, resolution_m, row_0, extent_m, units, layers, level)
+    below = None
+    if isinstance(plan, PlanGrid):
+        size_m = plan.resolution_m * np.array(plan.occupied.shape[::-1])
+        below = PlanDrawing(plan_pixels(file, plan, PREVIEW_PIXELS), np.stack([plan.origin_m, plan.origin_m + size_m]))
+    elif isinstance(plan, PlanLines):
+        below = PlanDrawing(lines_m=np.concatenate(list(plan.pieces_m.values())))
     walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, name=str(file))
     if not isinstance(plan, PlanGrid):
-        return _Source(file, walls)
-    return _Source(file, walls, plan if plan.free.any() else None, yaw_rad=plan.yaw_rad)
+        return _Source(file, walls, drawing=below)
+    return _Source(file, walls, plan if plan.free.any() else None, yaw_rad=plan.yaw_rad, drawing=below)
 
 
 def _split(raw: Sequence[Surface], file: Path, up: Up | None) -> list[Surface]:

@@ -5,11 +5,12 @@ Source of the YAML and of how its modes read a pixel: https://wiki.ros.org/map_s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from ...core import InputError
@@ -81,6 +82,23 @@ def read_sheet(file: Path, resolution_m: float | None) -> Sheet:
     return sheet
 
 
+@dataclass(frozen=True, eq=False)
+class PlanDrawing:
+    """Plan as it is drawn, for pictures of its scene.
+
+    Attributes:
+        pixels: picture [rows, columns, 3], its first row on top; None: there is none.
+        box_m: lowest and highest coordinates [2, 2] of the picture.
+        lines_m: lines [n, 2, 2].
+        motion: matrix [4, 4] from the drawing's frame to the scene's.
+    """
+
+    pixels: NDArray[np.uint8] | None = None
+    box_m: FloatArray = field(default_factory=lambda: np.zeros((2, 2)))
+    lines_m: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+    motion: FloatArray = field(default_factory=lambda: np.eye(4))
+
+
 @dataclass(frozen=True)
 class Pixels:
     """Pixels of a picture, its first row on top.
@@ -112,6 +130,20 @@ class Pixels:
     def is_saved_map(self) -> bool:
         """Whether the pixels have the greys of map_saver and no others."""
         return not self.coloured and bool(np.isin(np.round(WHITE * self.grey, 6), SAVED_GREYS).all())
+
+
+def thumbnail(file: Path, most_pixels: int, side: int) -> NDArray[np.uint8] | None:
+    """Colours [rows, columns, 3] of a picture with at most some pixels along a side; None for 16 bits.
+
+    `read_pixels` refuses files that cannot be read.
+    """
+    with open_picture(file, most_pixels, FORMATS) as stored:
+        picture = ImageOps.exif_transpose(stored)
+        if picture.mode.startswith(("I", "F")):
+            return None
+        small = picture.convert("RGBA")
+        small.thumbnail((side, side))
+        return np.asarray(Image.alpha_composite(Image.new("RGBA", small.size, "white"), small).convert("RGB"))
 
 
 def read_pixels(file: Path, most_pixels: int) -> Pixels:

@@ -30,11 +30,13 @@ from .pictures import (
     FREE_PROBABILITY,
     OCCUPIED_PROBABILITY,
     PICTURE_SUFFIXES,
+    SAVED_GREYS,
     SHEET_SUFFIXES,
     WHITE,
     Sheet,
     read_pixels,
     read_sheet,
+    thumbnail,
 )
 
 logger = logging.getLogger(__name__)
@@ -312,6 +314,17 @@ def picture_scale(path: Path, resolution_m: float | None = None) -> tuple[int, f
     path, resolution_m, sheet = _scaled_picture(path, resolution_m)
     corner_m = np.zeros(2) if sheet is None else np.array(sheet.origin[:2])
     return len(read_pixels(path, LARGEST_PICTURE).grey), resolution_m, corner_m
+
+
+def plan_pixels(path: Path, grid: PlanGrid, side: int) -> NDArray[np.uint8]:
+    """Picture [rows, columns, 3] of a plan of cells that has been read, at most some pixels along a side."""
+    if path.suffix.lower() in (*PICTURE_SUFFIXES, *SHEET_SUFFIXES):
+        pixels = thumbnail(_scaled_picture(path, grid.resolution_m)[0], LARGEST_PICTURE, side)
+        if pixels is not None:
+            return pixels
+    step = -(-max(grid.occupied.shape) // side)
+    grey = np.where(grid.occupied, 0, np.where(grid.free, 255, SAVED_GREYS[1]))[::-step, ::step]
+    return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
