@@ -24,9 +24,10 @@ from ...core.types import IntArray
 from ...datasets.folder_files import read_columns
 from .buildings import Buildings
 from .dxf import read_dxf
-from .faces import PlanLines
+from .faces import THICKEST_WALL_M, PlanLines
 from .geojson import GEOJSON_SUFFIXES, Extent, read_geojson
 from .pictures import (
+    DARK,
     FREE_PROBABILITY,
     OCCUPIED_PROBABILITY,
     PICTURE_SUFFIXES,
@@ -37,6 +38,7 @@ from .pictures import (
     read_pixels,
     read_sheet,
     thumbnail,
+    wall_grey,
 )
 
 logger = logging.getLogger(__name__)
@@ -50,6 +52,7 @@ POINT_CELL_M = 0.05  # side of the cells that points are counted in, as usual fo
 LARGEST_GRID_CELLS = 4_000_000  # 100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away
 THINNEST_WALL_M = 0.05  # thinner lines of a drawing are door leaves, dimensions and letters
 PLANS = ".npz, .png, .pgm, .jpg, .yaml, .csv, .xyz, .geojson, .osm or .dxf"
+SMALLEST_PART_M = 0.8  # smaller parts that touch no others are letters, symbols and pillars
 LARGEST_PICTURE = 4 * LARGEST_GRID_CELLS
 """Most cells of an occupancy grid that is stated as such: the walls of more take hours to find."""
 
@@ -337,40 +340,67 @@ def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
         origin = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x  # in the turned frame
         grid = grid_from_probability(probability, resolution_m, "top", origin, str(path), thresholds)
         return replace(grid, yaw_rad=yaw)
-    if pixels.coloured:  # a drawing: what is no line is ground, of whatever colour
-        probability = np.where(probability > OCCUPIED_PROBABILITY, 1.0, 0.0)
+    level = DARK if pixels.is_saved_map else wall_grey(pixels.grey, resolution_m, THICKEST_WALL_M)
+    if pixels.coloured or level > DARK:  # a drawing: what is no line is ground, of whatever colour
+        probability = np.where(WHITE * pixels.grey <= level, 1.0, 0.0)
     grid = grid_from_probability(probability, resolution_m, "top", name=str(path))
     if pixels.is_saved_map:
         return grid
-    if pixels.coloured:
+    if pixels.coloured or level > DARK:
         text = (
-            "%s: %.2g %% of its pixels, those darker than grey %d, count as walls; if walls are lighter, darken them, "
+            "%s: %.2g %% of its pixels, those darker than grey %d, count as walls; if walls are others, darken these, "
         )
         text += "or state a lower occupied_thresh in the YAML of a ROS map beside it"
-        logger.warning(text, path, 100 * grid.occupied.mean(), WHITE * (1 - OCCUPIED_PROBABILITY))
+        logger.warning(text, path, 100 * grid.occupied.mean(), level)
     return without_thin_lines(grid, str(path))
 
 
 def without_thin_lines(grid: PlanGrid, name: str = "plan") -> PlanGrid:
     """A drawing without lines thinner than `THINNEST_WALL_M`, whose cells are free; how many is logged.
 
-    A drawing of which less than half remains has walls drawn as lines, and is returned as it is.
+    So are parts smaller than `SMALLEST_PART_M` that touch no others, such as letters. Where less than half remains,
+    walls are drawn as lines: narrow spaces between two of them are filled, as both are faces of a wall, and a drawing
+    of which less than half remains even so is returned as it is.
     """
-    # A disk, so that walls of any direction remain; of even diameter, too, hence the half cells.
-    cells = max(1, int(THINNEST_WALL_M / grid.resolution_m + 1e-6))
-    offset = np.arange(cells) - (cells - 1) / 2
-    disk = np.hypot(offset[:, None], offset) <= cells / 2
-    thick = ndimage.binary_opening(grid.occupied, disk)
-    lines = grid.occupied & ~ndimage.binary_dilation(thick, np.ones((3, 3)))
+    lines = _thin_lines(grid)
     if not lines.any():
         return grid
     share = lines.sum() / grid.occupied.sum()
     if share > 0.5:
+        filled = replace(grid, occupied=grid.occupied | _between_faces(grid))
+        lines = _thin_lines(filled)
+        if lines.sum() <= 0.5 * filled.occupied.sum():
+            text = "%s: walls are drawn by both faces; other lines are not walls (door leaves, furniture, dimensions)"
+            logger.warning(text, name)
+            return replace(filled, occupied=filled.occupied & ~lines, free=filled.free | lines)
         logger.warning("%s: walls are drawn as lines thinner than %g m, so every line is a wall", name, THINNEST_WALL_M)
         return grid
     text = "%s: lines thinner than %g m, %.2g %% of the dark cells, are not walls (door leaves, dimensions, letters)"
     logger.warning(f"{text}; draw those thicker that are", name, THINNEST_WALL_M, 100 * share)
     return replace(grid, occupied=grid.occupied & ~lines, free=grid.free | lines)
+
+
+def _thin_lines(grid: PlanGrid) -> Mask:
+    """Dark cells of lines thinner than `THINNEST_WALL_M`, and of small parts that touch no others."""
+    # A disk, so that walls of any direction remain; of even diameter, too, hence the half cells.
+    cells = max(1, int(np.ceil(THINNEST_WALL_M / grid.resolution_m - 1e-6)))
+    offset = np.arange(cells) - (cells - 1) / 2
+    disk = np.hypot(offset[:, None], offset) <= cells / 2
+    thick = ndimage.binary_opening(grid.occupied, disk)
+    parts, _ = ndimage.label(thick, np.ones((3, 3)))
+    boxes = ndimage.find_objects(parts)
+    sides_m = np.array([[0.0, 0.0], *([(axis.stop - axis.start) for axis in box] for box in boxes)]) * grid.resolution_m
+    if (sides_m.max(axis=1) >= SMALLEST_PART_M).any():
+        thick &= (sides_m.max(axis=1) >= SMALLEST_PART_M)[parts]
+    return np.asarray(grid.occupied & ~ndimage.binary_dilation(thick, np.ones((3, 3))))
+
+
+def _between_faces(grid: PlanGrid) -> Mask:
+    """Cells of spaces that lines enclose and that are nowhere wider than a wall."""
+    spaces, count = ndimage.label(~grid.occupied)
+    half_m = ndimage.distance_transform_edt(~grid.occupied) * grid.resolution_m
+    widest_m = ndimage.maximum(half_m, spaces, np.arange(count + 1))
+    return np.asarray((2 * widest_m <= THICKEST_WALL_M)[spaces] & ~grid.occupied)
 
 
 def _read_text(path: Path) -> FloatArray:
