@@ -69,3 +69,16 @@ html_theme_options = {"navigation_with_keys": True}
 # External links cannot be checked without network; missing internal ones are warnings of the build, and so errors.
 linkcheck_ignore = [r"https?://.*"]
 linkcheck_anchors = True
+
+
+def setup(app):  # type: ignore[no-untyped-def]
+    """Write the page of the table of radio fields beside the pages of the site."""
+    from wrf_mi.apps.table.page import table_page
+
+    def write(app, exception):  # type: ignore[no-untyped-def]
+        if exception is None and app.builder.format == "html":
+            (Path(app.outdir) / "table.html").write_text(
+                table_page(CHECKOUT / "benchmarks" / "table"), encoding="utf-8"
+            )
+
+    app.connect("build-finished", write)

@@ -1,6 +1,7 @@
 """Command ``wrf-mi bench``."""
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from wrf_mi.apps.commands.output import show
@@ -37,17 +38,20 @@ def _measure(a: argparse.Namespace) -> int:
     from wrf_mi.parallel import open_scheduler
 
     from .bench import CHECKS, REFUSED, BenchFailed, CheckRefused, all_here, bench, own_table
+    from .entries import write_entries
 
     with open_scheduler(a.scheduler) as scheduler:
         workers = scheduler if a.scheduler else None
         if TABLES in a.names:
-            from .tables import tables
+            from .tables import FOLDER, tables
 
             most_s = None if a.hours is None else 3600 * a.hours
-            rows = tables(Path(a.out), Path(a.runs), a.quick, workers, most_s)
+            place = Path(a.out).parent / (f"{FOLDER}-quick" if a.quick else FOLDER)
+            rows = [asdict(entry) for entry in tables(place, Path(a.runs), a.quick, workers, most_s).values()]
         else:
             try:
                 rows = bench(a.names or all_here(), Path(a.out), Path(a.runs), workers)
+                write_entries(Path(a.out))
             except CheckRefused:  # printed on standard error by the check
                 return REFUSED
             for row in rows if not a.json else ():

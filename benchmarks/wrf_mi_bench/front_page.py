@@ -1,13 +1,12 @@
 """Table and picture of the project's README: ``python -m wrf_mi_bench.front_page`` prints the one, writes the other.
 
-The table has a line for each question, from stored results. Columns with a scene and without one are apart. The picture
-shows a floor whose signal strengths are known everywhere: scan and measurements, prediction, standard deviation, truth.
+The table has a line for each question, from entries of the table of radio fields. Columns with and without a scene
+are apart. The picture shows a floor whose signal strengths are known everywhere: scan and measurements, prediction,
+standard deviation, truth.
 """
 
-import json
 import tempfile
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from wrf_mi_scenes.floor_plans import office
 from wrf_mi_scenes.mitsuba_xml import write_scene
 
 import wrf_mi
+from wrf_mi.apps.table.entries import ALL_ROWS, Entry, read_entries
 from wrf_mi.core.angles import FloatArray
 from wrf_mi.core.files import write_figure
 from wrf_mi.core.receivers import receiver_index
@@ -29,141 +29,91 @@ from wrf_mi.scene import drawing
 from wrf_mi.synthetic.floor_receivers import DEFAULT, NAME
 from wrf_mi.synthetic.searches import SCATTERING, set_scattering
 from wrf_mi.synthetic.stored import SCAN
-from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import inside_interval
 from wrf_mi.tracing import open_scene, trace_paths
 
-from .comparison import STORED, data_folder
+from .comparison import data_folder
 from .declared import pivoted
+from .entries import OPEN
 from .sources import fit_key, source_files
-from .stages import CALIBRATED, HYBRID, JOINT, MATERIALS, Cell, run_of_cell
-from .stages import CORRECTED as IN_CORRECTED
-from .table_pages import FORMER, grouped, read_rows
-from .table_plan import PARTS, SHARES
+from .stages import HYBRID, Cell, run_of_cell
+from .table_pages import FORMER
+from .table_pages import STORED as ENTRIES
 from .tables import scene_of_data
-from .unmeasured import CORRECTED, IDW, KRIGING, LAW, TRACED, gains
 
 COLUMNS = ("hybrid", "ray tracing", "WRF-GS+", "WRF-GS+", "kriging", "IDW")
 SCENE = 3
 """Number of columns whose methods have a scene; the others have none."""
 HEAD = [f"{name}, {'scan' if k < SCENE else 'no scan'}" for k, name in enumerate(COLUMNS)]
-TRACING, ALONE, INTERPOLATION = 1, 3, 5
-"""Columns by number: ray tracing, WRF-GS+ without a scene, IDW."""
-OF_STAGES = {HYBRID: 0, "ray-tracing": TRACING, CALIBRATED: TRACING, MATERIALS: TRACING, IN_CORRECTED: TRACING}
-OF_STAGES |= {JOINT: 2, "kriging": 4, "idw": INTERPOLATION}
-OF_TABLES = {HYBRID: 0, "ray-tracing": TRACING, "ray-tracing-corrected": TRACING, "wrf-gs+-joint": 2}
-OF_TABLES |= {"wrf-gs+": ALONE, "kriging": 4, "idw": INTERPOLATION}
-OF_PARTS = {HYBRID: 0, TRACED: TRACING, CORRECTED: TRACING, KRIGING: 4, IDW: INTERPOLATION, LAW: INTERPOLATION}
-"""Column of each method of the benchmark ``stages``, of the tables, and of held-out carriers and receivers."""
-Medians = Mapping[str, float]  # by method
+METHODS = {"hybrid": 0, "wrf-gs+-joint": 2, "wrf-gs+": 3, "kriging": 4, "idw": 5, "mri": 5}
+METHODS |= dict.fromkeys(
+    ("ray-tracing", *(f"ray-tracing-{how}" for how in ("calibrated", "materials", "corrected"))), 1
+)
+"""Column of each method of the table; ray tracing is the best of the scene as made, calibrated and corrected."""
+LAW = "mri"  # the column of interpolation has it where nothing can be interpolated, and names it
+MADE = {"random-room": "made by `wrf-mi bench stages`"}  # data that only a benchmark makes
 
 
 class Question(NamedTuple):
-    """Line of the table: question, arguments of ``wrf-mi train``, task, column of each method, and its medians."""
+    """Line of the table: question, data set, split, number of training rows, and whether it was measured before."""
 
     text: str
-    data: str
-    task: str
-    columns: Mapping[str, int]
-    medians: Callable[[Path], Medians]
+    dataset: str
+    split: str = "official"
+    share: int | float = ALL_ROWS
     former: bool = False  # whether an earlier version was measured
+    pooled: bool = False  # whether of the entries that are pooled over seeds
 
-
-def of_stages(cell: str, results: Path) -> Medians:
-    rows = json.loads((results / "stages.json").read_text(encoding="utf-8"))["figures"]["rows"]
-    return {row["model"]: row["score"]["median"] for row in rows if row["cell"] == cell}
-
-
-def of_tables(dataset: str, results: Path) -> Medians:
-    part = next(part for part in PARTS if part.dataset == dataset and part.split == "official")
-    groups = grouped(part, {row["row"]: row for row in read_rows(results / "tables")})
-    return {
-        method: float(np.mean([row["score"]["median"] for row in rows]))
-        for (share, method), rows in groups.items()
-        # Without a mesh the paths of free space are no ray tracing in a scan.
-        if share == SHARES[0] and not (part.scene == "open" and method == "ray-tracing")
-    }
-
-
-def of_parts(pattern: str, results: Path) -> Medians:
-    parts = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(results.glob(pattern))]
-    return {name: median for name, (median, _, _) in gains(parts).items()}
+    @property
+    def data(self) -> str:
+        """Arguments of ``wrf-mi train``."""
+        words = [self.dataset] + ([] if self.split == "official" else ["--split", self.split])
+        words += ["--n-train", str(self.share)] if isinstance(self.share, int) else []
+        return MADE.get(self.dataset, f"`{' '.join(words)}`")
 
 
 QUESTIONS = (
+    Question("spectra in a region without measurements, scanned room", "laboratory", "blocked"),
+    Question("spectra at held-out positions, furnished room", "traced-room", former=True),
+    Question("power in a region without measurements, flat with a plan", "flat-ble", "blocked", 400),
+    Question("power in the flat from five measured positions", "flat-ble", share=5),
     Question(
-        "spectra in a region without measurements, scanned room",
-        "`laboratory --split blocked`",
-        "spectrum",
-        OF_STAGES,
-        partial(of_stages, "laboratory-blocked-all"),
-    ),
-    Question(
-        "spectra at held-out positions, furnished room",
-        "`traced-room`",
-        "spectrum",
-        OF_TABLES,
-        partial(of_tables, "traced-room"),
-        True,
-    ),
-    Question(
-        "power in a region without measurements, flat with a plan",
-        "`flat-ble --split blocked --n-train 400`",
-        "rssi",
-        OF_STAGES,
-        partial(of_stages, "flat-ble-blocked-400"),
-    ),
-    Question(
-        "power in the flat from five measured positions",
-        "`flat-ble --n-train 5`",
-        "rssi",
-        OF_STAGES,
-        partial(of_stages, "flat-ble-official-5"),
-    ),
-    Question(
-        "power at a receiver without any measurement, same flat",
-        "`flat-ble --split receiver --n-train 400`",
-        "rssi",
-        OF_PARTS,
-        partial(of_parts, "new-receivers/flat-ble-0-*.json"),
-        True,
+        "power at a receiver without any measurement, same flat", "flat-ble", "receiver", 400, former=True, pooled=True
     ),
     Question(
         "spectra at a carrier without measurements, furnished room",
-        "`traced-room-bands --split frequency`",
-        "spectrum",
-        OF_PARTS,
-        partial(of_parts, "new-carriers/*.json"),
-        True,
+        "traced-room-bands",
+        "frequency",
+        former=True,
+        pooled=True,
     ),
-    Question(
-        "channels from 100 measured ones, scanned room",
-        "made by `wrf-mi bench stages`",
-        "csi",
-        OF_STAGES,
-        partial(of_stages, "random-room-official-100"),
-    ),
-    Question(
-        "measurements a few millimetres apart",
-        "`rfid-lab`",
-        "spectrum",
-        OF_TABLES,
-        partial(of_tables, "rfid-lab"),
-    ),
+    Question("channels from 100 measured ones, scanned room", "random-room", share=100),
+    Question("measurements a few millimetres apart", "rfid-lab"),
 )
 
 
-def question_table(results: Path = STORED) -> str:
-    """Markdown table of medians over test rows, the best of each line bold.
+def medians_of(question: Question, entries: Mapping[str, Entry]) -> dict[str, float]:
+    """Median score by method of the entries that answer a question, mean over seeds."""
+    wanted = question.dataset, question.split, question.share, type(question.share), question.pooled
+    by_method: dict[str, list[float]] = {}
+    for entry in entries.values():
+        found = entry.dataset, entry.split, entry.share, type(entry.share), entry.seed is None
+        # Without a mesh the paths of free space are no ray tracing in a scan, and a hybrid has none.
+        without = entry.dataset in OPEN and METHODS.get(entry.method, SCENE) < SCENE
+        if found == wanted and not without:
+            by_method.setdefault(entry.method, []).append(float(entry.score["median"]))
+    return {method: float(np.mean(medians)) for method, medians in by_method.items()}
 
-    Ray tracing is the better of the paths in the scene as stated, and calibrated or corrected by the measurements.
-    """
-    rows = []
+
+def question_table(table: Path = ENTRIES) -> str:
+    """Markdown table of medians over test rows from a folder of entries, the best of each line bold."""
+    rows, entries = [], read_entries(table)
     for question in QUESTIONS:
-        task, columns = TASKS[question.task], dict[int, tuple[float, str]]()
+        medians, columns = medians_of(question, entries), dict[int, tuple[float, str]]()
+        task = next(entry.of for entry in entries.values() if entry.dataset == question.dataset)
         better = max if task.higher_is_better else min
-        for method, median in question.medians(results).items():
-            if (column := question.columns.get(method)) is not None:
+        for method, median in medians.items():
+            if (column := METHODS.get(method)) is not None and not (method == LAW and "idw" in medians):
                 prefix = "MRI " if method == LAW else ""
                 columns[column] = better(columns.get(column, (median, prefix)), (median, prefix))
         best = better(columns.values())
@@ -172,14 +122,8 @@ def question_table(results: Path = STORED) -> str:
             cell = f"{prefix}{median:.{task.digits}f}"
             cell = f"**{cell}**" if median == best[0] else cell
             rows.append({"question": text, "data": question.data, "column": column, "cell": cell})
-    return pivoted(
-        "| question | data | ... |",
-        "| {question} | {data} | ... |",
-        "question",
-        "column",
-        "{cell}",
-        dict(enumerate(HEAD)),
-    )(rows)
+    head, line = "| question | data | ... |", "| {question} | {data} | ... |"
+    return pivoted(head, line, "question", "column", "{cell}", dict(enumerate(HEAD)))(rows)
 
 
 RUNS, PICTURE = Path("runs/bench/front-page"), Path("docs/images/front-page.png")

@@ -42,14 +42,14 @@ def stale(out: Path) -> tuple[list[dict[str, Any]], int]:
         before = measured.get(SOURCE) or history.digests(path, date, modules)
         changed = sorted(name for name in {*now, *(before or {})} if before and before.get(name) != now.get(name))
         if changed or not before:
-            name = path.relative_to(out).with_suffix("").as_posix()
+            name = path.relative_to(out if out in path.parents else out.parent).with_suffix("").as_posix()
             older.append({"name": name, "date": date, "command": command, "changed": changed or UNKNOWN})
     return older, count
 
 
 def results(out: Path) -> Iterator[tuple[Path, dict[str, Any], tuple[str, ...], str]]:
     """Each result's file, content, modules and command; other JSON files are passed over."""
-    for path in sorted(out.rglob("*.json")):
+    for path in sorted([*out.rglob("*.json"), *(out.parent / FOLDER).glob("*.json")]):
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
@@ -59,9 +59,8 @@ def results(out: Path) -> Iterator[tuple[Path, dict[str, Any], tuple[str, ...], 
             yield path, content, modules_of(name), f"wrf-mi bench {name}"
         elif path.parent == out and name.startswith(Path(QUICK).stem):
             yield path, content, modules_of_benchmark(f"{__package__}.quick"), content["command"]
-        elif folder.startswith(FOLDER):
-            command = f"wrf-mi bench {FOLDER}{' --quick' if folder != FOLDER else ''}"
-            yield path, content, modules_of_command(content["command"].split()), f"rm {path}; {command}"
+        elif folder == FOLDER and (words := str(content.get("command")).split())[1:2] == ["train"]:
+            yield path, content, modules_of_command(words), f"rm {path}; wrf-mi bench tables"
         elif folder in CHECKS:
             yield path, content, modules_of(folder), f"rm {path}; wrf-mi bench {folder}"
 

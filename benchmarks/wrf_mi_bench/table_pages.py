@@ -1,6 +1,5 @@
 """Pages and pictures of the tables of all methods, from stored rows, and their run time against error."""
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,8 +8,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from wrf_mi.apps.table.entries import Entry, read_entries
+from wrf_mi.apps.table.page import PUBLISHED
 from wrf_mi.core import InputError
-from wrf_mi.core.files import one_line, write_atomically, write_figure
+from wrf_mi.core.files import write_atomically, write_figure
+from wrf_mi.core.yaml_files import read_yaml
 from wrf_mi.runs.figures import score_cdf
 from wrf_mi.runs.results import reference_words
 from wrf_mi.tasks import TASKS
@@ -20,34 +22,24 @@ from .declared import lined, pivoted
 from .table_plan import MADE_HERE, PARTS, SHARES, TablePart, plan
 
 
-def read_rows(place: Path) -> list[dict[str, Any]]:
-    rows = []
-    for path in sorted(place.glob("*-seed*.json")):
-        try:
-            rows.append(json.loads(path.read_text(encoding="utf-8")))
-        except ValueError as error:
-            raise InputError(f"{path}: not readable ({one_line(error)}); restore it, or delete it") from None
-    return rows
-
-
 def write_tables(place: Path, quick: bool = False) -> None:
     """Write tables in Markdown to ``README.md`` and a picture of the score distributions of each part."""
-    stored = {row["row"]: row for row in read_rows(place)}
+    stored, stated = read_entries(place), published(place)
     text = ["# Every method, task by task", NOTE]
     for name, heading in OVERVIEWS.items():
-        if shown := overview(name, stored, quick):
+        if shown := overview(name, stored, stated, quick):
             text += [f"## {heading.capitalize()}: medians", shown]
     for part in PARTS:
         groups = grouped(part, stored, quick)
         if not groups:
             continue
         title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
-        text += [f"## {title}", part_table(part, groups)]
+        text += [f"## {title}", part_table(part, groups, stated)]
         most = max(share for share, _ in groups)
         first = {method: rows[0] for (share, method), rows in groups.items() if share == most}
         picture = f"{part.task}-{part.dataset}-{part.split}.png"
         figure = score_cdf(
-            {part.entries[method].label: row["quantiles"] for method, row in first.items()}, {}, TASKS[part.task].label
+            {part.entries[method].label: row.quantiles for method, row in first.items()}, {}, TASKS[part.task].label
         )
         write_figure(place / picture, figure)
         text.append(f"![Distribution of the scores of each method]({picture})")
@@ -79,31 +71,42 @@ NOTE = (
 FORMER = "†"  # mark of rows that were measured on other data than the newest rows of their part
 
 
-Groups = Mapping[tuple[float, str], Sequence[Mapping[str, Any]]]
-"""Stored rows by share of the training rows and method, in the order of their seeds."""
+Groups = Mapping[tuple[float, str], Sequence[Entry]]
+"""Entries by share of the training rows and method, in the order of their seeds."""
 
 
-def grouped(part: TablePart, stored: Mapping[str, Mapping[str, Any]], quick: bool = False) -> Groups:
-    groups: dict[tuple[float, str], list[Mapping[str, Any]]] = {}
+Published = Mapping[tuple[str, str], str]
+"""Figures that the paper states for other data, by overview and method."""
+
+
+def published(place: Path) -> Published:
+    """Figures of papers for the methods of the overviews, from the file beside the entries; empty without it."""
+    path = place / PUBLISHED
+    figures = read_yaml(path)["figures"] if path.exists() else []
+    return {(stated["table"], stated["key"]): stated["figure"] for stated in figures}
+
+
+def grouped(part: TablePart, stored: Mapping[str, Entry], quick: bool = False) -> Groups:
+    groups: dict[tuple[float, str], list[Entry]] = {}
     for row in plan(quick):
         if row.part == part and row.name in stored:
             groups.setdefault((row.share, row.method), []).append(stored[row.name])
     return groups
 
 
-def is_former(part: TablePart, rows: Sequence[Mapping[str, Any]], newest: str | None) -> bool:
+def is_former(part: TablePart, rows: Sequence[Entry], newest: str | None) -> bool:
     """Whether one of some rows was measured on other data than those of a digest; measured data do not change."""
-    return part.dataset.startswith(MADE_HERE) and any(row.get("data") != newest for row in rows)
+    return part.dataset.startswith(MADE_HERE) and any(row.data != newest for row in rows)
 
 
 def newest_data(groups: Groups) -> str | None:
     """Digest of the data of most of the newest rows."""
     rows = [row for of_method in groups.values() for row in of_method]
-    last = max(row["date"] for row in rows)
-    return Counter(row.get("data") for row in rows if row["date"] == last).most_common(1)[0][0]
+    last = max(row.date for row in rows)
+    return Counter(row.data for row in rows if row.date == last).most_common(1)[0][0]
 
 
-def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = False) -> str:
+def overview(name: str, stored: Mapping[str, Entry], stated: Published, quick: bool = False) -> str:
     """Markdown table of medians, most rows of each data set; a line is a method, a column a data set.
 
     With several seeds a median is their mean. Best mean rank first. "" where nothing is stored.
@@ -125,7 +128,7 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
             entry = part.entries[row["method"]]
             labels.setdefault(row["method"], []).append(entry.label)
             row |= {"title": title_of(part), "text": f"{text} {FORMER}" if row["former"] else text}
-            rows.append({**row, "task": task, "published": entry.published})
+            rows.append({**row, "task": task, "published": stated.get((name, row["method"]), "")})
     if not rows:
         return ""
     titles = {row["title"]: row["title"] for row in rows}
@@ -138,9 +141,9 @@ def overview(name: str, stored: Mapping[str, Mapping[str, Any]], quick: bool = F
     return pivoted(head, line, "method", "title", "{text}", titles)(rows)
 
 
-def _mean(rows: Sequence[Mapping[str, Any]], key: str) -> float:
+def _mean(rows: Sequence[Entry], key: str) -> float:
     """Mean of a score over rows."""
-    return float(np.mean([row["score"][key] for row in rows]))
+    return float(np.mean([row.score[key] for row in rows]))
 
 
 def title_of(part: TablePart) -> str:
@@ -148,27 +151,31 @@ def title_of(part: TablePart) -> str:
     return part.dataset if part.split == "official" else f"{part.dataset}, {part.split}"
 
 
-def part_table(part: TablePart, groups: Groups) -> str:
+def part_table(part: TablePart, groups: Groups, stated: Published) -> str:
     """Markdown table of a data set and split: best median first, fewer rows below, references last."""
     task = TASKS[part.task]
     sign, rows = -1 if task.higher_is_better else 1, list[dict[str, Any]]()
     digits, newest, most = task.digits, newest_data(groups), max(share for share, _ in groups)
     for share, method in sorted(groups, key=lambda key: (-key[0], sign * _mean(groups[key], "median"))):
         of_method, entry = groups[share, method], part.entries[method]
-        medians = [row["score"]["median"] for row in of_method]
+        medians = [row.score["median"] for row in of_method]
         spread = f" [{min(medians):.{digits}f}, {max(medians):.{digits}f}]" if len(medians) > 1 else ""
         figures: dict[str, Any] = {key: _mean(of_method, key) for key in ("median", "mean", "p10", "p90")}
         figures |= {"label": entry.label + (f" {FORMER}" if is_former(part, of_method, newest) else "")}
-        figures |= {"training": f"{np.median([row['train_seconds'] for row in of_method]):.0f} s"}
-        figures |= {"sample": f"{np.median([row['ms_per_sample'] for row in of_method]):.2g} ms"}
-        figures |= {"memory": f"{max(row['peak_memory_mb'] for row in of_method):.0f} MB"}
-        figures |= {"spread": spread, "published": entry.published if share == most else "", "digits": digits}
-        rows.append({"n_train": of_method[0]["n_train"], **figures})
+        figures |= {"training": f"{np.median([row.train_seconds for row in of_method]):.0f} s"}
+        figures |= {"sample": f"{np.median([row.ms_per_sample for row in of_method]):.2g} ms"}
+        figures |= {"memory": f"{max(row.peak_memory_mb or 0 for row in of_method):.0f} MB"}
+        figures |= {
+            "spread": spread,
+            "published": stated.get((part.table, method), "") if share == most else "",
+            "digits": digits,
+        }
+        rows.append({"n_train": of_method[0].n_train, **figures})
     if "idw" not in part.entries:  # references that every run states, where interpolation has no row
         first = next(of_method[0] for (share, _), of_method in groups.items() if share == most)
         empty = dict.fromkeys(("spread", "training", "sample", "memory", "published"), "")
-        for key, block in first["reference"].items():
-            label = {"n_train": first["n_train"], "label": _reference_words(part, first, key), "digits": 2}
+        for key, block in (first.reference or {}).items():
+            label = {"n_train": first.n_train, "label": _reference_words(part, first, key), "digits": 2}
             rows.append({**block, **label, **empty})
     head = (
         f"| rows | method | median {task.label} | mean | p10 | p90 | training | a sample | memory | paper, other data |"
@@ -180,20 +187,20 @@ def part_table(part: TablePart, groups: Groups) -> str:
     return lined(head, line)(rows)
 
 
-def _reference_words(part: TablePart, row: Mapping[str, Any], key: str) -> str:
+def _reference_words(part: TablePart, entry: Entry, key: str) -> str:
     """Description of a reference; keys of IDW end with its number of neighbours where rows did not choose it."""
     name = key.rstrip("0123456789")
     if name != key:
         return f"{TASKS[part.task].references[name]} of {key.removeprefix(name)} nearest"
-    return reference_words(TASKS[part.task], row["reference"], key)
+    return reference_words(TASKS[part.task], dict(entry.reference or {}), key)
 
 
-STORED, PICTURE = Path("benchmarks/results/tables"), Path("docs/images/pareto.png")
-"""Stored rows, and the picture, which is written only in a checkout of the project."""
+STORED, PICTURE = Path("benchmarks/table"), Path("docs/images/pareto.png")
+"""Entries, and the picture, which is written only in a checkout of the project."""
 COSTS = {"ms_per_sample": ("prediction of a sample", "ms"), "train_seconds": ("training", "s")}
 """Key, title and unit of each cost."""
 LEAST = 1e-3  # smallest cost on the logarithmic axes
-PUBLISHED = {"nerf2": (200, 0.78), "wrf-gs": (5, 0.82), "wrf-gs+": (8, 0.90)}
+SPEEDS = {"nerf2": (200, 0.78), "wrf-gs": (5, 0.82), "wrf-gs+": (8, 0.90)}
 """Milliseconds of a prediction on an RTX 3090 and median SSIM of the authors' programs for the spectra of NeRF2's data
 (WRF-GS+, section V), as hollow markers beside spectra of these data.
 """
@@ -201,12 +208,12 @@ PUBLISHED = {"nerf2": (200, 0.78), "wrf-gs": (5, 0.82), "wrf-gs+": (8, 0.90)}
 Points = Mapping[str, Mapping[str, float]]  # score and costs of each method by name
 
 
-def points_of(part: TablePart, stored: Mapping[str, Mapping[str, Any]]) -> Points:
+def points_of(part: TablePart, stored: Mapping[str, Entry]) -> Points:
     """Mean over seeds of the median score, and median costs, of each method of a part with all training rows."""
     groups = grouped(part, stored)
     return {
         method: {"score": _mean(rows, "median")}
-        | {cost: float(np.median([row[cost] for row in rows])) for cost in COSTS}
+        | {cost: float(np.median([getattr(row, cost) for row in rows])) for cost in COSTS}
         for (share, method), rows in groups.items()
         if share == SHARES[0]
     }
@@ -259,7 +266,7 @@ def pareto_figure(by_part: Mapping[TablePart, Points]) -> Figure:
                 number = names.index(name)
                 shown[name] = axes.scatter(*place, color=f"C{number}", marker="os^"[number // 10])
             if part.task == "spectrum" and cost == "ms_per_sample":
-                for name, place in PUBLISHED.items():
+                for name, place in SPEEDS.items():
                     if name in at:
                         number = names.index(name)
                         axes.scatter(*place, facecolor="none", edgecolor=f"C{number}", marker="os^"[number // 10])
@@ -274,9 +281,9 @@ def pareto_figure(by_part: Mapping[TablePart, Points]) -> Figure:
 
 def read_points(place: Path = STORED) -> dict[TablePart, Points]:
     """Points of each part with stored rows; `InputError` where there are none."""
-    stored = {row["row"]: row for row in read_rows(place)}
+    stored = read_entries(place)
     if not stored:
-        raise InputError(f"{place}: no stored rows; call it in a checkout that has them, or run wrf-mi bench tables")
+        raise InputError(f"{place}: no entries; call it in a checkout that has them, or run wrf-mi bench tables")
     return {part: points for part in PARTS if (points := points_of(part, stored))}
 
 

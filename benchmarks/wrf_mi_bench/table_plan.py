@@ -22,7 +22,6 @@ class Entry:
     quick: tuple[str, ...] = ()  # further arguments of the small version, which takes half a minute
     seeds: Sequence[int] = ONE  # seeds; several for random methods of less than three minutes
     few_seeds: Sequence[int] = SEEDS  # seeds with fewer rows, which are random themselves
-    published: str = ""  # figures of the paper, on other data; "": none
 
 
 def _set(*settings: str) -> tuple[str, ...]:
@@ -40,12 +39,12 @@ FEWER, SIXTY = (_set(f"steps={steps}", f"validate_every={2 * steps // 5}") for s
 """Schedules of the small version: networks, and networks with slow steps."""
 SHORT = _set("steps=400", "validate_every=200")  # schedule of fields of Gaussians in the small version
 SPECTRUM: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT, seeds=SEEDS, published="0.90, p90 0.95"),
-    "wrf-gs": Entry("WRF-GS", "wrf-gs", quick=SHORT, seeds=SEEDS, published="0.82, p90 0.88"),
-    "nerf2": Entry("NeRF2", "nerf2", quick=SIXTY, seeds=SEEDS, published="0.78, p90 0.86"),
-    "vae": Entry("VAE", "vae", quick=FEWER, seeds=SEEDS, published="0.70, p90 0.82"),
-    "dcgan": Entry("DCGAN", "dcgan", quick=SIXTY, published="0.56, p90 0.69"),
-    "ray-tracing": Entry("ray tracing", "ray-tracing", NAMED, published="0.38, p90 0.61"),
+    "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT, seeds=SEEDS),
+    "wrf-gs": Entry("WRF-GS", "wrf-gs", quick=SHORT, seeds=SEEDS),
+    "nerf2": Entry("NeRF2", "nerf2", quick=SIXTY, seeds=SEEDS),
+    "vae": Entry("VAE", "vae", quick=FEWER, seeds=SEEDS),
+    "dcgan": Entry("DCGAN", "dcgan", quick=SIXTY),
+    "ray-tracing": Entry("ray tracing", "ray-tracing", NAMED),
     "kriging": Entry("kriging", "kriging", seeds=SEEDS),
     "idw": Entry("IDW", "idw"),
 }
@@ -57,22 +56,20 @@ FURNISHED = {
     "wrf-gs": replace(SPECTRUM["wrf-gs"], options=ROOM),
     "wrf-gs+-joint": Entry("WRF-GS+ with the scan's paths", "wrf-gs+", NAMED, quick=SHORT),
     "hybrid": Entry("hybrid, knows the scan", "hybrid", NAMED),
-    "ray-tracing": Entry("ray tracing in the scan", "ray-tracing", NAMED, THROUGH_WALLS, published="0.38, p90 0.61"),
+    "ray-tracing": Entry("ray tracing in the scan", "ray-tracing", NAMED, THROUGH_WALLS),
     "ray-tracing-corrected": Entry("ray tracing in the scan, corrected", "ray-tracing", CORRECTED, THROUGH_WALLS),
 }
 UNSEEN = {
     **SPECTRUM,
-    "ray-tracing": Entry(
-        "ray tracing, line of sight alone", "ray-tracing", NAMED, few_seeds=ONE, published="0.38, p90 0.61"
-    ),
+    "ray-tracing": Entry("ray tracing, line of sight alone", "ray-tracing", NAMED, few_seeds=ONE),
 }
 """Methods without a mesh, where only the direct path can be traced."""
 RSSI: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT, seeds=SEEDS, published="2.4, p10 1.1, p90 4.6"),
-    "wrf-gs": Entry("WRF-GS", "wrf-gs", quick=SHORT, seeds=SEEDS, published="2.9"),
+    "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT, seeds=SEEDS),
+    "wrf-gs": Entry("WRF-GS", "wrf-gs", quick=SHORT, seeds=SEEDS),
     "wrf-gs+-joint": Entry("WRF-GS+, knows walls", "wrf-gs+", NAMED, quick=SHORT, seeds=SEEDS),
     "hybrid": Entry("hybrid, knows walls and heading", "hybrid", NAMED),
-    "nerf2": Entry("NeRF2", "nerf2", quick=FEWER, few_seeds=ONE, published="3.1"),
+    "nerf2": Entry("NeRF2", "nerf2", quick=FEWER, few_seeds=ONE),
     "ray-tracing": Entry("ray tracing, calibrated, knows walls and heading", "ray-tracing", NAMED, CALIBRATED),
     "ray-tracing-corrected": Entry(
         "ray tracing, calibrated, walls corrected, knows heading", "ray-tracing", CORRECTED, CALIBRATED
@@ -81,15 +78,15 @@ RSSI: Mapping[str, Entry] = {
     "trees": Entry("randomised trees, know the heading", "trees", seeds=SEEDS),
     "kriging": Entry("kriging, knows the heading", "kriging"),
     "idw": Entry("IDW", "idw"),
-    "mri": Entry("MRI", "mri", published="8.3"),
+    "mri": Entry("MRI", "mri"),
 }
 UPLINK: Mapping[str, Entry] = {
-    "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT, seeds=SEEDS, published="23.91, p10 20.85, p90 25.52"),
-    "wrf-gs": Entry("WRF-GS", "wrf-gs", quick=SHORT, seeds=SEEDS, published="22.98, p10 20.82, p90 24.33"),
-    "nerf2": Entry("NeRF2", "nerf2", quick=FEWER, few_seeds=ONE, published="20.55"),
-    "fire": Entry("FIRE", "fire", quick=FEWER, seeds=SEEDS, published="15.29"),
-    "r2f2": Entry("R2F2", "r2f2", seeds=SEEDS, published="8.57"),
-    "optml": Entry("OptML", "optml", quick=FEWER, seeds=SEEDS, published="8.47"),
+    "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT, seeds=SEEDS),
+    "wrf-gs": Entry("WRF-GS", "wrf-gs", quick=SHORT, seeds=SEEDS),
+    "nerf2": Entry("NeRF2", "nerf2", quick=FEWER, few_seeds=ONE),
+    "fire": Entry("FIRE", "fire", quick=FEWER, seeds=SEEDS),
+    "r2f2": Entry("R2F2", "r2f2", seeds=SEEDS),
+    "optml": Entry("OptML", "optml", quick=FEWER, seeds=SEEDS),
     "linear": Entry("linear map", "linear", seeds=SEEDS),
     "hybrid": Entry("hybrid, from the uplink and positions", "hybrid"),
     "kriging": Entry("kriging, from positions", "kriging"),

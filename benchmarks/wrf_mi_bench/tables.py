@@ -1,27 +1,28 @@
 """Tables of every method of the paper for each task, from runs of ``wrf-mi train``.
 
-Each row of `wrf_mi_bench.table_plan` is stored as a JSON file when its run is done, so an interrupted measurement can
-be resumed, on another machine too. A row is measured again where its arguments or the content of its data set have
-changed, or its file is deleted; rows of other versions of packages are kept and reported. The name of a run folder has
-a key of command, source, data, scene and versions (`wrf_mi_bench.sources`).
+Each row of `wrf_mi_bench.table_plan` is stored as an entry of `wrf_mi.apps.table` when it is done, so an interrupted
+measurement can be resumed, on another machine too. A row is measured again where its arguments or the content of its
+data set have changed, or its file is deleted; rows of other versions of packages are kept and reported. The name of a
+run folder has a key of command, source, data, scene and versions (`wrf_mi_bench.sources`).
 """
 
 import json
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from wrf_mi_scenes.build_laboratory import sheet
 from wrf_mi_scenes.mitsuba_xml import write_scene
 
+from wrf_mi.apps.table.entries import Entry, entry_of, predictions_digest, read_entries, write_entry
 from wrf_mi.core import InputError
 from wrf_mi.core.digest import content_digest
-from wrf_mi.core.files import atomic_folder, one_line, remove_leftovers, write_atomically
+from wrf_mi.core.files import atomic_folder, one_line, remove_leftovers
 from wrf_mi.parallel import Scheduler
 from wrf_mi.runs.folder import CONFIG, is_finished, package_versions
 from wrf_mi.runs.results import read_run
@@ -31,19 +32,17 @@ from wrf_mi.scene.make import make_scene
 from wrf_mi.synthetic import load_record
 from wrf_mi.synthetic.floor_channels import MEASURED
 from wrf_mi.synthetic.stored import SCAN
-from wrf_mi.tasks.scores import summary
 
 from .bench import BenchFailed, provenance, run_command
 from .comparison import data_folder, say
 from .sources import fit_key, modules_of_command, source_digests, source_files
-from .table_pages import read_rows, write_tables
+from .table_pages import write_tables
 from .table_plan import CORRECTED, PARTS, Row, TablePart, available, plan
 
-FOLDER = "tables"  # folder of the rows; ``tables-quick`` for the small version
-QUANTILES = 101  # number of equally spaced quantiles of a row's scores
+FOLDER = "table"  # folder of the entries beside that of the results; ``table-quick`` for the small version
+LICENCE = "MIT"  # of this project
 FLAT_HEIGHT_M = 2.7  # height of the ceiling of the flat, which its layout lacks
 FAR_M, PLATE_M = 100.0, 0.01  # distance and size of the only surface of the open scene; Sionna RT needs one
-KEPT = ("n_train", "n_test", "train_seconds", "ms_per_sample", "peak_memory_mb", "reference")
 
 
 def scene_of(part: TablePart, folder: Path) -> Path:
@@ -103,8 +102,8 @@ def _scenes(row: Row, place: Path) -> list[Path]:
     return [corrected_scene(row, place) if row.entry.scene == CORRECTED else scene_of(row.part, place)]
 
 
-def measure(runs: Path, row: Row) -> dict[str, Any]:
-    """Figures of a row, from a finished run of the same key or a new one."""
+def measure(runs: Path, row: Row) -> Entry:
+    """Entry of a row, from a finished run of the same key or a new one."""
     scenes, data = _scenes(row, runs / "scenes"), _data_digest(row.part.dataset)
     source = source_digests(*modules_of_command(row.command.split()))
     folder = runs / f"{row.name}-{fit_key(row.command, source, data, [scene_files(place) for place in scenes])}"
@@ -118,44 +117,43 @@ def measure(runs: Path, row: Row) -> dict[str, Any]:
             shutil.rmtree(folder)  # stopped before its configuration was written
         scene = ["--scene", str(scenes[0])] if scenes else []
         wall = run_command(row.arguments(scene), folder, resumes=resumes)
-    run = read_run(folder)
-    scores = np.sort(run.score[~np.isnan(run.score)])
-    figures = {key: run.metrics[key] for key in KEPT}
-    if row.entry.scene == CORRECTED:
-        figures["train_seconds"] += json.loads((scenes[0] / CORRECTION).read_text(encoding="utf-8"))["seconds"]
-    facts = {"row": row.name, "label": row.entry.label, "share": row.share, "seed": row.seed, "command": row.command}
-    facts |= {**provenance(*modules_of_command(row.command.split())), "data": data, "wall_seconds": wall, **figures}
-    quantiles = [round(float(q), 5) for q in np.quantile(scores, np.linspace(0, 1, QUANTILES))]
-    return {**facts, "score": summary(scores), "quantiles": quantiles}
+    run, of_part = read_run(folder), row.part
+    facts: dict[str, Any] = {"method": row.method, "label": row.entry.label, "share": row.share, "seed": row.seed}
+    facts |= {"dataset": of_part.dataset, "split": of_part.split, "command": row.command, "licence": LICENCE}
+    facts |= {**provenance(*modules_of_command(row.command.split())), "data": data, "wall_seconds": wall}
+    entry = entry_of(run, predictions_digest(run), **facts)
+    if row.entry.scene != CORRECTED:
+        return entry
+    seconds = json.loads((scenes[0] / CORRECTION).read_text(encoding="utf-8"))["seconds"]
+    return replace(entry, train_seconds=(entry.train_seconds or 0) + seconds)
 
 
 def tables(
-    out: Path, runs: Path, quick: bool = False, scheduler: Scheduler | None = None, most_s: float | None = None
-) -> list[dict[str, Any]]:
-    """Measure all rows that are not stored yet and write tables and pictures; all stored rows.
+    place: Path, runs: Path, quick: bool = False, scheduler: Scheduler | None = None, most_s: float | None = None
+) -> dict[str, Entry]:
+    """Measure all rows that are not stored yet and write tables and pictures into a folder; all its entries.
 
     A row whose command fails is reported and omitted; the other rows are measured.
     """
-    place = out / (f"{FOLDER}-quick" if quick else FOLDER)
     place.mkdir(parents=True, exist_ok=True)
     remove_leftovers(place)
     rows = plan(quick)
     for name in sorted({row.part.dataset for row in rows if not available(row.part)}):
         say("tables", f"data set {name} is not on this machine and is left out; see wrf-mi data list")
-    stored, digests = {row["row"]: row for row in read_rows(place)}, dict[str, str]()
+    stored, digests = read_entries(place), dict[str, str]()
     left = [row for row in rows if available(row.part) and not _holds(stored.get(row.name), row, digests)]
     say("tables", f"{len(left)} of {len(rows)} rows to measure; results in {place}")
     _report_versions([stored[row.name] for row in rows if row.name in stored and row not in left])
     begun, failures = time.perf_counter(), list[str]()
 
-    def each(index: int, result: dict[str, Any] | str) -> None:
+    def each(index: int, result: Entry | str) -> None:
         if isinstance(result, str):
             if result:
                 failures.append(result)
                 say("tables", result)
             return
-        write_atomically(place / f"{left[index].name}.json", json.dumps(result, indent=1) + "\n")
-        say(result["row"], f"median {result['score']['median']:.3f}, {result['train_seconds']:.0f} s")
+        write_entry(place, result)
+        say(result.name, f"median {result.score['median']:.3f}, {result.train_seconds or 0:.0f} s")
         write_tables(place, quick)
 
     for part in dict.fromkeys(row.part for row in left if row.entry.scene):
@@ -168,7 +166,7 @@ def tables(
     say("tables", f"{place / 'README.md'} after {(time.perf_counter() - begun) / 60:.0f} min")
     if failures:
         raise BenchFailed(f"tables: {len(failures)} rows did not finish: {failures[0]}")
-    return read_rows(place)
+    return read_entries(place)
 
 
 def _data_digest(dataset: str) -> str:
@@ -178,30 +176,30 @@ def _data_digest(dataset: str) -> str:
     return content_digest(dataset_files(dataset))
 
 
-def _holds(stored: Mapping[str, Any] | None, row: Row, digests: dict[str, str]) -> bool:
+def _holds(stored: Entry | None, row: Row, digests: dict[str, str]) -> bool:
     """Whether a stored row has the planned command and, where it states them, the present data; fills ``digests``."""
-    if stored is None or stored["command"] != row.command:
+    if stored is None or stored.command != row.command:
         return False
     dataset = row.part.dataset
-    if "data" not in stored or not dataset_files(dataset):
+    if stored.data is None or not dataset_files(dataset):
         return True
     if dataset not in digests:
         digests[dataset] = _data_digest(dataset)
-    return stored["data"] == digests[dataset]
+    return stored.data == digests[dataset]
 
 
-def _report_versions(rows: Sequence[Mapping[str, Any]]) -> None:
+def _report_versions(rows: Sequence[Entry]) -> None:
     """Report how many kept rows have other versions of packages or do not state their data."""
     now = package_versions()
-    others = sum(any(row["versions"].get(name) != version for name, version in now.items()) for row in rows)
-    silent = sum("data" not in row for row in rows)
+    others = sum(any((row.versions or {}).get(name) != version for name, version in now.items()) for row in rows)
+    silent = sum(row.data is None for row in rows)
     for count, what in ((others, "were measured by other versions of packages"), (silent, "do not state their data")):
         if count:
             say("tables", f"{count} of {len(rows)} stored rows {what} and are kept; delete their files to measure them")
 
 
-def _guarded(runs: Path, until: float | None, row: Row) -> dict[str, Any] | str:
-    """A row, or the reason of its failure; "" where the time is over."""
+def _guarded(runs: Path, until: float | None, row: Row) -> Entry | str:
+    """Entry of a row, or the reason of its failure; "" where the time is over."""
     if until is not None and time.time() > until:
         return ""
     try:

@@ -46,7 +46,7 @@ def on_site(text: str, docs: Path, folder: Path) -> str:
             # From the top, as those of an included file are relative to the page that includes it.
             return f"[{shown}](/{path.relative_to(docs)}{anchor})"
         checkout = docs.parent
-        tables = checkout / "benchmarks/results/tables"
+        tables = checkout / "benchmarks/table"
         pages = {checkout / "README.md": "/index.md", tables: "/results.md", tables / "README.md": "/results.md"}
         if path in pages:
             return f"[{label}]({pages[path]})"

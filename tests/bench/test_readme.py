@@ -15,11 +15,12 @@ from documents import CHECKOUT, DOCS, PAGE_NAMES, PAGES, README, blocks, marked
 from PIL import Image
 from wrf_mi_bench.bench import CASES, CHECKS
 from wrf_mi_bench.command import TABLES
-from wrf_mi_bench.front_page import OF_STAGES, OF_TABLES, QUESTIONS, SCENE, question_table
-from wrf_mi_bench.stages import ALONE
+from wrf_mi_bench.entries import stored_entries
+from wrf_mi_bench.front_page import METHODS, SCENE, question_table
 from wrf_mi_bench.table_plan import PARTS
 
 from wrf_mi.apps.commands.main import build_parser
+from wrf_mi.apps.table.entries import read_entries
 from wrf_mi.core import Receiver, Record
 from wrf_mi.core.settings import describe, with_settings
 from wrf_mi.datasets import write_spectrum_folder
@@ -104,16 +105,22 @@ def test_readme_is_short_and_leads_from_a_scan_to_a_map():
 
 
 def test_questions_of_the_readme_are_answered_by_stored_results():
-    assert marked("README.md", "questions") == question_table(CHECKOUT / "benchmarks" / "results")
+    assert marked("README.md", "questions") == question_table(CHECKOUT / "benchmarks" / "table")
 
 
 def test_columns_of_the_readme_separate_methods_with_a_scene():
-    asked = {question.data.strip("`").split(" ")[0] for question in QUESTIONS if question.columns is OF_TABLES}
-    entries = {name: entry for part in PARTS if part.dataset in asked for name, entry in part.entries.items()}
-    scenes = [(OF_TABLES[name], bool(entry.scene)) for name, entry in entries.items() if name in OF_TABLES]
-    scenes += [(column, bool(ALONE[name].scene)) for name, column in OF_STAGES.items() if name in ALONE]
-    assert len(scenes) == 13
-    assert all((column < SCENE) == scene for column, scene in scenes)
+    scenes = [
+        (METHODS[name], bool(entry.scene)) for part in PARTS for name, entry in part.entries.items() if name in METHODS
+    ]
+    assert len(scenes) > 20
+    assert all((column < SCENE) == scene for column, scene in scenes if column != METHODS["hybrid"])
+
+
+def test_entries_of_other_benchmarks_are_those_of_their_stored_results():
+    table = read_entries(CHECKOUT / "benchmarks" / "table")
+    derived = {entry.name: entry for entry in stored_entries(CHECKOUT / "benchmarks" / "results")}
+    assert len(derived) > 100
+    assert [name for name, entry in derived.items() if table.get(name) != entry] == []
 
 
 @pytest.mark.parametrize("path", PAGES, ids=PAGE_NAMES)

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from wrf_mi_bench.bench import BenchFailed
 from wrf_mi_bench.table_pages import LEAST, Points, front, front_table, fronts, pareto_figure, points_of, read_points
 from wrf_mi_bench.table_plan import PARTS, QUICK_PARTS, Row, TablePart, plan
 
+from wrf_mi.apps.table.entries import QUANTILES, Entry, read_entries, write_entry
 from wrf_mi.core import InputError
 from wrf_mi.models import MODELS
 from wrf_mi.scene.correction_data import FILE as CORRECTION
@@ -29,16 +29,31 @@ def part_of(dataset: str) -> TablePart:
     return next(part for part in PARTS if part.dataset == dataset)
 
 
-def made_row(row: Row, median: float, **more: object) -> dict:
+PUBLISHED = {("uplink", "r2f2"): "8.57", ("uplink", "fire"): "15.29"}
+
+
+def made_row(row: Row, median: float, **more: Any) -> Entry:
     block = {"median": median, "mean": median, "p10": median - 1, "p90": median + 1}
-    return {
-        **{"row": row.name, "label": row.entry.label, "share": row.share, "seed": row.seed, "command": row.command},
+    facts: dict[str, Any] = {
+        **{"label": row.entry.label, "share": row.share, "seed": row.seed, "command": row.command},
+        **{"method": row.method, "task": row.part.task, "dataset": row.part.dataset, "split": row.part.split},
         **{"date": "2026-01-01", "versions": tables.package_versions(), "n_train": 10, "n_test": 5},
         **{"train_seconds": 3.0, "ms_per_sample": 1.25, "peak_memory_mb": 400.0},
         **{"reference": {"uplink": block | {"median": -7.0}}, "score": block},
-        "quantiles": [median - 1 + 0.02 * i for i in range(tables.QUANTILES)],
-        **more,
+        "quantiles": [median - 1 + 0.02 * i for i in range(QUANTILES)],
     }
+    return Entry(**facts | more)
+
+
+def stub_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Entries of runs that took 3 s, whatever their folders hold."""
+
+    def entry(run: object, predictions: str, **facts: Any) -> Entry:
+        return Entry(**{"task": "rssi", "score": {}, "train_seconds": 3.0, **facts})
+
+    monkeypatch.setattr(tables, "read_run", lambda folder: None)
+    monkeypatch.setattr(tables, "predictions_digest", lambda run: "")
+    monkeypatch.setattr(tables, "entry_of", entry)
 
 
 def test_every_method_of_the_paper_is_planned_for_its_task():
@@ -85,12 +100,12 @@ def test_row_is_stored_when_done_and_not_measured_twice(short_plan, monkeypatch,
 
     monkeypatch.setattr(tables, "measure", measure)
     with pytest.raises(BenchFailed, match=r"1 rows did not finish: .*: r2f2 stumbled"):
-        tables.tables(tmp_path, tmp_path / "runs")
-    stored = {path.stem for path in (tmp_path / "tables").glob("*.json")}
+        tables.tables(tmp_path / "table", tmp_path / "runs")
+    stored = {path.stem for path in (tmp_path / "table").glob("*.json")}
     assert stored == {row.name for row in short_plan if row.method == "fire"}
-    tables.tables(tmp_path, tmp_path / "runs")
+    tables.tables(tmp_path / "table", tmp_path / "runs")
     assert asked == [row.name for row in short_plan] + [short_plan[1].name]
-    assert len(tables.tables(tmp_path, tmp_path / "runs")) == 3
+    assert len(tables.tables(tmp_path / "table", tmp_path / "runs")) == 3
     assert len(asked) == 4
 
 
@@ -106,25 +121,25 @@ def test_rows_of_other_data_or_commands_are_measured_again_and_of_other_versions
         return made_row(row, 5.0, data=tables.content_digest([data]))
 
     def change(row, **changes):
-        path = tmp_path / "tables" / f"{row.name}.json"
+        path = tmp_path / "table" / f"{row.name}.json"
         stored = {**json.loads(path.read_text()), **changes}
         path.write_text(json.dumps({key: value for key, value in stored.items() if value is not None}))
 
     monkeypatch.setattr(tables, "measure", measure)
     for _ in range(2):
-        tables.tables(tmp_path, tmp_path / "runs")
+        tables.tables(tmp_path / "table", tmp_path / "runs")
         assert asked == [row.name for row in short_plan]
     assert "stored rows" not in capsys.readouterr().err
     older: tuple[dict[str, Any], ...] = {"data": "other"}, {"versions": {"numpy": "0.1"}}, {"data": None}
     for row, changes in zip(short_plan, older, strict=True):
         change(row, **changes)
-    tables.tables(tmp_path, tmp_path / "runs")
+    tables.tables(tmp_path / "table", tmp_path / "runs")
     assert asked[3:] == [short_plan[0].name]
     err = capsys.readouterr().err
     assert "1 of 2 stored rows were measured by other versions of packages and are kept" in err
     assert "1 of 2 stored rows do not state their data and are kept" in err
     change(short_plan[0], command=short_plan[0].command.replace("--model fire", "--model fire --set steps=1"))
-    tables.tables(tmp_path, tmp_path / "runs")
+    tables.tables(tmp_path / "table", tmp_path / "runs")
     assert asked[4:] == [short_plan[0].name]
 
 
@@ -141,23 +156,22 @@ def test_scenes_are_made_once_and_can_be_opened(flat_folder, monkeypatch, tmp_pa
 def test_runs_of_rows_are_used_again_but_for_other_data_or_versions(tmp_path, monkeypatch, capsys):
     row, data, asked = Row(part_of("flat-ble"), "idw", 1.0, 0), tmp_path / "data", []
     data.mkdir()
-    metrics = dict.fromkeys(tables.KEPT, 1)
 
     def run(module, arguments):
         asked.append(Path(arguments[-1]))
         asked[-1].mkdir(parents=True)
-        (asked[-1] / "metrics.json").write_text(json.dumps(metrics))
+        (asked[-1] / "metrics.json").write_text("{}")
         return 0, ""
 
     monkeypatch.setattr(tables, "dataset_files", lambda dataset: [data])
     monkeypatch.setattr(bench, "run_module", run)
-    monkeypatch.setattr(tables, "read_run", lambda folder: SimpleNamespace(score=np.ones((1, 3)), metrics=metrics))
+    stub_results(monkeypatch)
     first = tables.measure(tmp_path, row)
-    assert tables.measure(tmp_path, row)["data"] == first["data"]
+    assert tables.measure(tmp_path, row).data == first.data
     assert len(asked) == 1
     assert f"{row.name}: finished before in {asked[0]}" in capsys.readouterr().err
     (data / "rows.csv").write_text("1")
-    assert tables.measure(tmp_path, row)["data"] != first["data"]
+    assert tables.measure(tmp_path, row).data != first.data
     versions = sources.versions() | {"drjit": "0.1"}
     monkeypatch.setattr(sources, "versions", lambda: versions)
     tables.measure(tmp_path, row)
@@ -166,13 +180,14 @@ def test_runs_of_rows_are_used_again_but_for_other_data_or_versions(tmp_path, mo
 
 def test_no_row_begins_after_the_time_limit(short_plan, monkeypatch, tmp_path):
     monkeypatch.setattr(tables, "measure", lambda runs, row: pytest.fail("begun"))
-    assert tables.tables(tmp_path, tmp_path / "runs", most_s=-1.0) == []
+    assert tables.tables(tmp_path / "table", tmp_path / "runs", most_s=-1.0) == {}
 
 
 def test_the_best_method_comes_first_and_the_reference_last(short_plan, tmp_path):
     fire, r2f2, few = short_plan
     for row, median in ((fire, 5.0), (r2f2, 6.5), (few, 9.0)):
-        (tmp_path / f"{row.name}.json").write_text(json.dumps(made_row(row, median)))
+        write_entry(tmp_path, made_row(row, median))
+    (tmp_path / "published.yml").write_text("figures: [{method: R2F2, key: r2f2, table: uplink, figure: '8.57'}]")
     table_pages.write_tables(tmp_path)
     text = (tmp_path / "README.md").read_text()
     order = [text.index(cell) for cell in ("| R2F2 | **6.50**", "| FIRE | **5.00**", "| FIRE | **9.00**", "**-7.00**")]
@@ -182,14 +197,14 @@ def test_the_best_method_comes_first_and_the_reference_last(short_plan, tmp_path
 
 
 def test_damaged_row_is_reported(tmp_path):
-    (tmp_path / "a-seed0.json").write_text('{"row": ')
+    (tmp_path / "a-seed0.json").write_text('{"method": ')
     with pytest.raises(InputError, match=r"a-seed0\.json: not readable .*restore it, or delete it"):
-        table_pages.read_rows(tmp_path)
+        read_entries(tmp_path)
 
 
 def test_missing_data_sets_are_skipped(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(tables, "available", lambda part: False)
-    assert tables.tables(tmp_path, tmp_path / "runs") == []
+    assert tables.tables(tmp_path / "table", tmp_path / "runs") == {}
     assert "flat-ble is not on this machine" in capsys.readouterr().err
 
 
@@ -205,10 +220,10 @@ def test_overview_has_a_line_per_method_with_the_mean_over_seeds(monkeypatch):
     monkeypatch.setattr(table_pages, "plan", lambda quick=False: rows)
     medians = (5.0, 7.0, 100.0, 3.0, 9.5)
     stored = {row.name: made_row(row, median) for row, median in zip(rows, medians, strict=True)}
-    lines = table_pages.overview("uplink", stored).splitlines()
+    lines = table_pages.overview("uplink", stored, PUBLISHED).splitlines()
     assert lines[0] == "| CEA (dB) | traced-csi-flat | traced-csi-office | paper, other data |"
     assert lines[2:] == ["| R2F2 | **9.50** |  | 8.57 |", "| FIRE | 6.00 | **3.00** | 15.29 |"]
-    assert table_pages.overview("rssi", stored) == ""
+    assert table_pages.overview("rssi", stored, PUBLISHED) == ""
 
 
 def test_rows_of_data_as_they_were_made_before_are_marked(monkeypatch, tmp_path):
@@ -218,18 +233,18 @@ def test_rows_of_data_as_they_were_made_before_are_marked(monkeypatch, tmp_path)
     monkeypatch.setattr(table_pages, "plan", lambda quick=False: rows)
     stated = [{"date": "2026-01-02", "data": "new"}, {"date": "2026-01-01", "data": "old"}, {"date": "2026-01-01"}]
     stored = {row.name: made_row(row, 5.0, **facts) for row, facts in zip(rows, stated * 2, strict=True)}
-    remade, measured = (table_pages.part_table(part, table_pages.grouped(part, stored)) for part in parts)
+    remade, measured = (table_pages.part_table(part, table_pages.grouped(part, stored), PUBLISHED) for part in parts)
     labels = [line.split("|")[2].strip() for line in remade.splitlines()[2:5]]
     assert labels == ["WRF-GS", "WRF-GS+ †", "kriging, from positions †"]
     assert "†" not in measured
-    assert table_pages.overview("uplink", stored).count("†") == 2
-    assert "†" not in table_pages.overview("rssi", stored)
+    assert table_pages.overview("uplink", stored, PUBLISHED).count("†") == 2
+    assert "†" not in table_pages.overview("rssi", stored, PUBLISHED)
 
 
 @pytest.mark.parametrize("name", table_pages.IN_RESULTS)
 def test_results_page_shows_the_stored_overviews(name):
-    stored = table_pages.read_rows(CHECKOUT / "benchmarks" / "results" / "tables")
-    overview = table_pages.overview(name, {row["row"]: row for row in stored})
+    place = CHECKOUT / "benchmarks" / "table"
+    overview = table_pages.overview(name, read_entries(place), table_pages.published(place))
     assert marked("docs/results.md", name).strip() == overview
 
 
@@ -244,14 +259,13 @@ def test_a_corrected_scene_is_made_once_and_its_time_counts(flat_folder, monkeyp
         (folder / CORRECTION).write_text(json.dumps({"seconds": 40.0}))
         return 50.0
 
-    run = SimpleNamespace(score=np.array([1.0, 2.0]), metrics=dict.fromkeys(tables.KEPT, 1) | {"train_seconds": 3.0})
     monkeypatch.setattr(tables, "run_command", run_command)
-    monkeypatch.setattr(tables, "read_run", lambda folder: run)
+    stub_results(monkeypatch)
     part = part_of("flat-ble")
     row = Row(part, "ray-tracing-corrected", 1.0, 0)
     assert "--scene {flat, corrected}" in row.command
     for _ in range(2):
-        assert tables.measure(tmp_path, row)["train_seconds"] == 43
+        assert tables.measure(tmp_path, row).train_seconds == 43
     assert [words[0] for words in calls] == ["correct", "train", "train"]  # the run is not finished: no metrics
     scene = tables.scene_of(part, tmp_path / "scenes")
     assert calls[0] == ["correct", "flat-ble", "--scene", str(scene), "--split", "official", "--seed", "0"]
@@ -279,8 +293,7 @@ def test_front_holds_the_pareto_optimal_methods_from_cheap_to_costly():
 def test_points_are_means_of_medians_over_seeds_of_all_training_rows():
     rows = [Row(RFID, "vae", 1.0, 0), Row(RFID, "vae", 1.0, 1), Row(RFID, "vae", 1.0, 2), Row(RFID, "kriging", 0.1, 0)]
     stored = {
-        row.name: {"score": {"median": 0.1 * k}, "ms_per_sample": 10.0**k, "train_seconds": 2.0 * k}
-        for k, row in enumerate(rows)
+        row.name: made_row(row, 0.1 * k, ms_per_sample=10.0**k, train_seconds=2.0 * k) for k, row in enumerate(rows)
     }
     assert points_of(RFID, stored) == {
         "vae": {"score": pytest.approx(0.1), "ms_per_sample": 10.0, "train_seconds": 2.0}
@@ -304,5 +317,5 @@ def test_text_and_picture_show_both_fronts():
 
 
 def test_missing_rows_are_reported(tmp_path):
-    with pytest.raises(InputError, match="no stored rows; call it in a checkout that has them, or run wrf-mi bench"):
+    with pytest.raises(InputError, match="no entries; call it in a checkout that has them, or run wrf-mi bench"):
         read_points(tmp_path)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from ..core import InputError
 from ..core.angles import FloatArray
-from ..core.files import atomic_folder, write_atomically, write_csv, write_figure
+from ..core.files import atomic_folder, listed, write_atomically, write_csv, write_figure
 from ..estimators.ray_tracing import PATHS
 from ..scene.drawing import without_formulas
 from ..tasks import TASKS
@@ -38,7 +38,7 @@ from .scene_view import scene_view
 
 INDEX = "index.html"
 
-Picture = tuple[str, str, Figure]  # name, heading, figure
+Picture = tuple[str, str, str, Figure]  # name, heading, what is seen in words, figure
 
 
 def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProgress = quiet) -> Path:
@@ -81,7 +81,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
             on_progress("comparing", done / len(groups))
             shown = pictures(slug, runs)
             drawn += shown
-            files = [(folder / name, title) for name, title, _ in shown]
+            files = [(folder / name, title, seen) for name, title, seen, _ in shown]
             sections.append(Section(slug, runs, score_rows(runs), method_rows(runs), differences(runs), files))
 
         # Tables, pictures, and the page that holds both.
@@ -90,7 +90,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
             _write_table(folder / "methods.csv", METHODS, (section.methods for section in sections))
         changes = (difference_rows(section.differences) for section in sections)
         _write_table(folder / "differences.csv", DIFFERENCES, changes)
-        for done, (name, _, figure) in enumerate(drawn):
+        for done, (name, _, _, figure) in enumerate(drawn):
             on_progress("drawing", done / len(drawn))
             write_figure(folder / name, without_formulas(figure))
         write_atomically(folder / INDEX, page(sections, out))
@@ -128,6 +128,7 @@ def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
     task = TASKS[runs[0].task]
     of_references = {name: run.reference_scores[key] for name, (run, key) in references(runs).items()}
     cdf = figures.score_cdf({run.name: run.score for run in runs}, of_references, task.label)
+    medians = listed((f"{run.name} {run.metrics[task.block]['median']:.3g}" for run in runs), len(runs))
     drawn: list[tuple[str, str, Figure | None]] = [
         ("cdf", f"{task.label} over test rows", cdf),
         ("samples", *samples(runs)),
@@ -137,7 +138,18 @@ def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
         ("scene", "Mesh, traced paths and the strongest Gaussians of the field", _scene(runs)),
         ("training", "Training", _training(runs)),
     ]
-    return [(f"{slug}-{name}.png", heading, figure) for name, heading, figure in drawn if figure is not None]
+    seen = {
+        "cdf": f"a curve for each run, the share of test rows up to a score; medians: {medians}",
+        "samples": "measured beside each run's prediction, a line for each of three test rows",
+        "time": f"a point for each run, median score over times of prediction and training; medians: {medians}",
+        "stages": "scores on held-out rows, a step for each stage",
+        "errors": f"a map for each run, test positions coloured by their score; medians: {medians}",
+        "best": "test positions in the colour of the run with the best score there",
+        "scene": "seen from above",
+        "training": "scores on validation rows over the time of training, a curve for each run",
+    }
+    shown = [(name, heading, figure) for name, heading, figure in drawn if figure is not None]
+    return [(f"{slug}-{name}.png", heading, f"{heading}: {seen[name]}", figure) for name, heading, figure in shown]
 
 
 def _times(runs: Sequence[Results]) -> Figure:
@@ -162,7 +174,7 @@ def _training(runs: Sequence[Results]) -> Figure | None:
     return figures.training_curves(curves, TASKS[runs[0].task].label) if curves else None
 
 
-def _error_maps(runs: Sequence[Results]) -> list[Picture]:
+def _error_maps(runs: Sequence[Results]) -> list[tuple[str, str, Figure | None]]:
     """Scores over the first run's test positions, and the best run at each that several predict; none without them."""
     first, task = runs[0], TASKS[runs[0].task]
     if not np.isfinite(first.tx_pos_m).all():
@@ -173,7 +185,7 @@ def _error_maps(runs: Sequence[Results]) -> list[Picture]:
     where = "over receivers, " if len(first.receivers) > 1 else ""
     table = figures.position_table([("", shown)], names, first.tx_pos_m, task.label)
     heading = f"{task.label} at the test positions of {first.name} (mean {where}seen from above)"
-    maps: list[Picture] = [("errors", heading, table)]
+    maps: list[tuple[str, str, Figure | None]] = [("errors", heading, table)]
     several = (~np.isnan(scores)).sum(axis=0) > 1
     if several.any():
         ranked = np.where(np.isnan(scores), -np.inf, scores if task.higher_is_better else -scores)

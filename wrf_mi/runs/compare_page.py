@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 import os
 import platform
@@ -11,11 +9,8 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from datetime import datetime
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
-
-from PIL import Image
 
 from ..core import AntennaOptions
 from ..core.settings import flat
@@ -23,7 +18,7 @@ from ..core.yaml_files import read_yaml
 from ..datasets.registry import KNOWN
 from ..estimators.model import default_settings
 from ..tasks import TASKS
-from .baselines import warnings_of
+from .baselines import CONSTANT, verdicts, warnings_of
 from .compare_tables import (
     BETTER,
     COLUMNS,
@@ -39,12 +34,15 @@ from .compare_tables import (
     first_differences,
 )
 from .folder import CONFIG, RunConfig, known_config, stored_versions
+from .page import definitions, document, escaped, picture, sorted_table
 from .results import PREDICTED, Results
 
 NUMERIC = frozenset(COLUMNS) - {"run", "model", "dataset", "split", "metric"}
-CONSTANT = ("dataset", "metric")  # columns that are equal in a section, whose heading states them
+GAINS = frozenset(("rows", "blocks", "difference", "low", "high"))
+"""Columns of numbers in the tables of scores and of differences."""
+SAME = ("dataset", "metric")  # columns that are equal in a section, whose heading states them
 MOST_RUNS = 8  # largest number of runs of which the page lists all pairs
-FIRST = ("run", "median", "mean", "common_mean")  # columns that narrow screens show without scrolling
+FIRST = ("run", "rank", "median", "mean", "common_mean")  # columns that narrow screens show without scrolling
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ class Section:
     scores: Sequence[Mapping[str, Any]]  # rows of the table of scores, by `COLUMNS`
     methods: list[dict[str, Any]]  # rows of the table of methods; none without several seeds
     differences: Sequence[Difference]  # paired differences
-    pictures: Sequence[tuple[Path, str]]  # file and heading of each picture
+    pictures: Sequence[tuple[Path, str, str]]  # file and heading of each picture, and what is seen in words
 
     @property
     def title(self) -> str:
@@ -69,52 +67,41 @@ def page(sections: Sequence[Section], folder: Path) -> str:
     """HTML of a comparison in a folder; the pictures must have been written."""
     runs = [run for section in sections for run in section.runs]
     count = f"{len(runs)} run{'s' if len(runs) > 1 else ''}"
-    links = " · ".join(f'<a href="#{_text(part.slug)}">{_text(part.title)}</a>' for part in sections)
+    links = " · ".join(f'<a href="#{escaped(part.slug)}">{escaped(part.title)}</a>' for part in sections)
     contents = f"<nav>{links}</nav>" if len(sections) > 1 else ""
     today = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     again = shlex.join(["wrf-mi", "compare", *(str(run.path) for run in runs), "--out", str(folder)])
-    style, script = (files(__package__).joinpath(f"compare_page.{kind}").read_text("utf-8") for kind in ("css", "js"))
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Comparison of runs</title>
-<style>
-{style}</style>
-<h1>Comparison of {count}</h1>
-<p class="note">Made {today} by <code>{_text(again)}</code></p>
+    body = f"""<h1>Comparison of {count}</h1>
 {contents}
 {"".join(map(_section, sections))}
 <h2>Versions and machines</h2>
 {_versions(runs)}
-<script>
-{script}</script>
-</html>
-"""
+<p class="note">Made {today} by <code>{escaped(again)}</code></p>"""
+    return document("Comparison of runs", body)
 
 
 def _section(section: Section) -> str:
-    shown = {key: COLUMNS[key] for key in dict.fromkeys((*FIRST, *COLUMNS)) if key not in CONSTANT}
+    shown = {key: COLUMNS[key] for key in dict.fromkeys((*FIRST, *COLUMNS)) if key not in SAME}
     listed, words = section.differences, ""
     if len(section.runs) > MOST_RUNS:
         listed, words = first_differences(section.runs, listed), " Further pairs are in differences.csv."
-    gains = _table(DIFFERENCES, difference_rows(listed), frozenset(("rows", "blocks", "difference", "low", "high")))
-    images = "\n".join(_image(path, title) for path, title in section.pictures)
+    gains = sorted_table(
+        DIFFERENCES, difference_rows(listed), frozenset(("rows", "blocks", "difference", "low", "high"))
+    )
+    images = "\n".join(picture(path.read_bytes(), title, seen) for path, title, seen in section.pictures)
     best = best_run(section.runs).name
     lines = [_command(run) for run in section.runs]
     others = f" and the best run by mean score on common rows, {best}; then all other pairs"
     others = others if len(section.runs) > 1 else ""
     return f"""
-<h2 id="{_text(section.slug)}">{_text(section.title)}</h2>
-{_facts(section.runs)}
-<h3>Models</h3>
-{_models(section.runs)}
+<h2 id="{escaped(section.slug)}">{escaped(section.title)}</h2>
+{_result(section.runs)}
 <h3>Scores</h3>
-<p class="note">{_text(TASKS[section.runs[0].task].label)}, {_better(section.runs[0])}. Click a heading to sort.
-The median comes first here, the verdicts below are of differences of means: they may rank runs differently.</p>
-{_table(shown, section.scores, NUMERIC)}
+<p class="note">{escaped(TASKS[section.runs[0].task].label)}, {_better(section.runs[0])}. Ranked by the median; click a
+heading to sort. Paired differences are of means: they may rank runs differently.</p>
+{sorted_table(shown, section.scores, NUMERIC)}
 {_unbeaten(section.runs)}{_methods(section.methods)}<h3>Paired differences</h3>
-<p class="note">Each run against its best reference{_text(others)}, on the test rows that both have: mean difference
+<p class="note">Each run against its best reference{escaped(others)}, on the test rows that both have: mean difference
 per row, positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of blocks of rows: clusters
 of their positions, since near rows resemble each other, or else stretches of consecutive rows. {BETTER} and {WORSE}:
 the interval excludes zero, in all seeds; else a tie. {NO_GAIN}: the run would be {BETTER}, but is not better than the
@@ -122,15 +109,36 @@ constant prediction. {OTHER_ROWS}: differences would be those of the training
 rows.{words}</p>
 {gains}
 {images}
+<h3>Data and models</h3>
+{_facts(section.runs)}
+{_models(section.runs)}
 <h3>Commands</h3>
-<pre>{_text(chr(10).join(lines))}</pre>
+<pre>{escaped(chr(10).join(lines))}</pre>
 """
+
+
+def _result(runs: Sequence[Results]) -> str:
+    """The runs, best median first, each with its verdicts against the best constant and the best simple model."""
+    task = TASKS[runs[0].task]
+
+    def score(run: Results) -> float:
+        return float(run.metrics[task.block]["median"])
+
+    ranked = sorted(runs, key=score, reverse=task.higher_is_better)
+    lines = []
+    for run in ranked[:MOST_RUNS]:
+        # Earlier versions store no constant, or no gains.
+        whole = CONSTANT in run.metrics and all("gain" in block for block in run.metrics["reference"].values())
+        words = verdicts(run.metrics) if whole else [f"median {score(run):.4g}"]
+        lines.append(f"<li><b>{escaped(run.name)}</b>: {escaped('. '.join(words))}</li>")
+    more = f"<p>{len(runs) - MOST_RUNS} more below.</p>" if len(runs) > MOST_RUNS else ""
+    return f"<ol>{''.join(lines)}</ol>{more}"
 
 
 def _unbeaten(runs: Sequence[Results]) -> str:
     """What the command says of runs that are no better than the constant prediction."""
     lines = [f"{run.name}: {line}" for run in runs for line in warnings_of(run.metrics)]
-    return "".join(f'<p class="note">{_text(line)}</p>\n' for line in lines)
+    return "".join(f'<p class="note">{escaped(line)}</p>\n' for line in lines)
 
 
 def _methods(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -141,7 +149,7 @@ def _methods(rows: Sequence[Mapping[str, Any]]) -> str:
 <p class="note">Runs that differ in their seed alone are one method. The difference from the best method is that of
 scores that are means over seeds, on the rows that all runs score, positive in favour of the method, with the interval
 over blocks of rows; the standard deviations are those over seeds.</p>
-{_table(METHODS, rows, frozenset(METHODS) - {"method"})}
+{sorted_table(METHODS, rows, frozenset(METHODS) - {"method"})}
 """
 
 
@@ -165,17 +173,11 @@ def _facts(runs: Sequence[Results]) -> str:
         facts["common"] = f"{count} test rows are common to all runs{text}"
     facts["reference"] = _distinct(run.reference_name for run in runs) + " (of the same training rows)"
     facts["scene"] = _distinct(str(run.metrics.get("scene") or "") for run in runs)
-    return _definitions(facts)
+    return definitions(facts)
 
 
 def _distinct(texts: Iterable[str]) -> str:
     return "; ".join(dict.fromkeys(filter(None, texts)))
-
-
-def _definitions(facts: Mapping[str, str]) -> str:
-    """Facts as a list of definitions; empty ones are left out."""
-    terms = (f"<dt>{_text(key)}</dt><dd>{_text(words)}</dd>" for key, words in facts.items() if words)
-    return f"<dl>{''.join(terms)}</dl>"
 
 
 def _models(runs: Sequence[Results]) -> str:
@@ -194,7 +196,7 @@ def _models(runs: Sequence[Results]) -> str:
         described = config.entry.described(config.scene is not None)
         words = f"{config.model}: {described}" + (", calibrated intervals" if config.intervals else "")
         rows.append({"run": run.name, "model": words, "settings": changed or "none", "scene": config.scene})
-    return _table(columns, rows, frozenset())
+    return sorted_table(columns, rows, frozenset())
 
 
 def _versions(runs: Sequence[Results]) -> str:
@@ -205,46 +207,7 @@ def _versions(runs: Sequence[Results]) -> str:
         groups.setdefault(versions or "not stored", []).append(run.name)
     machine = f"{platform.platform()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     facts = {", ".join(names): words for words, names in groups.items()} | {"this page": machine}
-    return _definitions(facts)
-
-
-def _table(columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]], numeric: frozenset[str]) -> str:
-    """Table that sorts by a click on a heading; columns without a value are left out."""
-    filled = {key: title for key, title in columns.items() if any(row.get(key) is not None for row in rows)}
-    buttons = {key: f'<button type="button">{_text(title)}</button>' for key, title in filled.items()}
-    head = "".join(f'<th scope="col"{_class(key, numeric)}>{button}</th>' for key, button in buttons.items())
-    body = "\n".join("<tr>" + "".join(_cell(key, row.get(key), numeric) for key in filled) + "</tr>" for row in rows)
-    table = f'<table class="sorts"><thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table>'
-    return f'<div class="scroll">{table}</div>'
-
-
-def _class(key: str, numeric: frozenset[str]) -> str:
-    return ' class="n"' if key in numeric else ""
-
-
-def _cell(key: str, value: Any, numeric: frozenset[str]) -> str:
-    """A value with four significant digits, empty where unknown; verdicts are coloured."""
-    if value is None or value != value:  # NaN: not stated by another program
-        return f"<td{_class(key, numeric)}></td>"
-    if key == "verdict":
-        return f'<td class="{_text(str(value).partition(" ")[0])}">{_text(value)}</td>'
-    exact = f' data-value="{_text(value)}"' if key in numeric else ""
-    shown = f"{value:.4g}" if isinstance(value, float) else str(value)
-    return f"<td{_class(key, numeric)}{exact}>{_text(shown)}</td>"
-
-
-def _image(path: Path, title: str) -> str:
-    with Image.open(path) as picture:
-        width, height = picture.size
-    data = base64.b64encode(path.read_bytes()).decode()
-    # On a telephone a wide picture keeps half its size, at which its texts are legible, and scrolls.
-    size = f'width="{width}" height="{height}" style="--least: {width // 2}px"'
-    image = f'<img src="data:image/png;base64,{data}" {size} alt="{_text(title)}">'
-    return f'<h3>{_text(title)}</h3>\n<div class="scroll">{image}</div>'
-
-
-def _text(value: Any) -> str:
-    return html.escape(str(value))
+    return definitions(facts)
 
 
 def changed_settings(config: RunConfig) -> dict[str, Any]:

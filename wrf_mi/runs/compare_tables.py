@@ -20,7 +20,7 @@ from .baselines import CONSTANT, CONSTANT_RMSE, constant_of, warnings_of
 from .folder import known_config
 from .results import PREDICTED, Results
 
-COLUMNS = {"run": "run", "model": "model", "dataset": "data set", "split": "split", "seed": "seed"}
+COLUMNS = {"rank": "rank", "run": "run", "model": "model", "dataset": "data set", "split": "split", "seed": "seed"}
 COLUMNS |= {"n_train": "training rows (mean of folds)", "n_test": "test rows", "metric": "score"}
 COLUMNS |= {key: key for key in ("median", "mean", "p10", "p90")} | {"common_mean": "mean, common rows"}
 COLUMNS |= {"bias": "bias (dB)", "std": "standard deviation of the error (dB)", "rmse": "RMSE (dB)"}
@@ -255,7 +255,7 @@ def _method(run: Results) -> Any:
 
 
 def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
-    """Rows of the table for a data set: each run, and each reference once."""
+    """Rows of the table for a data set, best median first: each run, and each reference and constant once."""
     task = TASKS[runs[0].task]
     means = common_means(runs)
     rows: list[dict[str, Any]] = [
@@ -267,7 +267,8 @@ def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
         rows.append(counts | run.metrics["reference"][key] | {"run": name, "model": key})
     rows += _constants(runs)
     shared = {"dataset": Path(runs[0].dataset).name or runs[0].dataset, "metric": task.label}
-    return [{column: (row | shared).get(column) for column in COLUMNS} for row in rows]
+    rows.sort(key=lambda row: float(row["median"]), reverse=task.higher_is_better)
+    return [{column: (row | shared | {"rank": n}).get(column) for column in COLUMNS} for n, row in enumerate(rows, 1)]
 
 
 def _constants(runs: Sequence[Results]) -> list[dict[str, Any]]:

@@ -25,6 +25,7 @@ MODULES = (
     "runs",
     "maps",
     "export",
+    "table",
     "bench",
     "demo",
 )  # in the order of the help
