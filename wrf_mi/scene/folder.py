@@ -119,7 +119,7 @@ def write_scene(
         write_atomically(part / XML_FILE, scene_xml(full.by_surface(), full.constants))
         write_atomically(part / MATERIALS_FILE, materials_text(full))
         write_atomically(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
-        drawn = {"points_m": points_m, "drawing_below": drawing_below, "positions_m": positions_m}
+        drawn: dict[str, Any] = {"points_m": points_m, "drawing_below": drawing_below, "positions_m": positions_m}
         write_figure(part / PREVIEW_FILE, draw_scene(surfaces, materials=full.by_surface(), **drawn))
     return folder
 
