@@ -60,9 +60,12 @@ def read_dxf(path: Path, units: str | None = None, layers: Sequence[str] = ()) -
     if (unit := units or stated) not in UNITS_M:
         raise InputError(f"{path}: does not state the unit of its lines; give it by --units ({', '.join(UNITS_M)})")
     drawn: dict[str, list[FloatArray]] = {}
-    for layer, curve in _curves(document.modelspace(), "0", SAG_M / UNITS_M[unit]):
-        if layers or layer not in document.layers or not _is_hidden(document.layers.get(layer)):
-            drawn.setdefault(layer, []).append(curve * UNITS_M[unit])
+    try:
+        for layer, curve in _curves(document.modelspace(), "0", SAG_M / UNITS_M[unit]):
+            if layers or layer not in document.layers or not _is_hidden(document.layers.get(layer)):
+                drawn.setdefault(layer, []).append(curve * UNITS_M[unit])
+    except RecursionError:
+        raise InputError(f"{path}: a block contains itself; explode it") from None
     roles = _roles(path, drawn, layers)
     lines = {role: [c for layer in names for c in drawn[layer]] for role, names in roles.items()}
     leaves = [circle for curve in lines.get(DOOR, []) if (circle := _circle(curve))]
