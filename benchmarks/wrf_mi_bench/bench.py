@@ -116,6 +116,7 @@ _OWN: Mapping[str, Check] = {
         **_STORED,
     ),
     "ablation": _here("mechanisms of signal strengths", "ablation:main", FLAT, resumes=True, table="ablation:table"),
+    "journey": _here("plan and walk", "journey:main", table="journey:table"),
     "buildings": _here("measured buildings", "buildings:main", FLAT, resumes=True, table="buildings:table"),
     "devices": _here("own readings of a device", "buildings:devices", resumes=True, table="buildings:devices_table"),
     "rooms": _here("random rooms", "rooms:main", resumes=True, table="rooms:table"),

@@ -16,8 +16,8 @@ from PIL import Image
 from wrf_mi_bench.bench import CASES, CHECKS
 from wrf_mi_bench.command import TABLES
 from wrf_mi_bench.entries import stored_entries
-from wrf_mi_bench.front_page import METHODS, SCENE, question_table
-from wrf_mi_bench.table_plan import PARTS
+from wrf_mi_bench.front_page import question_table
+from wrf_mi_bench.journey import COMMANDS
 
 from wrf_mi.apps.commands.main import build_parser
 from wrf_mi.apps.table.entries import read_entries
@@ -100,20 +100,15 @@ def test_commands_parse(path):
 
 def test_readme_is_short_and_leads_from_a_scan_to_a_map():
     shown = [shlex.split(line, comments=True)[1] for block in blocks(README, "sh") for line in block.splitlines()]
-    assert shown == ["demo", "test", "mesh", "data", "train", "predict", "map"]
+    journey = ["mesh", "data", "train", "map", "locate"]
+    assert shown == [*journey, "demo", "test", "mesh", "check", "data", "train", "predict"]
+    lines = [shlex.split(line, comments=True) for line in blocks(README, "sh")[0].splitlines()]
+    assert [" ".join(words[1:]) for words in lines] == list(COMMANDS)
     assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
 
 
-def test_questions_of_the_readme_are_answered_by_stored_results():
-    assert marked("README.md", "questions") == question_table(CHECKOUT / "benchmarks" / "table")
-
-
-def test_columns_of_the_readme_separate_methods_with_a_scene():
-    scenes = [
-        (METHODS[name], bool(entry.scene)) for part in PARTS for name, entry in part.entries.items() if name in METHODS
-    ]
-    assert len(scenes) > 20
-    assert all((column < SCENE) == scene for column, scene in scenes if column != METHODS["hybrid"])
+def test_the_first_table_of_the_results_is_of_stored_entries():
+    assert marked("docs/results.md", "questions") == question_table(CHECKOUT / "benchmarks" / "table")
 
 
 def test_entries_of_other_benchmarks_are_those_of_their_stored_results():

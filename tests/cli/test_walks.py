@@ -8,15 +8,10 @@ import pytest
 from changed_folders import DATA, needs
 from commands import Command
 from PIL import Image
+from wrf_mi_bench.journey import COMMANDS as JOURNEY
 
 WALKS = {
-    "mall-f3": (
-        "mesh {data}/geojson_map.json --wall-height 4 --out {out}/scene",
-        "data import {data}/train.csv --test {data}/test.csv --place 3 --min-rows 110 --out {out}/data",
-        "train {out}/data --scene {out}/scene --preset fast --out {out}/run",
-        "map {out}/run --step 8 --out {out}/map.nc",
-        "locate {out}/run --out {out}/positions.csv",
-    ),
+    "mall-f3": tuple(words.replace("mall-f3/", "{data}/").replace("runs/", "{out}/") for words in JOURNEY),
     "flat-ble": (
         "mesh {data}/layout.csv --wall-height 2.7 --out {out}/scene",
         "data import {data}/calibration_df.csv --test {data}/test_robot_df.csv --anchors {data}/anchors.csv --place 0.5"
@@ -52,9 +47,9 @@ def figure(pattern: str, text: str) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(name, marks=needs(name)) for name in WALKS])
 def test_a_survey_becomes_maps_and_positions_by_five_commands(name: str, tmp_path: Path, command: Command) -> None:
-    words = [line.format(data=DATA / name, out=tmp_path).split() for line in WALKS[name]]
-    assert len(words) == 5
-    printed = {parts[0]: command.done(parts) for parts in words}
+    lines = [line.format(data=DATA / name, out=tmp_path).split() for line in WALKS[name]]
+    assert len(lines) == 5
+    printed = {words[0]: command.done(words) for words in lines}
     scores = printed["train"]
     hybrid_db, idw_db = figure(r"^hybrid +([\d.]+)", scores), figure(r"^IDW of .*\(idw\) +([\d.]+)", scores)
     assert 1 < hybrid_db < min(8, WORSE * idw_db)
@@ -62,7 +57,11 @@ def test_a_survey_becomes_maps_and_positions_by_five_commands(name: str, tmp_pat
     error_m = figure(r"^error \(m\) +([\d.]+)", printed["locate"])
     neighbours_m = figure(r"^error of \d+ nearest neighbours \(m\) +([\d.]+)", printed["locate"])
     assert 0.1 < error_m < min(LARGEST_M[name], WORSE * neighbours_m)
-    pictures = ["map.png", "positions.png", "data/plan.png", *["scene/preview.png"] * (name != "wifi-office")]
+    outs = [words[words.index("--out") + 1] for words in lines]
+    pictures = [Path(out).with_suffix(".png") for out in outs if out.endswith((".nc", ".csv"))]
+    for out in outs:
+        pictures += [file for name in ("plan.png", "preview.png") if (file := Path(out) / name).exists()]
+    assert len(pictures) == (3 if name == "wifi-office" else 4)
     for picture in pictures:
-        with Image.open(tmp_path / picture) as image:
+        with Image.open(picture) as image:
             assert np.asarray(image.convert("L")).std() > 5, picture

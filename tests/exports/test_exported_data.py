@@ -1,6 +1,7 @@
 """Measurements, traced paths and fields of Gaussians in files: read back without loss, and refused where damaged."""
 
 import csv
+import json
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 import trimesh
 from changed_folders import error_line, refusal
 from commands import Command
+from PIL import Image
 from programs import installed
 from scipy.constants import speed_of_light
 from small_fits import settings
@@ -175,6 +177,38 @@ def test_scenario_of_deepmimo_is_a_data_set(run: Path, tmp_path: Path) -> None:
     assert (record.task.name, len(record), len(record.receivers)) == ("csi", 30, 2)
 
 
+def test_scenario_of_a_scene_has_users_at_any_height(tmp_path: Path) -> None:
+    """Users at 1.2 and 2 m, which no run was traced at: the channel of the line of sight has Friis' gain."""
+    xml = write_xml(tmp_path / "room", SHOEBOX)
+    tx, rx = np.array([[1.0, 1.5, 1.2], [1.0, 1.5, 2.0]]), np.array([[5.0, 4.0, 2.0]])
+    options = ExportOptions(tx_pos_m=tx, rx_pos_m=rx, frequency_hz=FREQUENCY_HZ, kinds="line-of-sight")
+    assert export(xml, "deepmimo", tmp_path / "scenario", options)["users"] == 2
+    record = load(tmp_path / "scenario")
+    np.testing.assert_allclose(record.tx_pos_m, tx, atol=1e-5)
+    distance_m = np.linalg.norm(tx - rx, axis=1)
+    ratio = np.abs(record.observation[0, 0]).ravel()[0] / np.abs(record.observation[0, 1]).ravel()[0]
+    assert ratio == pytest.approx(distance_m[1] / distance_m[0], rel=0.1)
+
+
+@pytest.mark.parametrize("record", [make_record(), full_record()], ids=["plain", "full"])
+def test_pictures_of_spectra_state_their_limits(record: Record, tmp_path: Path) -> None:
+    file = write_record_file(tmp_path / "one.npz", record)
+    if record.task.name != "spectrum":
+        refusal(export, file, "png", tmp_path / "pictures", "format png takes spectra")
+        return
+    export(file, "png", tmp_path / "pictures")
+    limits = json.loads((tmp_path / "pictures" / "limits.json").read_text())
+    for number, receiver in enumerate(record.receivers):
+        with Image.open(tmp_path / "pictures" / receiver.name / "00002.png") as picture:
+            grey = np.asarray(picture, float)
+        level_db = limits["black_db"] + grey / limits["white"] * (limits["white_db"] - limits["black_db"])
+        with np.errstate(divide="ignore"):
+            stated_db = 20 * np.log10(record.observation[number, 1])
+        step_db = (limits["white_db"] - limits["black_db"]) / 255
+        np.testing.assert_allclose(level_db, stated_db.clip(limits["black_db"]), atol=0.51 * step_db)
+    assert limits["white_db"] == pytest.approx(20 * np.log10(record.observation.max()))
+
+
 def test_damaged_tables_are_refused(run: Path, tmp_path: Path, command: Command) -> None:
     file = tmp_path / "paths.csv"
     export(run, "paths", file)
@@ -284,14 +318,60 @@ def test_splat_transform_converts_it_and_back(runs: dict[str, Path], tmp_path: P
     with convert("field.ply", "field.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     np.testing.assert_array_equal([np.float32(row["rot_3"]) for row in table], read["rot_3"])
-    # Through their compressed form positions and opacities come back rounded, in another order.
-    convert("field.ply", "field.compressed.ply")
-    rounded = trimesh.load(convert("field.compressed.ply", "rounded.ply")).metadata["_ply_raw"]["vertex"]["data"]
-    ours, theirs = (np.stack([part[axis] for axis in "xyz"], axis=-1) for part in (read, rounded))
-    nearest = np.linalg.norm(ours[:, None] - theirs, axis=-1)
-    assert nearest.min(axis=1).max() < COMPRESSED_M
-    alpha = [1 / (1 + np.exp(-part["opacity"].astype(float))) for part in (read, rounded)]
-    np.testing.assert_allclose(alpha[1][nearest.argmin(axis=1)], alpha[0], atol=1 / 255)
+    # Through the compressed form, theirs or ours, the attributes come back rounded, in another order.
+    convert("field.ply", "theirs.compressed.ply")
+    export(runs[model], "3dgs", tmp_path / "ours.compressed.ply", ExportOptions(tx_pos_m=TX_M))
+    for name in ("theirs", "ours"):
+        again = convert(f"{name}.compressed.ply", "rounded.ply")
+        assert_rounded(trimesh.load(again).metadata["_ply_raw"]["vertex"]["data"], read)
+
+
+def assert_rounded(rounded: np.ndarray, read: np.ndarray) -> None:
+    """Whether vertices of a compressed PLY are others in another order, to the precision of its bits."""
+    there, back = (np.stack([part[axis] for axis in "xyz"], axis=-1) for part in (read, rounded))
+    distance_m = np.linalg.norm(there[:, None] - back, axis=-1)
+    assert distance_m.min(axis=1).max() < COMPRESSED_M
+    same = distance_m.argmin(axis=1)
+    alpha = [1 / (1 + np.exp(-part["opacity"].astype(float))) for part in (rounded[same], read)]
+    np.testing.assert_allclose(alpha[0], alpha[1], atol=1 / 255)
+    turns = [np.stack([part[f"rot_{k}"] for k in range(4)]) for part in (rounded[same], read)]
+    np.testing.assert_allclose(np.abs((turns[0] * turns[1]).sum(axis=0)), 1, atol=1e-5)
+    for column, bits in [(f"scale_{k}", 10) for k in range(3)] + [(f"f_dc_{k}", 8) for k in range(3)]:
+        width = np.ptp(read[column]) / (2**bits - 1)
+        np.testing.assert_allclose(rounded[column][same], read[column], atol=0.51 * width + SINGLE)
+
+
+def test_compressed_ply_holds_the_gaussians_in_bits(runs: dict[str, Path], tmp_path: Path) -> None:
+    """Unpacked as its format states: x in the highest 11 bits of a share of the chunk's box, and so on."""
+    read = exported(runs["wrf-gs+"], tmp_path / "field.ply")
+    export(runs["wrf-gs+"], "3dgs", tmp_path / "field.compressed.ply", ExportOptions(tx_pos_m=TX_M))
+    header, _, content = (tmp_path / "field.compressed.ply").read_bytes().partition(b"end_header\n")
+    words = [line.split() for line in header.decode().splitlines() if line.startswith("property")]
+    names = [name for _, kind, name in words if kind == "float"]
+    chunk = dict(zip(names, np.frombuffer(content, "<f4", len(names)).astype(float), strict=True))
+    packed = np.frombuffer(content[4 * len(names) :], [(name, "<u4") for _, kind, name in words if kind == "uint"])
+
+    def share(name: str, low: int, bits: int) -> np.ndarray:
+        return (packed[f"packed_{name}"] >> low & (2**bits - 1)) / (2**bits - 1)
+
+    def spread(name: str, shares: np.ndarray) -> np.ndarray:
+        return np.asarray(chunk[f"min_{name}"] + shares * (chunk[f"max_{name}"] - chunk[f"min_{name}"]))
+
+    assert names[:12:3] == ["min_x", "max_x", "min_scale_x", "max_scale_x"]
+    assert len(packed) == len(read)
+    columns = {}
+    for k, (axis, low, bits) in enumerate((("x", 21, 11), ("y", 11, 10), ("z", 0, 11))):
+        columns[axis] = spread(axis, share("position", low, bits))
+        columns[f"scale_{k}"] = spread(f"scale_{axis}", share("scale", low, bits))
+        columns[f"f_dc_{k}"] = (spread("rgb"[k], share("color", 24 - 8 * k, 8)) - 0.5) / 0.28209479177387814
+    alpha = share("color", 0, 8).clip(1e-6, 1 - 1e-6)
+    parts = np.stack([(share("rotation", low, 10) - 0.5) * np.sqrt(2) for low in (20, 10, 0)])
+    largest = packed["packed_rotation"] >> 30
+    full = np.sqrt(1 - np.square(parts).sum(axis=0))
+    rotations = [np.insert(parts[:, row], largest[row], full[row]) for row in range(len(packed))]
+    columns |= {f"rot_{k}": np.array(rotations)[:, k] for k in range(4)} | {"opacity": np.log(alpha / (1 - alpha))}
+    unpacked = np.array(list(zip(*columns.values(), strict=True)), dtype=[(name, "f8") for name in columns])
+    assert_rounded(unpacked, read)
 
 
 @pytest.mark.parametrize("model", FIELDS)

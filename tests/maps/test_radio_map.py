@@ -137,6 +137,27 @@ def test_surface_has_the_values_of_its_points(law: Run, tmp_path: Path) -> None:
     np.testing.assert_allclose(parts["power_dbm"][1], law.predict(points, 1).mean, rtol=FLOAT32)
 
 
+def test_heights_count_from_a_sloping_surface(law: Run, tmp_path: Path) -> None:
+    """Ground that rises by 1 m in 4 m: z is that of the ground and 1.5 m."""
+    corners = np.array([[1, 1, 0], [5, 1, 1], [5, 4, 1], [1, 4, 0]], float)
+    trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]]).export(tmp_path / "slope.ply")
+    parts = radio_map(law, surface=tmp_path / "slope.ply", step_m=0.5, height_m=1.5)
+    np.testing.assert_allclose(parts["z"], (parts["x"] - 1) / 4 + 1.5, atol=1e-5)
+    points = np.stack([parts[axis] for axis in "xyz"], axis=-1)
+    np.testing.assert_allclose(parts["power_dbm"][0], law.predict(points, 0).mean, rtol=FLOAT32)
+
+
+@pytest.mark.parametrize("name", ["law", "traced"])
+def test_cells_have_the_strength_that_is_predicted_at_their_centres(name: str, request: pytest.FixtureRequest) -> None:
+    run = request.getfixturevalue(name)
+    parts = radio_map(run, step_m=0.7, height_m=1.3)
+    power = parts["power_dbm"][-1].values
+    predicted = run.predict(grid_positions(parts).reshape(-1, 3), len(run.receivers) - 1).mean.reshape(power.shape)
+    known = ~np.isnan(power)
+    assert known.sum() > 20
+    np.testing.assert_allclose(power[known], predicted[known], rtol=FLOAT32)
+
+
 def test_headings_are_averaged_by_the_law_of_total_variance(flat_folder: Path, tmp_path: Path) -> None:
     run = wrf_mi.train(flat_folder, "kriging", out=tmp_path / "run", intervals=True)
     parts = radio_map(run, step_m=1.5)
@@ -282,7 +303,7 @@ def test_bad_input_is_one_line(law: Run, tmp_path: Path, command: Command) -> No
         ({"heading_deg": 30.0}, "do not depend on the heading"),
         ({"frequency_hz": 1e9}, "one carrier"),
         ({"surface": "none.ply"}, "no such file"),
-        ({"surface": "none.ply", "height_m": 1.0}, "belongs to a grid"),
+        ({"surface": "none.ply", "height_m": float("inf")}, "height inf"),
     ):
         with pytest.raises(InputError, match=message):
             radio_map(law, **given)

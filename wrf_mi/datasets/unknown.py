@@ -31,7 +31,7 @@ SENT = frozenset({"tx", "txpower", "sent", "transmit", "transmitted", "eirp"})
 BESIDE = frozenset({"db", "received", "rx", "mean", "average", "avg", "median", "value", "measured"})
 """Words beside those of strengths in the name of a column that belongs to no particular receiver."""
 RECEIVER = (
-    *("bssid", "mac", "address", "uuid", "receiver", "rx", "anchor", "gateway", "ap", "beacon", "cell"),
+    *("bssid", "mac", "address", "uuid", "receiver", "rx", "anchor", "gateway", "ap", "access", "beacon", "cell"),
     *("cellid", "station", "pci", "node", "device", "ssid", "id", "name"),
 )
 """Words in the names of columns that tell receivers apart, the most particular first."""

@@ -78,6 +78,17 @@ FLOOR_M = 0.05  # largest height of a floor that counts as zero
 CELLS = 40  # cells along the longest side, in which areas are seen
 CORE = (0.005, 0.995)
 """Quantiles of the coordinates between which the extent is taken: strays do not make a room larger."""
+WIDEST_DEG = 1.0  # largest extent of a place in degrees
+AWAY = 20.0
+"""Least distance of a place in degrees from the origin in its extents, 1 km at 0.2 degrees: a room in metres is not a
+metre wide and twenty metres away."""
+
+
+def is_geographic(xy: FloatArray) -> bool:
+    """Whether coordinates [n, 2] may be degrees of a place on the globe rather than metres of a room."""
+    extent, largest = float(np.ptp(xy, axis=0).max()), np.abs(xy).max(axis=0)
+    in_range = largest.max() <= LONGITUDE and largest.min() <= LATITUDE
+    return bool(in_range and 0 < extent <= WIDEST_DEG and largest.max() >= AWAY * extent)
 
 
 def local_projection(longitude: float, latitude: float) -> str:

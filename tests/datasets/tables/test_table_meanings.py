@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from changed_folders import refusal
 
+from wrf_mi.apps.importing.column_names import unit_of
 from wrf_mi.apps.importing.files import read_table
-from wrf_mi.apps.importing.forms import Columns, find_columns, parsed_columns, unit_of
+from wrf_mi.apps.importing.forms import Columns, find_columns, parsed_columns
 from wrf_mi.apps.importing.places import find_frame, headings_rad, place_numbers, unit_scale
 from wrf_mi.apps.importing.readings import Readings, mean_strengths, normal_id, without_not_heard
 
@@ -81,7 +82,7 @@ def test_units_stand_at_the_end_of_names() -> None:
     ("stated", "receivers", "message"),
     [
         ("x=east", (), r"line 1: no column east \(columns: x, y, p\); correct --columns"),
-        ("", ("AP*",), r"no column of signal strengths among x, y, p; try --columns 'id=\?,rssi=\?', or --receivers"),
+        ("", ("AP*",), r"no column of signal strengths among x, y, p; write a row for each reading.*, or --receivers"),
         ("", (), r"no column of signal strengths"),
         *((text, (), r"--columns: .* give MEANING=COLUMN") for text in ("place=x", "x", "x=")),
     ],

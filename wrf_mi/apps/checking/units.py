@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ...core import Record
 from ...core.files import listed
-from ...scene.coordinates import LATITUDE
-from ..importing.places import is_geographic
+from ...scene.coordinates import LATITUDE, is_geographic
 
 NamedTexts = Iterator[tuple[str, str]]  # names and texts of suspicions
 

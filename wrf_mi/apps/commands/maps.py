@@ -23,7 +23,7 @@ def _add_map(commands: Any) -> None:
     add = parser.add_argument
     add("run", metavar="RUN", help="run folder")
     add("--out", required=True, metavar="FILE", help="file to write: MAP.nc, MAP.zarr or MAP.csv; beside it MAP.png")
-    text = "z of the transmitter, metres (default: the median of the data's); the grid covers the scene, or the data"
+    text = "z of the transmitter, metres (default: the median of the data's); with --surface: above it (default: 0)"
     add("--height", type=float, metavar="M", help=text)
     text = "mesh whose faces' centres are the positions, in place of the grid (PLY, STL, OBJ, GLB; metres)"
     add("--surface", metavar="MESH", help=text)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,9 @@ from .source import Source
 DEGREE_0 = 0.28209479177387814
 """Spherical harmonic of degree 0, 1 / (2 sqrt(pi)): a viewer's colour is 0.5 + `DEGREE_0` f_dc."""
 RANGE_DB = 40.0  # range of magnitudes of the signal, below the strongest, over which colours differ
+PACKED, CHUNK = ".compressed.ply", 256  # name of compressed files, and Gaussians of a chunk
+PARTS = tuple(f"{name}_{k}" for name in ("scale", "f_dc") for k in range(3))
+BOUNDED = ("x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b")  # names of the bounds of a chunk
 OPAQUE = 1e-6  # least distance of an opacity from 0 and 1, whose logits are infinite
 FORMAT = 2  # version of the file with all parameters
 VERSION, SPLIT_ARRAYS, FITTED_ARRAYS = "export/format", "split/", "run/"
@@ -105,12 +110,63 @@ def write_3dgs(source: Source, out: Path, options: ExportOptions) -> dict[str, A
     comments = [f"Gaussians of a radio field ({run.config.model}) for the transmitter at {where} m; metres, z up"]
     comments.append(f"colour: magnitude of the signal, viridis over {RANGE_DB:g} dB below the strongest")
     comments.append("signal_re_k + j signal_im_k: complex signals; time factor exp(+j omega t)")
-    # G. Turk, "The PLY polygon file format" (1994)
+    elements = _packed(columns) if out.name.lower().endswith(PACKED) else {"vertex": columns}
+    write_atomically(out, _ply(comments, **elements))
+    return {"Gaussians": len(columns["x"]), "properties": len(elements["vertex"])}
+
+
+def _ply(comments: Sequence[str], **elements: Mapping[str, FloatArray]) -> bytes:
+    """File of elements with columns of equal type (G. Turk, "The PLY polygon file format", 1994)."""
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {one_line(text)}" for text in comments)]
-    header += [f"element vertex {len(columns['x'])}", *(f"property float {name}" for name in columns), "end_header", ""]
-    rows = np.stack(list(columns.values()), axis=1).astype("<f4")
-    write_atomically(out, "\n".join(header).encode() + rows.tobytes())
-    return {"Gaussians": len(rows), "properties": len(columns)}
+    rows = {name: np.stack(list(columns.values()), axis=1) for name, columns in elements.items()}
+    for name, columns in elements.items():
+        kind = "uint" if rows[name].dtype == np.uint32 else "float"
+        header += [f"element {name} {len(rows[name])}", *(f"property {kind} {column}" for column in columns)]
+    content = b"".join(values.astype(values.dtype.newbyteorder("<")).tobytes() for values in rows.values())
+    return "\n".join([*header, "end_header", ""]).encode() + content
+
+
+def _packed(columns: Mapping[str, FloatArray]) -> dict[str, dict[str, Any]]:
+    """Elements of PlayCanvas' compressed PLY: bounds of each 256 neighbours, and attributes as shares of them.
+
+    https://github.com/playcanvas/splat-transform; `columns` as of `splat_columns`, whose further ones it cannot hold.
+    """
+    values = np.stack([columns[name] for name in (*"xyz", *PARTS)]).astype(float)
+    values[6:] = 0.5 + DEGREE_0 * values[6:]
+    # Neighbours along a Z curve of 1024 cells a side share a chunk; the last one is filled up.
+    low, extent = values[:3].min(axis=1, keepdims=True), np.ptp(values[:3], axis=1).max() or 1.0
+    cells = ((values[:3] - low) / extent * 1023).astype(np.int64)
+    order = np.argsort(sum((cells[axis] >> bit & 1) << 3 * bit + axis for bit in range(10) for axis in range(3)))
+    count = len(order)
+    filled = np.concatenate([order, np.repeat(order[-1:], -count % CHUNK)])
+    chunks = values[:, filled].reshape(len(values), -1, CHUNK)
+    least, most = (bounds.astype(np.float32) for bounds in (chunks.min(axis=2), chunks.max(axis=2)))
+    size = np.where(most > least, most - least, 1)[..., None]
+    shares = ((chunks - least[..., None]) / size).clip(0, 1).reshape(len(values), -1)[:, :count]
+    bounds: dict[str, Any] = {}
+    for k, (name, rows) in product((0, 3, 6), (("min", least), ("max", most))):
+        bounds |= {f"{name}_{BOUNDED[row]}": rows[row] for row in range(k, k + 3)}
+    # Of a quaternion of length 1 its largest component is left out, which is made positive.
+    rotation = np.stack([columns[f"rot_{k}"] for k in range(4)])[:, order]
+    largest = np.abs(rotation).argmax(axis=0)
+    rotation = rotation * np.sign(rotation[largest, np.arange(count)])
+    others = rotation.T[np.arange(4) != largest[:, None]].reshape(count, 3).T
+    alpha = 1 / (1 + np.exp(-columns["opacity"][order]))
+    packed = {
+        "packed_position": _bits(shares[:3], 11, 10, 11),
+        "packed_rotation": _bits([largest / 3, *(0.5 + others / np.sqrt(2))], 2, 10, 10, 10),
+        "packed_scale": _bits(shares[3:6], 11, 10, 11),
+        "packed_color": _bits([*shares[6:], alpha], 8, 8, 8, 8),
+    }
+    return {"chunk": bounds, "vertex": packed}
+
+
+def _bits(shares: Iterable[FloatArray], *widths: int) -> Any:
+    """Numbers in 0..1 side by side in 32 bits, the first one in the highest."""
+    numbers = np.zeros((), np.uint32)
+    for values, width in zip(shares, widths, strict=True):
+        numbers = numbers << np.uint32(width) | np.rint(values * (2**width - 1)).astype(np.uint32)
+    return numbers
 
 
 def write_field(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:

@@ -104,8 +104,8 @@ def write_paths(source: Source, out: Path, options: ExportOptions) -> dict[str, 
 
 
 def write_scenario(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
-    """Write the paths of a run as a scenario of DeepMIMO (`wrf_mi.apps.exports.source.Write`)."""
-    traced = source.trace()
+    """Write paths of a run or a scene as a scenario of DeepMIMO (`wrf_mi.apps.exports.source.Write`)."""
+    traced = traced_paths(source, options)
     write_deepmimo(out, traced, options.replace)
     return {"paths": len(traced.paths), "users": traced.paths.n_tx, "base stations": traced.paths.n_rx}
 

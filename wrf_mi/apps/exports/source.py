@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image
 from wrf_mi_scenes import scenes
 
 from ...core import InputError, Record
+from ...core.files import atomic_folder, write_atomically
 from ...datasets import write_ble_folder, write_nerf2_csi, write_spectrum_folder
 from ...datasets.layouts import is_data
 from ...datasets.record_file import write_record_file
@@ -22,6 +26,7 @@ from ...tracing.paths.result import TraceResult, load_trace
 from ...tracing.sionna.scenes import MESHES
 from .format import DATASET, RUN, SCENE, ExportOptions
 
+PICTURE_DB = 40.0  # range of the pictures of spectra
 BITS = 16  # bits of a pixel: 8 would round spectra that are computed or of 16 bits
 
 
@@ -114,4 +119,27 @@ TASKS_OF = {"spectra": "spectrum", "ble": "rssi", "nerf2-csi": "csi", "npz": Non
 write_spectra = _written("spectrum", lambda out, record, again: write_spectrum_folder(out, record, BITS, again))
 write_strengths = _written("rssi", write_ble_folder)
 write_channels = _written("csi", write_nerf2_csi)
+
+
+def write_pictures(source: Source, out: Path, options: ExportOptions) -> dict[str, Any]:
+    """Write spectra as PNG of 8 bits, linear in dB (`wrf_mi.apps.exports.source.Write`).
+
+    ``limits.json`` states the level of black and white, 20 log10 of the data's grey; white is the largest one.
+    `InputError`: other data, or a folder that exists.
+    """
+    record = source.record(options.progress)
+    if record.task.name != "spectrum":
+        raise InputError(f"{source.name}: a data set of {record.task}; format png takes spectra")
+    white_db = 20 * np.log10(record.observation.max() or 1.0)
+    share = 1 + (20 * np.log10(record.observation.clip(np.finfo(np.float32).tiny)) - white_db) / PICTURE_DB
+    with atomic_folder(out, options.replace) as part:
+        for receiver, images in zip(record.receivers, np.rint(255 * share.clip(0, 1)).astype(np.uint8), strict=True):
+            (part / receiver.name).mkdir()
+            for row, image in enumerate(images, start=1):
+                Image.fromarray(image).save(part / receiver.name / f"{row:05d}.png")
+        limits = {"black_db": float(white_db - PICTURE_DB), "white_db": float(white_db), "black": 0, "white": 255}
+        write_atomically(part / "limits.json", json.dumps(limits, indent=1) + "\n")
+    return {"spectra": record.observation[..., 0, 0].size, "limits (dB)": f"{limits['black_db']:g} to {white_db:g}"}
+
+
 write_npz = _written(None, lambda out, record, again: write_record_file(out, record))

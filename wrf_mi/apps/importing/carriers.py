@@ -6,8 +6,8 @@ import numpy as np
 
 from ...core.angles import FloatArray
 from ...core.files import listed, one_line
+from .column_names import HERTZ, unit_of
 from .files import Table
-from .forms import HERTZ, unit_of
 from .places import finite_columns
 from .readings import Readings
 

@@ -13,15 +13,15 @@ from ...core import DataFault
 from ...core.files import one_line
 from ...core.yaml_files import read_yaml
 from ...datasets.unknown import SENT, STRENGTH, name_words
-from .programs import EVENT_LOGS, FLOOR_NAME, MQTT, EventLog
+from .programs import EVENT_LOGS, FLOOR_NAME, MAC, MQTT, EventLog
 
-POINTS = frozenset({"point", "position", "location", "coordinates", "xy", "xyz", "pos"})
-"""Names of lists that hold x, y and, if stated, z."""
+POINTS = frozenset({"point", "position", "location", "coordinates", "coord", "coords", "xy", "xyz", "pos", "geometry"})
+"""Names of lists that hold x, y and, if stated, z, and of objects that name them."""
 FIRST_MESSAGES, FIRST_EVENTS = 50, 20_000
 """Lines in which a reading of MQTT is looked for, and a position or reading among those of a phone's other sensors."""
 IMAGE = re.compile(r".+\.(?:png|jpe?g|gif|bmp|svg|webp)", re.IGNORECASE)
 IMAGE_WORDS = frozenset({"image", "plan", "floorplan", "map", "background", "picture"})
-ADDRESS = re.compile(r"(?:[0-9a-f]{2}[:_-]){5}[0-9a-f]{2}.*", re.IGNORECASE)
+ADDRESS = re.compile(f"{MAC.pattern}.*", re.IGNORECASE)
 Row = dict[str, Any]
 
 
@@ -63,19 +63,44 @@ def _rows(node: Any, around: Row, is_row: Any) -> Iterator[Row]:
             yield from _rows(item, around, is_row)
     if not isinstance(node, dict):
         return
+    if node and all(ADDRESS.fullmatch(str(key)) and isinstance(value, int | float) for key, value in node.items()):
+        yield from (around | {"bssid": key, "rssi": value} for key, value in node.items())
+        return
     if _is_mapping(node):
         for key, value in node.items():
-            yield from _rows(value, around | {"key": key}, is_row)
+            name = "bssid" if MAC.fullmatch(str(key)) and "bssid" not in around else "key"
+            yield from _rows(value, around | {name: key}, is_row)
         return
-    own: Row = around.copy()
+    own: Row = around | _point(node)
     for name, value in node.items():
-        if isinstance(value, list) and str(name).lower() in POINTS and _are_numbers(value):
-            own |= dict(zip("xyz", value, strict=False))
-        elif not isinstance(value, dict | list):
+        if not isinstance(value, dict | list):
             own[str(name)] = value
     outer = {name: value for name, value in own.items() if not _is_reading({name: value})}
-    inner = [row for value in node.values() for row in _rows(value, outer, is_row)]
+    inner = [row for name, value in node.items() for row in _rows(_named_values(name, value), outer, is_row)]
     yield from inner or ([own] if is_row(node) else [])
+
+
+def _point(node: Mapping[Any, Any]) -> Row:
+    """Coordinates that an object has in a list or an object of their own."""
+    fields: Row = {}
+    for name, value in node.items():
+        if str(name).lower() in POINTS and isinstance(value, list) and _are_numbers(value):
+            fields |= dict(zip("xyz", value, strict=False))
+        elif str(name).lower() in POINTS and isinstance(value, dict):
+            fields |= {str(key): part for key, part in value.items() if isinstance(part, int | float)} | _point(value)
+    return fields
+
+
+def _named_values(name: Any, value: Any) -> Any:
+    """Objects with ``rssi`` from a list ``rssi`` of objects with a ``value`` each, or an object of receivers."""
+    words = name_words(str(name))
+    if not words & STRENGTH or words & SENT:
+        return value
+    if isinstance(value, dict) and value and all(isinstance(dbm, int | float) for dbm in value.values()):
+        return [{"receiver": key, "rssi": dbm} for key, dbm in value.items()]
+    if isinstance(value, list) and all(isinstance(item, dict) for item in value):
+        return [{("rssi" if key == "value" else key): part for key, part in item.items()} for item in value]
+    return value
 
 
 def _is_mapping(node: Mapping[Any, Any]) -> bool:
@@ -143,8 +168,9 @@ def read_events(path: Path, text: str, lines: Sequence[tuple[int, str]], log: Ev
     """
     rows, floor = [], re.search(log.floor, text)
     named = {"walk": path.stem} | ({FLOOR_NAME: floor[1]} if floor else {})
-    for number, line in lines:
-        parts = line.split(log.separator)
+    runs_on = re.compile(f"(?<=.)(?={log.start})")  # a phone did not end the line before
+    for number, line in ((number, part) for number, content in lines for part in runs_on.split(content)):
+        parts = line.rstrip(log.separator).split(log.separator)
         fields = log.fields.get(parts[log.kind]) if len(parts) > log.kind else None
         if fields is None:
             continue

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import io
-import re
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,28 +21,22 @@ from ...core.files import listed, one_line, readable
 from ...core.memory import require_memory
 from ...datasets.folder_files import SINGLE_MAX
 from ...datasets.receivers_file import plain_id
+from . import fields
 from .documents import event_log_of, read_document, read_events, read_messages
 from .programs import CELL, POSE_NAMES, QUATERNION, Frame, cell_parts, headerless_form, program_of
+from .workbooks import read_sheets
 
 COMMENTS = ("#", "%", "//")
-SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas"}
-"""In the order of trial: a table with a decimal comma has commas in every line, too."""
-SPACES = r"\s+"
 SAMPLE = 50  # lines from which separator and decimal mark are read
 TEXT_MEMORY, FIELD_MEMORY = 6, 16  # bytes of memory for each byte of a text file and its lines, and for each field
 THIN = "remove columns or thin its rows"
-EMPTY = ("-", "--", "?")  # fields that are empty beside those that pandas knows (NaN, NA, null, None)
-FRACTION = re.compile(r"[+-]?\d*\.\d+(?:[eE][+-]?\d+)?|[+-]?\d+\.")
-COMMA_FRACTION = re.compile(r"[+-]?\d+,\d+")
-NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|nan", re.IGNORECASE)
-FIELD_UNIT = re.compile(r"([+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?)\s*([a-zA-Z]{1,7}|%)")
-"""A number with its unit, as in ``-65dBm``, ``2437 MHz`` and ``85%``."""
+EMPTY = ("-", "--", "?", "not detected", "not heard", "no signal", "n.d.")
+"""Fields that are empty beside those that pandas knows (NaN, NA, null, None)."""
 MOST_FIELDS = 12  # names of columns that a message has at most
-MOST_PREAMBLE = 20  # lines above the header that name the program, the device or the survey
-DOCUMENTS = (".json", ".jsonl", ".ndjson", ".yaml", ".yml")
+DOCUMENTS = (".json", ".geojson", ".jsonl", ".ndjson", ".yaml", ".yml")
 TRY_COLUMNS = "--columns x=X,y=Y,id=BSSID,rssi=RSSI (names of its columns)"
 CONVERSIONS = {
-    **dict.fromkeys((".geojson", ".kml", ".kmz"), "write its points as a table of readings: lon,lat,bssid,rssi"),
+    **dict.fromkeys((".kml", ".kmz"), "write its points as a table of readings: lon,lat,bssid,rssi"),
     ".gpx": "write its track as a table time,lat,lon and give it by --positions",
     **dict.fromkeys((".xls", ".xlsb", ".ods", ".numbers"), "save it as .xlsx or .csv"),
     **dict.fromkeys((".sqlite", ".db"), "export its table of readings as .csv"),
@@ -99,7 +91,11 @@ class Table:
         """Numbers of a column [rows], NaN where empty; an `InputError` for the first field that is no number."""
         values = self.frame[column]
         texts = values if values.dtype.kind in "biuf" else values.astype(str).str.strip()
-        numbers = package("pandas").to_numeric(texts, errors="coerce").to_numpy(float, na_value=np.nan)
+        numbers = package("pandas").to_numeric(texts, errors="coerce")
+        if texts is not values and (numbers.isna() & values.notna()).any():
+            plain = fields.plain_numbers(texts.where(values.notna()).dropna()).reindex(texts.index)
+            numbers = package("pandas").to_numeric(plain, errors="coerce")
+        numbers = numbers.to_numpy(float, na_value=np.nan)
         wrong = np.isnan(numbers) & values.notna().to_numpy() | (np.abs(numbers) > SINGLE_MAX) & np.isfinite(numbers)
         if wrong.any():
             row = int(np.argmax(wrong))
@@ -155,15 +151,16 @@ def read_table(path: str | Path, sheet: str = "", as_is: bool = False) -> Table:
     elif suffix == ".xlsx":
         package("openpyxl")
         with readable(path, missing, "give a file in the format of .xlsx"):
-            sheets = pandas.read_excel(path, sheet_name=None, engine="openpyxl")
-        name = _chosen_sheet(path, {name: len(frame) for name, frame in sheets.items() if frame.size}, sheet)
-        frame, note = sheets[name], f", sheet {one_line(name)}" * (len(sheets) > 1)
+            sheets = read_sheets(path)
+        name = _chosen_sheet(path, {name: len(frame) for name, (frame, _) in sheets.items() if frame.size}, sheet)
+        frame, above = sheets[name]
+        note = f", sheet {one_line(name)}" * (len(sheets) > 1) + f"; {above} rows above it are left out" * bool(above)
     else:
         return _of_program(_read_text(path, sheet), as_is)
     frame.columns = [str(name).strip() for name in frame.columns]
     _check_names(path, list(frame.columns))
     _check_size(path, len(frame), frame.shape[1])
-    table = Table(_with_units(frame), ((path, len(frame)),), (f"{path.name}: {len(frame)} rows{note}",))
+    table = Table(fields.with_units(frame), ((path, len(frame)),), (f"{path.name}: {len(frame)} rows{note}",))
     return _of_program(table, as_is)
 
 
@@ -200,24 +197,6 @@ def _chosen_sheet(path: Path, rows: dict[str, int], sheet: str) -> str:
     what = f"no sheet {one_line(sheet)} with cells" if sheet else "several sheets"
     shown = shlex.quote(max(rows, key=lambda name: rows[name], default="NAME"))
     raise DataFault(path, f"{what} ({named}); choose one by --sheet NAME, such as --sheet {shown}")
-
-
-def _with_units(frame: Frame) -> Frame:
-    """Columns of numbers that all have one unit in their fields as numbers, the unit in their names."""
-    names = {}
-    for name in frame.columns:
-        if frame[name].dtype.kind in "biufM" or not frame[name].notna().any():
-            continue
-        texts = frame[name].dropna().astype(str).str.strip()
-        if FIELD_UNIT.fullmatch(texts.iloc[0]) is None:
-            continue
-        parts = texts.str.extract(f"^{FIELD_UNIT.pattern}$")
-        if parts[1].nunique() == 1 and parts[1].notna().all():
-            numbers = package("pandas").to_numeric(parts[0].str.replace(",", "."))
-            frame = frame.assign(**{name: numbers.reindex(frame.index)})
-            unit = parts[1].iloc[0]
-            names[name] = name if unit.lower() in name.lower() else f"{name} ({unit})"
-    return frame.rename(columns=names)
 
 
 def joined(tables: list[Table]) -> Table:
@@ -273,42 +252,56 @@ def _read_text(path: Path, sheet: str) -> Table:
     rows, note_of_tables = _chosen_table(path, rows, first, sheet)
 
     # Separator and decimal mark, without lines above the header.
-    separator, above = _separator_below([line for _, line in rows[:SAMPLE]])
+    separator, above = fields.separator_below([line for _, line in rows[:SAMPLE]])
     rows = rows[above:]
-    sample = [_fields(line, separator) for _, line in rows[: SAMPLE - above]]
-    decimal = _decimal_mark(sample)
+    sample = [fields.split_line(line, separator) for _, line in rows[: SAMPLE - above]]
+    decimal = fields.decimal_mark(sample)
 
     # The header is the first line, the comment above it, or absent.
     header, named = "in its first line", sample[0]
-    if _is_row(named, decimal):
-        header, named = "in a comment", _fields(comment.lstrip("#%/ "), separator)
-        if len(named) != len(sample[0]) or _is_row(named, decimal):
+    if fields.is_row(named, decimal):
+        header, named = "in a comment", fields.split_line(comment.lstrip("#%/ "), separator)
+        if len(named) != len(sample[0]) or fields.is_row(named, decimal):
             header, named = "absent", [str(number + 1) for number in range(len(sample[0]))]
     names = [name.strip() or f"column_{number + 1}" for number, name in enumerate(named)]
     _check_names(path, names)
 
     # Fields: pandas fills missing ones silently.
-    for number, line in rows if separator != SPACES else ():
-        if (fields := line.count(separator) + 1) != len(names) and '"' not in line:
-            text = f"{fields} fields, but the first line has {len(names)}"
+    program = program_of(names)
+    for index, (number, line) in enumerate(rows) if separator != fields.SPACES else ():
+        if (count := line.count(separator) + 1) != len(names) and '"' not in line:
+            if program is not None and program.free in names and count > len(names):
+                rows[index] = number, _quoted(line, separator, names.index(program.free), count - len(names))
+                continue
+            text = f"{count} fields, but the first line has {len(names)}"
             shown = one_line(", ".join(names[:MOST_FIELDS]))
             remedy = "correct or remove the line, or write a row for each reading with a header and give"
             raise DataFault(path, f"{text} ({shown}); {remedy} {TRY_COLUMNS}", line=number)
     rows = rows[header == "in its first line" :]
     _check_size(path, len(rows), len(names))
     with readable(path, missing, "correct the line"):
-        frame = package("pandas").read_csv(
-            io.StringIO("\n".join(line for _, line in rows)),
-            **{"sep": separator, "decimal": decimal, "header": None, "names": names, "index_col": False},
-            **{"na_values": EMPTY, "skipinitialspace": True, "low_memory": False},
-        )
+        content = "\n".join(line for _, line in rows)
+        options: dict[str, Any] = {"sep": separator, "decimal": decimal, "names": names}
+        options |= {"header": None, "index_col": False, "na_values": EMPTY, "skipinitialspace": True}
+        frame = package("pandas").read_csv(io.StringIO(content), **options, low_memory=False)
+        note_of_marks = ""
+        if doubtful := fields.thousandths(frame):
+            texts = package("pandas").read_csv(io.StringIO(content), **options, usecols=doubtful, dtype=str)
+            frame, note_of_marks = fields.without_groups(path, frame, texts, decimal)
 
     # What was recognised, in words.
-    form = f"separated by {SEPARATORS.get(separator, 'blanks')}" + ", decimal comma" * (decimal == ",")
+    form = f"separated by {fields.SEPARATORS.get(separator, 'blanks')}" + ", decimal comma" * (decimal == ",")
     form += f", encoding {encoding}" * (encoding != "utf-8-sig")
     note = f"{path.name}: {len(frame)} rows, {form}, header {header}"
-    note += f"; {above} lines above it are left out" * bool(above) + note_of_tables
-    return Table(_with_units(frame), ((path, len(frame)),), (note,), header != "absent")
+    note += f"; {above} lines above it are left out" * bool(above) + note_of_tables + note_of_marks
+    return Table(fields.with_units(frame), ((path, len(frame)),), (note,), header != "absent")
+
+
+def _quoted(line: str, separator: str, column: int, surplus: int) -> str:
+    """A line whose field of free text has the separator in it, with this field in quotes."""
+    parts = line.split(separator)
+    text = separator.join(parts[column : column + surplus + 1]).strip()
+    return separator.join([*parts[:column], f'"{text}"', *parts[column + surplus + 1 :]])
 
 
 def _chosen_table(
@@ -318,9 +311,13 @@ def _chosen_table(
 
     A table begins with a header, which is the first line or follows a blank one.
     """
-    headers = {row: _fields(rows[row][1], _separator([rows[row][1]])[0]) for row in sorted({0, *first})}
+    headers = {
+        row: fields.split_line(rows[row][1], fields.separator_of([rows[row][1]])[0]) for row in sorted({0, *first})
+    }
     starts = [
-        row for row, names in headers.items() if row == 0 or (len(names) > 1 and not any(map(NUMBER.fullmatch, names)))
+        row
+        for row, names in headers.items()
+        if row == 0 or (len(names) > 1 and not any(map(fields.NUMBER.fullmatch, names)))
     ]
     if len(headers[0]) == 1:  # lines above the header
         starts = starts[:1]
@@ -329,8 +326,8 @@ def _chosen_table(
     counts = {name: len(lines) - 1 for name, lines in tables.items()}
     if len(tables) == 1:
         return rows, ""
-    known = [name for name, lines in tables.items() if program_of(_fields(lines[0][1], ","))]
-    name = _chosen_sheet(path, counts, sheet or (known[0] if len(known) == 1 else ""))
+    known = [name for name, lines in tables.items() if program_of(fields.split_line(lines[0][1], ","))]
+    name = _chosen_sheet(path, counts, sheet or (known[0] if known else ""))
     others = listed([f"{one_line(other)} ({counts[other]} rows)" for other in tables if other != name])
     return tables[name], f"; tables that are left out, by their first column (--sheet): {others}"
 
@@ -344,56 +341,18 @@ def _of_rows(path: Path, rows: Sequence[Mapping[str, Any]], image: str = "", lef
     _check_size(path, len(frame), frame.shape[1])
     note = f"{path.name}: {len(frame)} rows" + f", points of {image}" * bool(image)
     note += f"; {left_out} lines of other topics are left out" * bool(left_out)
-    return Table(_with_units(frame), ((path, len(frame)),), (note,), image=image)
+    return Table(fields.with_units(frame), ((path, len(frame)),), (note,), image=image)
 
 
 def _decoded(path: Path) -> tuple[str, str]:
     """Encoding and text of a file in UTF-8, UTF-16 with its mark, or else Windows' code page 1252."""
     require_memory(TEXT_MEMORY * path.stat().st_size, f"{path}", THIN)
     content = path.read_bytes()
-    for encoding in ["utf-16"] if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ["utf-8-sig", "cp1252"]:
+    wide = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}.get(content[:2])
+    if wide is None and b"\0" in content[:2]:  # without its mark
+        wide = "utf-16-be" if content[:1] == b"\0" else "utf-16-le"
+    for encoding in ["utf-8-sig", "cp1252"] if wide is None else [wide]:
         with suppress(UnicodeDecodeError):
-            return encoding, content.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+            text = content.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+            return encoding, text.replace(fields.MINUS, "-")
     raise DataFault(path, "not text; save it as UTF-8")
-
-
-def _fields(line: str, separator: str) -> list[str]:
-    if separator == SPACES:
-        return line.split()
-    return [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
-
-
-def _separator_below(lines: list[str]) -> tuple[str, int]:
-    """The separator of a table's first lines, and how many above its header have other numbers of fields."""
-    separator, is_certain = _separator(lines)
-    for above in range(1, min(MOST_PREAMBLE, len(lines) - 2) + 1) if not is_certain else ():
-        below, is_certain = _separator(lines[above:])
-        # Where a row begins the others, a row before it is damaged.
-        if is_certain and not _is_row(_fields(lines[above], below), "."):
-            return below, above
-    return separator, 0
-
-
-def _separator(sample: list[str]) -> tuple[str, bool]:
-    """The first separator with the same number of fields in all lines, or else that of most fields; and which."""
-    most = ("", 1)
-    for separator in (*SEPARATORS, SPACES):
-        counts = {len(_fields(line, separator)) for line in sample}
-        if len(counts) == 1 and counts != {1}:
-            return separator, True
-        if separator != SPACES and min(counts) > most[1]:
-            most = separator, min(counts)
-    return most[0] or ",", False
-
-
-def _decimal_mark(rows: list[list[str]]) -> str:
-    fields = [field for row in rows for field in row]
-    with_comma = any(COMMA_FRACTION.fullmatch(field) for field in fields)
-    return "," if with_comma and not any(FRACTION.fullmatch(field) for field in fields) else "."
-
-
-def _is_row(fields: list[str], decimal: str) -> bool:
-    """Whether fields are measurements rather than names: all numbers, or one of them negative or with decimals."""
-    fields = [field.replace(decimal, ".") for field in fields if field]
-    numbers = [field for field in fields if NUMBER.fullmatch(field)]
-    return len(numbers) == len(fields) or any(field[0] == "-" or FRACTION.fullmatch(field) for field in numbers)

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.angles import FloatArray
+from .column_names import ColumnName
 from .files import Table
-from .forms import MAC, ColumnName, named_columns
-from .places import PLACES, seconds
+from .forms import named_columns
+from .places import PLACES, seconds, ticks
+from .programs import MAC
 
 STALE_S = 2.0  # readings that are older when written are of another place: walkers go three metres in that time
 CLOCKS_S = 86_400.0  # largest median age of one clock: phones state times since their start, too
-TICKS = {1e17: 1e9, 1e14: 1e6, 1e11: 1e3}
-"""Ticks in a second of times since 1970, by their least number in this century: ns, us, ms."""
 
 
 def without_stale(table: Table, stated: Mapping[str, str]) -> Table:
@@ -28,7 +28,7 @@ def without_stale(table: Table, stated: Mapping[str, str]) -> Table:
     if not {"time", "seen"} <= of.keys():
         return table
     written, seen = (seconds(table, of[name], may_be_empty=True) for name in ("time", "seen"))
-    age_s = (written - seen) / _ticks(written)
+    age_s = (written - seen) / ticks(written)
     file, name = table.files[0][0].name, of["seen"]
     if np.isfinite(age_s).any() and abs(float(np.nanmedian(age_s))) > CLOCKS_S:
         return replace(table, notes=(*table.notes, f"{file}: {name} is of another clock than {of['time']}: not used"))
@@ -37,12 +37,6 @@ def without_stale(table: Table, stated: Mapping[str, str]) -> Table:
     times = np.where(np.isfinite(seen), seen, written)[~stale]
     frame = table.frame[~stale].assign(**{of["time"]: times})
     return replace(table, frame=frame, notes=(*table.notes, f"{note} {STALE_S:g} s ({name}): left out"))
-
-
-def _ticks(times: FloatArray) -> float:
-    """Ticks in a second of times [n]."""
-    largest = float(np.nanmax(np.abs(times), initial=0.0))
-    return next((ticks for least, ticks in TICKS.items() if largest > least), 1.0)
 
 
 def with_fixes(table: Table, stated: Mapping[str, str]) -> Table:
@@ -87,6 +81,7 @@ def _interpolated(table: Table, of: Mapping[str, str], is_fix: NDArray[np.bool_]
     runs = table.frame[of["run"]].astype(str).to_numpy() if "run" in of else np.full(len(table), "")
     names = [of[meaning] for meaning in PLACES if meaning in of and meaning not in ("floor", "heading")]
     values: dict[str, FloatArray] = {name: table.numbers(name).copy() for name in names}
+    floors = table.frame[of["floor"]].to_numpy(object).copy() if "floor" in of else np.array([])
     within, gap = np.zeros(len(table), bool), 0.0
     for run in np.unique(runs):
         fixes = np.flatnonzero((runs == run) & is_fix & np.isfinite(time_s))
@@ -96,10 +91,13 @@ def _interpolated(table: Table, of: Mapping[str, str], is_fix: NDArray[np.bool_]
             continue
         within[rows] = (time_s[rows] >= time_s[fixes[0]]) & (time_s[rows] <= time_s[fixes[-1]])
         gap = max(gap, float(np.diff(time_s[fixes]).max(initial=0.0)))
+        if "floor" in of:  # that of the fix before
+            floors[rows] = floors[fixes[np.searchsorted(time_s[fixes], time_s[rows], side="right").clip(1) - 1]]
         for name in names:
             values[name][rows] = np.interp(time_s[rows], time_s[fixes], values[name][fixes])
     text = f"{table.files[0][0].name}: positions are in rows of their own ({np.count_nonzero(is_fix & ~heard)}): linear"
-    text += f" between them in time, at most {gap / _ticks(time_s):.3g} s apart"
+    text += f" between them in time, at most {gap / ticks(time_s):.3g} s apart"
     if outside := int(np.count_nonzero(heard & ~within)):
         text += f"; {outside} readings before or after them are left out"
-    return replace(table, frame=table.frame.assign(**values)[within], notes=(*table.notes, text))
+    stated = {of["floor"]: floors} if "floor" in of else {}
+    return replace(table, frame=table.frame.assign(**values, **stated)[within], notes=(*table.notes, text))

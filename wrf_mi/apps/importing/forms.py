@@ -16,21 +16,19 @@ import numpy as np
 
 from ...core import DataFault, InputError
 from ...core.files import listed, one_line
-from ...datasets.unknown import RECEIVER, SENT, STRENGTH, long_columns, name_words, preferred
+from ...datasets.unknown import STRENGTH, long_columns, name_words, preferred
+from ...scene.coordinates import is_geographic
+from .column_names import DIGITS, LOWEST_DBM, METRES, NEVER_STRENGTHS, PIXELS, QUANTITIES, SERVING, ColumnName, unit_of
 from .files import Frame, Table, package
+from .programs import MAC
 
-METRES = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048, "inch": 0.0254}
-HERTZ = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
-PIXELS = ("px", "pixel", "pixels")
-UNITS = (*METRES, *PIXELS, *HERTZ, "deg", "degrees", "rad", "dbm", "mw", "s", "ms", "%")
-MARKED_UNIT = re.compile(r"[(\[]\s*([A-Za-z]+|%)\s*[)\]]|[_ ]([A-Za-z]+|%)$")
 AFFIXES = ("", "coord", "coordinate", "pos", "position", "loc", "location", "point", "p", "gt", "true", "tag")
 """Words before or after x, y and z in names of coordinates."""
-AXES = {"x": "|easting|east|ecoord", "y": "|northing|north|ncoord", "z": "|height"}
+AXES = {"x": "|easting|east|ecoord|rechtswert|este", "y": "|northing|north|ncoord|hochwert|norte", "z": "|height"}
 MEANINGS = {
     **{axis: "|".join(f"{affix}{axis}|{axis}{affix}" for affix in AFFIXES) + other for axis, other in AXES.items()},
-    "lat": "lat|latitude|gpslat|gpslatitude|currentlatitude",
-    "lon": "lon|lng|long|longitude|gpslon|gpslongitude|currentlongitude",
+    "lat": "lat|latitude|gpslat|gpslatitude|currentlatitude|latitud|breite|breitengrad",
+    "lon": "lon|lng|long|longitude|gpslon|gpslongitude|currentlongitude|longitud|laenge|laengengrad",
     "floor": "floor|floorid|floornumber|storey|level",
     "heading": "heading|yaw|orientation|bearing|azimuth|course|compass",
     "time": "time|timestamp|ts|datetime|date|rxtime|unixtime|epoch|t|firstseen",
@@ -41,80 +39,28 @@ MEANINGS = {
 }
 """Names of the columns of each meaning, in all forms."""
 STATED = (*MEANINGS, "id", "rssi", "cell")  # meanings of `parsed_columns`
-RANGES = ("rtt", "range", "distance", "dist", "tof")
-QUANTITIES = frozenset({*RANGES, "rsrq", "snr", "sinr", "std", "count", "variance", "noise", "quality"})
-"""Words of columns that hold another quantity of a receiver, which is kept and not used."""
-NEVER_STRENGTHS = frozenset({0.0, 1.0, 100.0, 127.0})
-"""Numbers above or at 0 dBm that columns of strengths hold where nothing was heard."""
-LOWEST_DBM = -150.0
-MAC = re.compile(r"(?:[0-9a-f]{2}[:_-]){5}[0-9a-f]{2}", re.IGNORECASE)
-DIGITS = re.compile(r"\d+")
+ROWS = "write a row for each reading"
+MOST_TEXTS = 0.5  # share of negative numbers above which a text in a column is a fault
+BESIDE = QUANTITIES | {
+    "channel",
+    "frequency",
+    "freq",
+    "time",
+    "timestamp",
+    "speed",
+    "accuracy",
+    "altitude",
+    "id",
+    "index",
+}
+"""Words in the names of columns that are no positions."""
+AXIS_WORDS = (
+    ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"}),
+    ({"x", "east", "easting", "este"}, {"y", "north", "northing", "norte"}),
+)
+"""Words in the names of columns of both axes."""
 FEWEST_SLOTS = 2
 MOST_SHOWN = 6
-
-
-@dataclass(frozen=True)
-class ColumnName:
-    """What the name of a column says."""
-
-    text: str
-
-    @property
-    def words(self) -> set[str]:
-        """Words in small letters."""
-        return name_words(self.text)
-
-    @property
-    def unit(self) -> str:
-        """Unit that the name ends with, as in ``x_mm`` and ``X (m)``."""
-        units = [(first or second).lower() for first, second in MARKED_UNIT.findall(self.text)]
-        return next((unit for unit in units if unit in UNITS), "")
-
-    @property
-    def without_unit(self) -> str:
-        """The name without its unit."""
-        return MARKED_UNIT.sub("", self.text).strip() if self.unit else self.text
-
-    @property
-    def plain(self) -> str:
-        """The name in small letters without unit, blanks and marks."""
-        return re.sub("[^a-z0-9]", "", self.without_unit.lower())
-
-    @property
-    def is_strength(self) -> bool:
-        """Whether the column may hold strengths that were received."""
-        return bool(self.words & STRENGTH) and not self.words & {*QUANTITIES, *SENT}
-
-    @property
-    def is_identity(self) -> bool:
-        """Whether the column may name receivers."""
-        return bool(self.words & {*RECEIVER}) and not self.words & {*STRENGTH, *QUANTITIES}
-
-    @property
-    def receiver(self) -> str:
-        """What the name has beside quantity and unit; "" where nothing is left."""
-        words = "|".join({*STRENGTH, *QUANTITIES})
-        short = re.sub(r"\(.*?\)|\[.*?\]", " ", self.text)
-        short = re.sub(rf"(?<![a-z])(?:{words})(?![a-z])", " ", short, flags=re.IGNORECASE)
-        return re.sub(r"\s+", " ", short).strip(" _.-:")
-
-    @property
-    def stem(self) -> str:
-        """The name without its number; one stem for all hardware addresses."""
-        return "MAC address" if MAC.fullmatch(self.text.strip()) else DIGITS.sub("#", self.text)
-
-    @property
-    def without_slot(self) -> str:
-        """The name without the number of its slot and what surrounds it, its unit in brackets behind it."""
-        stem = re.sub(r"[\s_\-.#:()\[\]]+", " ", DIGITS.sub(" ", self.without_unit)).strip()
-        if name_words(stem) & STRENGTH:  # "Cell RSRP" is the RSRP of the cell, whose identity is another column
-            stem = " ".join(word for word in stem.split() if word.lower() not in RECEIVER)
-        return stem + (f" ({self.unit})" if self.unit else "")
-
-
-def unit_of(name: str) -> str:
-    """Unit that a column's name ends with; "" without."""
-    return ColumnName(name).unit
 
 
 @dataclass
@@ -138,7 +84,8 @@ class Columns:
 
 def parsed_columns(text: str) -> dict[str, str]:
     """Columns by meaning from ``x=X,y=Y,rssi=level``; the name ``-`` means that there is none."""
-    pairs = [part.partition("=") for part in text.split(",") if part.strip()]
+    parts = re.split(r",(?=\s*\w+\s*=)", text)  # names may have commas
+    pairs = [part.partition("=") for part in parts if part.strip()]
     for meaning, equals, name in pairs:
         if meaning.strip() not in STATED or not equals or not name.strip():
             text = f"--columns: {one_line(meaning)!r} is not understood; give MEANING=COLUMN with a meaning of"
@@ -165,26 +112,51 @@ def find_columns(table: Table, stated: Mapping[str, str], receivers: Sequence[st
     if lacking := set(stated.values()) - {*names, "-"}:
         text = f"no column {one_line(min(lacking))} (columns: {shown_names(names)})"
         raise DataFault(table.files[0][0], f"{text}; correct --columns", line=1)
-    of = named_columns([name for name in names if not _in_pattern(name, receivers)], stated)
+    stating = table.frame.columns[table.frame.notna().any()]
+    of = named_columns([name for name in stating if not _in_pattern(name, receivers)], stated)
     for columns_of in FORMS.values():
         if (columns := columns_of(table, of, receivers)) is not None:
             columns.kept = list(table.frame.columns.drop([*columns.of.values(), *columns.strengths]))
-            tellers = [name for name in columns.kept if _tells_receivers(table, name)]
-            if len(columns.strengths) == 1 and tellers and not receivers:
-                strength = one_line(next(iter(columns.strengths)))
-                text = (
-                    f"{one_line(tellers[0])} has names, {strength} strengths: readings of several receivers, or of one"
-                )
-                remedy = f"give --columns {suggested_columns(table, of)}, or --receivers 'PATTERN*'"
-                raise DataFault(table.files[0][0], f"{text}; {remedy}", line=1)
+            _refuse_pooling(table, columns, receivers)
             return columns
-    text = f"no column of signal strengths among {shown_names(names)}"
-    remedy = f"try --columns {suggested_columns(table, of)}, or --receivers 'PATTERN*' for a column of each receiver"
+    if len(names) == 1:
+        raise DataFault(table.files[0][0], f"no table; {ROWS} with a header, such as x,y,bssid,rssi", line=1)
+    for name, values in table.frame.drop(columns=list(of.values()), errors="ignore").items():
+        is_text = values.dtype.kind not in "biufM"  # one among strengths
+        if is_text and package("pandas").to_numeric(values, errors="coerce").lt(0).mean() > MOST_TEXTS:
+            table.numbers(name)
+    text, suggested = f"no column of signal strengths among {shown_names(names)}", suggested_columns(table, of)
+    remedy = f"try --columns {suggested}" if suggested else f"{ROWS}, with strengths in dBm"
+    remedy += ", or --receivers 'PATTERN*' for a column of each receiver"
     raise DataFault(table.files[0][0], f"{text}; {remedy}", line=1)
 
 
+def _refuse_pooling(table: Table, columns: Columns, receivers: Sequence[str]) -> None:
+    """Refuse columns of strengths of several receivers, which another column names."""
+    if not columns.strengths or receivers:
+        return
+    strength, of, one = next(iter(columns.strengths)), columns.of, len(columns.strengths) == 1
+    tellers = [name for name in columns.kept if _tells_receivers(table, name)]
+    if not one:
+        tellers = [name for name in tellers if _has_addresses(table, name) and table.frame[name].nunique() > 1]
+    elif not tellers:  # names that differ from row to row at one place
+        pair = next((pair for pair in (("x", "y"), ("lon", "lat")) if set(pair) <= of.keys()), ())
+        keys = [of[name] for name in (*pair, "time") if name in of] + ([] if pair else _planar(table, of))
+        texts = [name for name in columns.kept if table.frame[name].astype(str).str.contains("[A-Za-z]").all()]
+        tellers = [name for name in texts if keys and table.frame.groupby(keys)[name].nunique().median() > 1]
+    if tellers:
+        text = f"{one_line(tellers[0])} has names, {one_line(strength)} strengths"
+        stated = of | {"id": tellers[0], "rssi": strength}
+        other = f"--receivers {shlex.quote(strength)}" if one else f"--columns run={tellers[0]} (what moved)"
+        remedy = f"give --columns {suggested_columns(table, stated)}, or {one_line(other)}"
+        raise DataFault(table.files[0][0], f"{text}: readings of several receivers, or of one; {remedy}", line=1)
+
+
 def suggested_columns(table: Table, of: Mapping[str, str], meanings: Sequence[str] = ("x", "y", "id", "rssi")) -> str:
-    """Text of ``--columns`` for a table, by the values of its columns; ``?`` where none is likely."""
+    """Text of ``--columns`` for a table, by the values of its columns; "" where a meaning has no likely one.
+
+    Positions are left out where no two columns may be them.
+    """
     free = [name for name in table.frame.columns if name not in of.values()]
     numeric = [name for name in free if table.is_numeric(name)]
     texts = [name for name in free if name not in numeric]
@@ -192,16 +164,37 @@ def suggested_columns(table: Table, of: Mapping[str, str], meanings: Sequence[st
     tellers = [name for name in texts if _tells_receivers(table, name)]
     repeated = [name for name in texts if 1 < table.frame[name].nunique() < len(table)]
     strengths = [name for name in numeric if _is_dbm(table, name)]
-    planar = [name for name in numeric if name not in strengths]
+    planar = _planar(table, of)
     likely = {"x": planar, "y": planar[1:], "id": [*addresses, *tellers, *repeated], "rssi": strengths}
-    if {"x", "y"} <= of.keys() or {"lon", "lat"} <= of.keys():
-        meanings = [meaning for meaning in meanings if meaning not in ("x", "y")]
-    likely = {meaning: likely[meaning] for meaning in meanings}
-    chosen = {meaning: of.get(meaning) or next(iter(names), "?") for meaning, names in likely.items()}
+    chosen = {meaning: of.get(meaning) or next(iter(likely[meaning]), "") for meaning in meanings}
+    if {"x", "y"} <= of.keys() or {"lon", "lat"} <= of.keys() or not (chosen.get("x") and chosen.get("y")):
+        chosen = {meaning: name for meaning, name in chosen.items() if meaning not in ("x", "y")}
+    elif is_geographic(np.column_stack([table.numbers(chosen[axis]) for axis in "xy"])):  # as most tables order them
+        chosen = {{"x": "lat", "y": "lon"}.get(meaning, meaning): name for meaning, name in chosen.items()}
+    if not chosen or not all(chosen.values()):
+        return ""
     return shlex.quote(one_line(",".join(f"{meaning}={name}" for meaning, name in chosen.items())))
 
 
+def _planar(table: Table, of: Mapping[str, str]) -> list[str]:
+    """Two columns of numbers that may be positions in a plane, by their names or else values; none without."""
+    numeric = [name for name in table.frame.columns if name not in of.values() and table.is_numeric(name)]
+    for pair in AXIS_WORDS:
+        named = [[name for name in numeric if name_words(name) & words] for words in pair]
+        if all(named):
+            return [max(group, key=lambda name: table.frame[name].nunique()) for group in named]
+    names = [name for name in numeric if table.frame[name].nunique() > 1 and not _is_dbm(table, name)]
+    names = [name for name in names if not name_words(name) & BESIDE]
+    names = [name for name in names if unit_of(name) in ("", *METRES, *PIXELS, "deg", "degrees")]
+    for name in names if len(names) > 2 else ():  # counts and times
+        values = table.numbers(name)
+        if len(names) > 2 and (values == np.round(values)).all() and (np.diff(values) >= 0).all():
+            names = [other for other in names if other != name]
+    return names[:2] if len(names) > 1 else []
+
+
 def _has_addresses(table: Table, name: str) -> bool:
+    """Whether a column has hardware addresses."""
     texts = table.frame[name].dropna().astype(str).str.strip()
     return bool(texts.str.fullmatch(MAC.pattern, case=False).any())
 
@@ -209,6 +202,15 @@ def _has_addresses(table: Table, name: str) -> bool:
 def _tells_receivers(table: Table, name: str) -> bool:
     """Whether a column has addresses, or several names under a heading of receivers."""
     return _has_addresses(table, name) or (ColumnName(name).is_identity and table.frame[name].nunique() > 1)
+
+
+def _is_dbm(table: Table, name: str) -> bool | None:
+    """Whether a column holds strengths; None where nothing was heard."""
+    if not table.is_numeric(name):
+        return False
+    values = np.unique(table.numbers(name))
+    values = values[~np.isnan(values) & ~np.isin(values, list(NEVER_STRENGTHS)) & (values > LOWEST_DBM)]
+    return bool(values[-1] < 0) if len(values) else None
 
 
 def shown_names(names: Sequence[str]) -> str:
@@ -236,14 +238,20 @@ def _readings(table: Table, of: dict[str, str], patterns: Sequence[str]) -> Colu
         column = ColumnName(name)
         if "rssi" in of and column.words & STRENGTH:
             return False
+        if column.words & STRENGTH and column.words & QUANTITIES and "id" not in of:  # noise in dBm
+            return False
         # "level" is a strength in tables of Android and a storey elsewhere.
         return name not in of.values() or column.plain == "level"
 
     alias = {of[meaning]: word for meaning, word in (("id", "bssid"), ("rssi", "rssi")) if meaning in of}
-    long = long_columns([alias.get(name, name) for name in table.frame.columns if name in alias or is_free(name)])
-    if long is None:
+    names = [alias.get(name, name) for name in table.frame.columns if name in alias or is_free(name)]
+    anchors = [name for name in names if "tag" not in name_words(name) or ColumnName(name).is_strength]  # tags move
+    if (long := long_columns(anchors) or long_columns(names)) is None:
         return None
     chosen = {"id": of.get("id", long[0]), "rssi": of.get("rssi", long[1])}
+    if "id" not in of and "ssid" in name_words(chosen["id"]):  # a network that several access points have
+        addresses = [name for name in table.frame.columns if is_free(name) and _has_addresses(table, name)]
+        chosen["id"] = addresses[0] if addresses else chosen["id"]
     return Columns(chosen | {meaning: name for meaning, name in of.items() if name not in chosen.values()})
 
 
@@ -303,7 +311,8 @@ def without_slots(table: Table) -> Table:
     """
     columns_of: dict[str, dict[str, str]] = {}
     for name in table.frame.columns if table.has_header else ():
-        if len(numbers := DIGITS.findall(name)) == 1:
+        numbers = DIGITS.findall(name) or ["0"] * bool(name_words(name) & SERVING)
+        if len(numbers) == 1:
             columns_of.setdefault(numbers[0], {})[ColumnName(name).without_slot] = name
     slots = [columns for columns in columns_of.values() if _is_slot([*map(ColumnName, columns)])]
     if len(slots) < FEWEST_SLOTS:
@@ -312,22 +321,18 @@ def without_slots(table: Table) -> Table:
     parts = [shared.join(table.frame[list(columns.values())].set_axis(list(columns), axis=1)) for columns in slots]
     frame: Frame = package("pandas").concat(parts)
     identities = [stem for stem in frame.columns.drop(list(shared)) if ColumnName(stem).is_identity]
+    strengths = [stem for stem in frame.columns.drop(list(shared)) if ColumnName(stem).is_strength]
+    nameless = int((frame[identities].isna().all(axis=1) & frame[strengths].notna().any(axis=1)).sum())
     frame = frame.dropna(subset=identities, how="all").sort_index(kind="stable")
-    note = f"{table.files[0][0].name}: {len(slots)} slots of cells in each row, {len(frame)} readings of cells"
-    return replace(table, frame=frame, notes=(*table.notes, f"{note} by identity"))
+    note = (
+        f"{table.files[0][0].name}: {len(slots)} slots of cells in each row, {len(frame)} readings of cells by identity"
+    )
+    note += f"; {nameless} without one are left out" * bool(nameless)
+    return replace(table, frame=frame, notes=(*table.notes, note))
 
 
 def _is_slot(columns: Sequence[ColumnName]) -> bool:
     return any(column.is_identity for column in columns) and any(column.is_strength for column in columns)
-
-
-def _is_dbm(table: Table, name: str) -> bool | None:
-    """Whether a column holds strengths; None where nothing was heard."""
-    if not table.is_numeric(name):
-        return False
-    values = np.unique(table.numbers(name))
-    values = values[~np.isnan(values) & ~np.isin(values, list(NEVER_STRENGTHS)) & (values > LOWEST_DBM)]
-    return bool(values[-1] < 0) if len(values) else None
 
 
 def _in_pattern(name: str, patterns: Sequence[str]) -> bool:

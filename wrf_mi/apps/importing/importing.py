@@ -22,9 +22,10 @@ from ...datasets.ble_folder import CARRIER_HZ, write_ble_folder
 from ...datasets.unknown import SENT, name_words
 from ...tasks import RSSI
 from .carriers import carriers_of_receivers, column_hz
+from .column_names import PIXELS
 from .files import Table, joined, read_table
 from .fixes import with_fixes, without_stale
-from .forms import PIXELS, described, find_columns, parsed_columns, without_slots
+from .forms import described, find_columns, parsed_columns, without_slots
 from .options import ImportOptions, option_name
 from .picture import plan_picture
 from .places import (
@@ -40,7 +41,7 @@ from .places import (
     with_cells,
     with_positions,
 )
-from .pooled import refuse_per_cent, refuse_several_kinds, texts_of_readings
+from .pooled import refuse_no_dbm, refuse_per_cent, refuse_several_kinds, texts_of_readings
 from .readings import (
     Means,
     Readings,
@@ -139,7 +140,9 @@ class _Import:
 
         # Positions of the rows, and single readings without numbers for "not heard".
         frame, xyz_m = self._positions()
-        readings, notes, not_heard = without_not_heard(read_readings(self.table, self.columns), self.options.not_heard)
+        readings = read_readings(self.table, self.columns)
+        refuse_no_dbm(self.table, readings)
+        readings, notes, not_heard = without_not_heard(readings, self.options.not_heard)
         self.notes += notes
         if not len(readings.dbm):
             raise DataFault(self.table.files[0][0], "no reading was heard; correct --columns or --not-heard")
@@ -249,7 +252,7 @@ class _Import:
         unit = self._unit()
         if unit in PIXELS or options.register_pairs is not None:
             pairs, is_pixels = options.register_pairs, unit in PIXELS
-            frame, note = registered_frame(options.plan, options.resolution_m, options.origin_m, pairs, is_pixels)
+            frame, note = registered_frame(xy, options.plan, options.resolution_m, options.origin_m, pairs, is_pixels)
             self.units |= {"x": unit or "registered", "y": unit or "registered"}
             self.notes.append(note)
             return frame, np.column_stack([frame.local_m(xy), self._heights_m()])

@@ -13,18 +13,15 @@ from numpy.typing import NDArray
 from ...core import DataFault, InputError
 from ...core.angles import FloatArray
 from ...core.files import listed, one_line
-from ...scene.coordinates import LATITUDE, LONGITUDE, local_projection
+from ...scene.coordinates import LATITUDE, LONGITUDE, is_geographic, local_projection
+from .column_names import METRES, unit_of
 from .files import Table, package
-from .forms import METRES, named_columns, shown_names, suggested_columns, unit_of
+from .forms import named_columns, shown_names, suggested_columns
 
 DEGREES = "EPSG:4326"
 FAR_M = 10_000.0  # largest coordinate without a shift: single precision resolves a millimetre to 16 km
 ROUND_M, ROUND_DEG = 10.0, 1e-4  # origins are rounded to these
 POSITION_DIGITS = 6  # decimals of metres that are written: the mean of equal positions is not exactly theirs
-WIDEST_DEG = 1.0  # largest extent of a place in degrees
-AWAY = 20.0
-"""Least distance of a place in degrees from the origin in its extents, 1 km at 0.2 degrees: a room in metres is not a
-metre wide and twenty metres away."""
 FULL_TURN = 4 * np.pi  # largest heading in radians where its unit is not stated; headings may count a turn
 COMPASS = ("bearing", "azimuth", "course", "compass")  # words of headings that run clockwise from north, in degrees
 MOST_OUTSIDE = 0.5  # share of rows outside the time of the positions above which the times are not in one unit
@@ -36,6 +33,8 @@ PAIR = re.compile(
 """Coordinates x, y and, if stated, z in one text, as in ``(3.5, -2.0)``."""
 DATE = re.compile(r"^(\d{4})\D(\d\d)\D(\d\d)\D(\d\d)\D(\d\d)\D(\d\d)")
 """Dates with any marks, as in ``2018.05.07_18.57.10``."""
+TICKS = {1e17: 1e9, 1e14: 1e6, 1e11: 1e3}
+"""Ticks in a second of times since 1970, by their least number in this century: ns, us, ms."""
 MOST_FLOORS = 20  # numbers of a third column without name from which it is no floor
 FILE = "file"  # column of positions with the names of the files that were measured there
 PLACES = ("x", "y", "z", "lat", "lon", "floor", "heading")
@@ -143,13 +142,6 @@ def _guessed_crs(xy: FloatArray, geographic: bool, unit: str) -> tuple[str, bool
     return DEGREES, swapped, [f"x and y are taken for {order} in degrees; --units m: they are metres"]
 
 
-def is_geographic(xy: FloatArray) -> bool:
-    """Whether coordinates [n, 2] may be degrees of a place on the globe rather than metres of a room."""
-    extent, largest = float(np.ptp(xy, axis=0).max()), np.abs(xy).max(axis=0)
-    in_range = largest.max() <= LONGITUDE and largest.min() <= LATITUDE
-    return bool(in_range and 0 < extent <= WIDEST_DEG and largest.max() >= AWAY * extent)
-
-
 def _projected(xy: FloatArray, crs: str, scale_m: float, swapped: bool) -> LocalFrame:
     """The local frame about the middle of coordinates of a reference system."""
     middle = np.median(_transformed(crs, DEGREES, (xy[:, ::-1] if swapped else xy) * scale_m), axis=0)
@@ -175,9 +167,10 @@ def plane_columns(of: Mapping[str, str], table: Table) -> tuple[str, str, bool]:
     for first, second, geographic in (("x", "y", False), ("lon", "lat", True)):
         if first in of and second in of:
             return of[first], of[second], geographic
-    names = shown_names(list(table.frame.columns))
-    remedy = f"try --columns {suggested_columns(table, of, ('x', 'y'))} (or lon=,lat=, or cell= for both in one text), "
-    remedy += "or give --positions FILE"
+    names, pair = shown_names(list(table.frame.columns)), suggested_columns(table, of, ("x", "y"))
+    remedy = f"try --columns {pair} (or lon=,lat=), or give --positions FILE"
+    if not pair:
+        remedy = "give --positions FILE with x,y, or --columns cell=NAME where one text has both"
     raise InputError(f"{table.files[0][0]}: no columns of positions among {names}; {remedy}")
 
 
@@ -272,18 +265,35 @@ def with_positions(values: Table, positions: Table, stated: Mapping[str, str]) -
     of = named_columns(in_positions, {key: name for key, name in stated.items() if name in in_positions})
     new = list(filter(None, map(of.get, PLACES)))
     time, other_time = named_columns(in_values, {}).get("time"), of.get("time")
+    if not {"x", "y"} <= of.keys() and not {"lon", "lat"} <= of.keys():
+        plane_columns(of, positions)
     shared = sorted(set(in_positions) & set(in_values) - {*new, time, other_time}, key=in_positions.index)
-    if shared and values.has_header and positions.has_header:
+    shared = shared if values.has_header and positions.has_header else []
+    is_path = time and other_time and shared and positions.frame[shared[0]].duplicated().any()
+    if shared and not is_path:
         return _looked_up(values, positions, shared[0], new), f"by the column {one_line(shared[0])}"
-    if time and other_time:
+    if not time or not other_time:
+        return _row_by_row(values, positions, new), "row by row"
+    if not is_path:
         return _interpolated(values, time, positions, other_time, new)
-    return _row_by_row(values, positions, new), "row by row"
+    # Paths of several devices: each at its own times.
+    key = shared[0]
+    if lacking := set(values.frame[key]) - set(positions.frame[key]):
+        raise DataFault(positions.files[0][0], f"no row has {one_line(key)} {one_line(lacking.pop())}; give its path")
+    paths = positions.frame.groupby(key)
+    pairs = [(rows, paths.get_group(name)) for (name,), rows in values.frame.groupby([key])]
+    frames = [
+        _interpolated(replace(values, frame=rows), time, replace(positions, frame=path), other_time, new)[0].frame
+        for rows, path in pairs
+    ]
+    frame = package("pandas").concat(frames).sort_index(kind="stable")
+    return replace(values, frame=frame), f"by time, linear between positions of one {one_line(key)}"
 
 
 def _row_by_row(values: Table, positions: Table, new: Sequence[str]) -> Table:
     if len(values) != len(positions):
         text = f"{len(positions)} rows for {len(values)} of {values.files[0][0].name}, and no column that both have"
-        remedy = "give a position for each row, or a column time or point in both"
+        remedy = "give a position for each row, or a column time or point in both (KITTI: times.txt beside the poses)"
         raise DataFault(positions.files[0][0], f"{text}; {remedy}")
     free = values.frame.rename(columns={name: f"value_{name}" for name in values.frame if name in new})
     return replace(values, frame=package("pandas").concat([free, positions.frame[new]], axis=1))
@@ -312,7 +322,7 @@ def _looked_up(values: Table, positions: Table, key: str, new: Sequence[str]) ->
 
 
 def _interpolated(values: Table, time: str, positions: Table, other: str, new: Sequence[str]) -> tuple[Table, str]:
-    at, known = seconds(values, time), seconds(positions, other)
+    at, known = (times / ticks(times) for times in (seconds(values, time), seconds(positions, other)))
     within = (at >= np.nanmin(known)) & (at <= np.nanmax(known))
     outside = len(at) - np.count_nonzero(within)
     if outside > MOST_OUTSIDE * len(at):
@@ -322,6 +332,12 @@ def _interpolated(values: Table, time: str, positions: Table, other: str, new: S
     columns = {name: np.interp(at, known[order], positions.numbers(name)[order]) for name in new}
     text = f"; {outside} rows before or after them are left out" if outside else ""
     return replace(values, frame=values.frame.assign(**columns)[within]), f"by time, linear between positions{text}"
+
+
+def ticks(times: FloatArray) -> float:
+    """Ticks in a second of times [n]."""
+    largest = float(np.nanmax(np.abs(times), initial=0.0))
+    return next((count for least, count in TICKS.items() if largest > least), 1.0)
 
 
 def with_cells(table: Table, column: str) -> Table:

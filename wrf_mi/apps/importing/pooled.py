@@ -8,9 +8,10 @@ from typing import Any
 from ...core import DataFault
 from ...core.files import listed, one_line
 from ...datasets.unknown import name_words
+from .column_names import unit_of
 from .files import Table
-from .forms import Columns, unit_of
-from .programs import FLOOR_NAME, RADIOS
+from .forms import Columns
+from .programs import FLOOR_NAME, RADIOS, ROLES
 from .readings import Readings
 
 
@@ -20,8 +21,15 @@ def refuse_per_cent(table: Table, columns: Columns) -> None:
     names = [of["rssi"]] if "rssi" in of and not columns.strengths else list(columns.strengths)
     for name in names:
         if unit_of(name) == "%" or name_words(name) & {"quality", "percent"}:
-            text = f"{one_line(name)} is in per cent; give dBm (in Windows dBm = quality / 2 - 100)"
-            raise DataFault(table.files[0][0], f"{text}, or name another column by --columns rssi=...")
+            text = f"{one_line(name)} is in per cent"
+            raise DataFault(table.files[0][0], f"{text}; give dBm (in Windows dBm = quality / 2 - 100)")
+
+
+def refuse_no_dbm(table: Table, readings: Readings) -> None:
+    """Refuse strengths of which none is below 0 dBm."""
+    if len(readings.dbm) and (lowest := readings.dbm.min()) >= 0:
+        text = f"no strength is below 0 dBm ({lowest:g} to {readings.dbm.max():g}): per cent, mW, or without their sign"
+        raise DataFault(table.files[0][0], f"{text}; give dBm (in Windows dBm = quality / 2 - 100)")
 
 
 def refuse_several_kinds(table: Table, columns: Columns, readings: Readings) -> None:
@@ -34,7 +42,8 @@ def refuse_several_kinds(table: Table, columns: Columns, readings: Readings) -> 
             raise DataFault(table.files[0][0], f"{text}, {remedy}")
     for name in table.frame.columns:
         values = texts_of_readings(table, name, readings)
-        if values.nunique() > 1 and set(values.str.lower()) <= RADIOS:
+        kinds = set(values.str.lower()) if values.nunique() > 1 else {""}
+        if kinds <= RADIOS or kinds <= ROLES:
             counts = listed([f"{one_line(text)} ({rows})" for text, rows in values.value_counts().items()])
             text = f"{one_line(name)} is {counts}: these are not pooled"
             remedy = f"choose one by --where {shlex.quote(f'{name}={values.value_counts().index[0]}')}"

@@ -14,8 +14,11 @@ import numpy as np
 
 Frame = Any  # pandas.DataFrame, which is imported where it is used
 
+MAC = re.compile(r"(?:[0-9a-f]{2}[:_-]){5}[0-9a-f]{2}", re.IGNORECASE)
 RADIOS = frozenset({"wifi", "ble", "bt", "bluetooth", "gsm", "cdma", "wcdma", "umts", "tdscdma", "lte", "nr", "5g"})
 """Values of a column of kinds of radio, in small letters."""
+ROLES = frozenset({"ap", "client", "station", "probe"})
+"""Values of a column of what sent in Wi-Fi."""
 CELL_PARTS = {"mcc": "mcc", "net": "net|mnc", "area": "area|lac|tac", "cell": "cell|cellid|cid|ci|eci"}
 """Names of the columns that identify a cell together: country, network, area and number."""
 FLOOR_NAME = "floor_name"  # column of the floor that the head of a log states
@@ -33,6 +36,7 @@ class Program:
         columns: columns by meaning, where their names do not tell it.
         renamed: new names of columns by a pattern of the former ones; a number is that of the slot of a cell.
         unknown: number that stands for an unknown strength, by column.
+        free: column of texts that may have the separator in them, without quotes.
     """
 
     name: str
@@ -40,11 +44,12 @@ class Program:
     columns: Mapping[str, str] = field(default_factory=dict)
     renamed: Mapping[str, str] = field(default_factory=dict)
     unknown: Mapping[str, float] = field(default_factory=dict)
+    free: str = ""
 
     def new_name(self, name: str) -> str:
         """Name of a column after `renamed`."""
         for pattern, new in self.renamed.items():
-            if match := re.fullmatch(pattern, name):
+            if match := re.fullmatch(pattern, name, re.IGNORECASE):
                 return match.expand(new)
         return name
 
@@ -66,8 +71,18 @@ PROGRAMS = (
         "bssid power firsttimeseen beacons",
         {"id": "BSSID", "rssi": "Power", "time": "Last time seen"},
         unknown={"Power": -1},
+        free="ESSID",
     ),
-    Program("airodump-ng", "bssid power localtime gpstime", {"time": "GPSTime"}, unknown={"Power": -1}),
+    Program(
+        "airodump-ng",
+        "stationmac power firsttimeseen probedessids",
+        {"id": "Station MAC", "rssi": "Power", "time": "Last time seen"},
+        unknown={"Power": -1},
+        free="Probed ESSIDs",
+    ),
+    Program("airodump-ng", "bssid power localtime gpstime", {"time": "GPSTime"}, unknown={"Power": -1}, free="ESSID"),
+    Program("WiFiAnalyzer", "timestamp ssid bssid strength primaryfrequency", free="SSID"),
+    Program("Vistumbler", "bssid signal rssi highrssi", {"id": "BSSID", "rssi": "RSSI"}),
     Program(
         "Bermuda",
         "scanneraddress rssi deviceaddress",
@@ -168,6 +183,7 @@ class EventLog:
         radios: kind of radio of the kinds of readings.
         fields: fields by column, of each kind; a tuple of fields is one identity.
         floor: pattern of the name of the floor in the comments.
+        start: pattern of the start of a line, which some phones write without ending the line before.
     """
 
     separator: str
@@ -175,7 +191,8 @@ class EventLog:
     time: int
     radios: Mapping[str, str]
     fields: Mapping[str, Mapping[str, int | tuple[int, ...]]]
-    floor: str
+    floor: str = "(?!)"
+    start: str = "(?!)"
 
 
 EVENT_LOGS = (
@@ -190,8 +207,16 @@ EVENT_LOGS = (
             "TYPE_BEACON": {"bssid": (2, 3, 4), "rssi": 6},
         },
         floor=r"FloorName:(\S+)",
+        start=r"\d{13}\tTYPE_",
+    ),
+    EventLog(
+        ";",
+        kind=0,
+        time=1,
+        radios={"WIFI": "WIFI"},
+        fields={"POSI": {"lat": 3, "lon": 4, "floor": 5}, "WIFI": {"ssid": 3, "bssid": 4, "rssi": -1}},
     ),
 )
-"""The first: logs of the Indoor Location Competition 2.0."""
+"""Logs of the Indoor Location Competition 2.0, and of the IPIN competitions, whose WIFI has a frequency or not."""
 MQTT = re.compile(r"(?:(?P<time>\S+)\s+)?espresense/devices/(?P<device>[^/\s]+)/(?P<node>\S+)\s+(?P<payload>\{.*\})\s*")
 """A line of ``mosquitto_sub -F '%U %t %p' -t 'espresense/devices/#'``: time, topic and payload."""

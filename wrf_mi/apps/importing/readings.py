@@ -16,7 +16,8 @@ from ...core.types import IntArray
 from ...datasets.receivers_file import plain_id
 from ...datasets.sentinels import CUSTOMARY_DBM, suspicious_values
 from .files import Table, package
-from .forms import MAC, Columns
+from .forms import Columns
+from .programs import MAC
 
 POOLED_READINGS = 4.0
 """Weight, in readings, of all places' variance in that of a place, of which few readings tell little."""

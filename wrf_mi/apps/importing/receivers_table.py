@@ -17,8 +17,9 @@ from ...core.files import listed, one_line
 from ...datasets.folder_files import CsvTable
 from ...datasets.receivers_file import COLUMNS, TX_COLUMNS, read_antennas, read_orientations, receiver_of
 from ...datasets.unknown import RECEIVER, name_words
+from .column_names import PIXELS, unit_of
 from .files import Table
-from .forms import PIXELS, named_columns, shown_names, unit_of
+from .forms import named_columns, shown_names
 from .places import POSITION_DIGITS, LocalFrame, plane_columns, unit_scale
 from .programs import CELL
 from .readings import id_key, normal_id
@@ -150,6 +151,8 @@ def _with_ids(table: Table) -> Table:
     names: list[str] = list(table.frame.columns)
     if not table.has_header and len(names) in (3, 4):
         names = ["id", "x", "y", "z"][: len(names)]
+    elif "id" in names and "name" in names:  # programs that make the id of the name where none is stated
+        return replace(table, frame=table.frame.assign(id=table.frame["id"].fillna(table.frame["name"])))
     elif "id" not in names:
         matches = (name for word in RECEIVER for name in names if word in name_words(name))
         if (first := next(matches, None)) is None:

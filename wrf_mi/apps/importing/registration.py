@@ -7,18 +7,25 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core import InputError
+from ...core import DataFault, InputError
+from ...core.angles import FloatArray
 from ...scene.plan.sources import picture_scale
 from ...scene.register import read_pairs, register_pairs, similar_pixels
 from .places import LocalFrame
 
 
 def registered_frame(
-    plan: str | Path | None, resolution_m: float, origin_m: Sequence[float], pairs: str | Path | None, is_pixels: bool
+    xy: FloatArray,
+    plan: str | Path | None,
+    resolution_m: float,
+    origin_m: Sequence[float],
+    pairs: str | Path | None,
+    is_pixels: bool,
 ) -> tuple[LocalFrame, str]:
     """The frame of pixels of a plan, whose y runs down, or of coordinates that pairs of points register, and a note.
 
     Args:
+        xy: coordinates [n, 2] of the table.
         plan: picture, or YAML of a ROS map that names one; None: none.
         resolution_m: side of a pixel in metres; 0: that of the YAML, or by ``pairs``.
         origin_m: metres x, y from the lower left corner of the picture that become the origin, as of ``wrf-mi mesh``.
@@ -26,7 +33,7 @@ def registered_frame(
         is_pixels: whether coordinates are pixels, whose scale the pairs state.
 
     Raises:
-        InputError: neither plan nor pairs, no scale, or pairs that disagree.
+        InputError: neither plan nor pairs, no scale, positions outside the plan, or pairs that disagree.
     """
     if pairs is not None:
         source, target = read_pairs(pairs)
@@ -39,8 +46,13 @@ def registered_frame(
         return LocalFrame(affine=tuple(map(tuple, matrix.tolist()))), f"{note}, turned by {angle:.1f} degrees"
     if plan is None:
         raise InputError("--units px: pixels of which picture? Give --plan plan.png, or --register-pairs pairs.csv")
-    height, scale_m, corner_m = picture_scale(Path(plan), resolution_m or None)
-    left_m, low_m = np.asarray(origin_m, float)[:2] - corner_m if len(origin_m) else (-corner_m[0], -corner_m[1])
-    affine = ((scale_m, 0.0, float(-left_m)), (0.0, -scale_m, float(height * scale_m - low_m)))
+    (height, width), scale_m, (x_m, y_m, yaw) = picture_scale(Path(plan), resolution_m or None)
+    if (outside := ((xy < 0) | (xy > [width, height])).any(axis=1)).any():
+        text = f"{outside.sum()} of {len(xy)} positions are outside its {width} x {height} pixels"
+        raise DataFault(Path(plan), f"{text}; give the picture that was clicked, or --register-pairs pairs.csv")
+    corner_m = np.array([x_m, y_m]) - (np.asarray(origin_m, float)[:2] if len(origin_m) else 0.0)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])  # of a robot's map about its corner
+    affine = np.column_stack([scale_m * turn @ np.diag([1, -1]), turn @ [0, height * scale_m] + corner_m])
     note = f"positions are pixels of {Path(plan).name} ({height} rows, {scale_m:g} m each): y runs down there, up here"
-    return LocalFrame(affine=affine), f"{note}; the frame is that of wrf-mi mesh {Path(plan).name}"
+    frame = LocalFrame(affine=tuple(map(tuple, affine.tolist())))
+    return frame, f"{note}; the frame is that of wrf-mi mesh {Path(plan).name}"

@@ -89,10 +89,10 @@ def radio_map(
     Args:
         run: run, or its folder, with one fitted model.
         height_m: z of a horizontal grid over the scene, or over the data where there is none; None: the median height
-            of the transmitters in the data.
+            of the transmitters in the data. With ``surface``, height above it; None: 0.
         step_m: spacing of the grid, or longest edge of a mesh's triangles, which are halved; None: 0.1 m, more for
             areas above a hectare, or the triangles as they are.
-        surface: mesh whose triangles' centres are the positions, in place of the grid.
+        surface: mesh at whose triangles' centres, or above them, the positions are, in place of the grid.
         receivers: names, or numbers from 0; None: all.
         threshold_dbm: received power above which a position counts as covered; None: -90 dBm, and no coverage for
             levels without a unit.
@@ -112,7 +112,7 @@ def radio_map(
     opened = run if isinstance(run, Run) else open_run(run)
     maps_package("xarray")
     task = opened.problem.record.task
-    _check(opened, task, surface, height_m, transmit_dbm, threshold_dbm)
+    _check(opened, task, height_m, transmit_dbm, threshold_dbm)
     known = opened.receivers
     numbers = range(len(known)) if receivers is None else [receiver_index(known, name) for name in receivers]
     if task.level_kind != "relative" and threshold_dbm is None:
@@ -125,11 +125,9 @@ def radio_map(
     return map_dataset(places, [known[number] for number in numbers], values, unit, attributes)
 
 
-def _check(run: Run, task: Task, surface: Any, height_m: float | None, transmit_dbm: float, threshold: Any) -> None:
+def _check(run: Run, task: Task, height_m: float | None, transmit_dbm: float, threshold: Any) -> None:
     if run.model.uplink == "required":
         raise InputError(f"{run.folder}: {run.config.model} predicts from the uplink, not from positions; no map of it")
-    if surface is not None and height_m is not None:
-        raise InputError("map: a height belongs to a grid; omit it, or the surface")
     for name, value in (("height", height_m), ("transmit power", transmit_dbm), ("threshold", threshold)):
         if value is not None and not np.isfinite(value):
             raise InputError(f"{name} {value:g}: give a finite number")
@@ -153,7 +151,7 @@ def _places(
 ) -> grid.Grid | grid.SurfaceMesh:
     known = run.problem.record.tx_pos_m
     if surface is not None:
-        mesh = grid.surface_of(surface, step_m)
+        mesh = grid.surface_of(surface, step_m, height_m or 0.0)
         grid.warn_of_points_outside(run, mesh.positions_m, known)
         return mesh
     height = grid.usual_height(run, known) if height_m is None else height_m

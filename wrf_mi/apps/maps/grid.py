@@ -62,14 +62,15 @@ class Grid:
 
 @dataclass(frozen=True)
 class SurfaceMesh:
-    """Triangles at whose centres a map is computed."""
+    """Triangles at or above whose centres a map is computed."""
 
     triangles_m: FloatArray  # corners of the triangles [m, 3, 3], metres
+    height_m: float = 0.0  # above the centres
 
     @property
     def positions_m(self) -> FloatArray:
-        """Centres of the triangles [m, 3], metres."""
-        return np.asarray(self.triangles_m.mean(axis=1))
+        """Positions [m, 3] above the centres of the triangles, metres."""
+        return np.asarray(self.triangles_m.mean(axis=1) + np.array([0, 0, self.height_m]))
 
 
 def grid_over(low_m: FloatArray, high_m: FloatArray, step_m: float, height_m: float) -> Grid:
@@ -99,8 +100,10 @@ def usual_step(low_m: FloatArray, high_m: FloatArray) -> float:
     return max(STEP_M, float(np.sqrt(np.prod((high_m - low_m)[:2]) / USUAL_POSITIONS)))
 
 
-def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
+def surface_of(mesh: str | Path, step_m: float | None = None, height_m: float = 0.0) -> SurfaceMesh:
     """Triangles of a mesh file in metres, halved until no edge is longer than a step; None: the faces as they are.
+
+    ``height_m`` is that of the positions above the triangles.
 
     `InputError`: a file without faces, a coordinate that is not finite, or more than `LARGEST` triangles.
     """
@@ -121,7 +124,7 @@ def surface_of(mesh: str | Path, step_m: float | None = None) -> SurfaceMesh:
         faces = np.arange(3 * len(triangles)).reshape(-1, 3)
         vertices, faces = trimesh.remesh.subdivide_to_size(triangles.reshape(-1, 3), faces, step_m, max_iter=ROUNDS)
         triangles = vertices[faces]
-    return SurfaceMesh(triangles)
+    return SurfaceMesh(triangles, height_m)
 
 
 def _check_step(step_m: float) -> None:

@@ -308,15 +308,17 @@ def _scaled_picture(path: Path, resolution_m: float | None) -> tuple[Path, float
     return path, resolution_m, sheet
 
 
-def picture_scale(path: Path, resolution_m: float | None = None) -> tuple[int, float, FloatArray]:
-    """Rows of a plan's picture, side of its pixels, and position [2] of its lower left corner, metres.
+def picture_scale(
+    path: Path, resolution_m: float | None = None
+) -> tuple[tuple[int, int], float, tuple[float, float, float]]:
+    """Rows and columns of a plan's picture, side of its pixels, and pose x, y, yaw of its lower left corner, metres.
 
     Raises:
         InputError: no picture that can be read, or no resolution.
     """
     path, resolution_m, sheet = _scaled_picture(path, resolution_m)
-    corner_m = np.zeros(2) if sheet is None else np.array(sheet.origin[:2])
-    return len(read_pixels(path, LARGEST_PICTURE).grey), resolution_m, corner_m
+    rows, columns = read_pixels(path, LARGEST_PICTURE).grey.shape
+    return (rows, columns), resolution_m, (0.0, 0.0, 0.0) if sheet is None else sheet.origin
 
 
 def plan_pixels(path: Path, grid: PlanGrid, side: int) -> NDArray[np.uint8]:
