@@ -63,7 +63,7 @@ def read_ifc(path: Path) -> list[Surface]:
         elements = [element for name in _classes(model) for element in model.by_type(name)]
         settings = geom.settings()
         settings.set("use-world-coords", True)
-        shapes = list(geom.iterator(settings, model, 1, include=elements)) if elements else []
+        shapes: list[Any] = list(geom.iterator(settings, model, 1, include=elements)) if elements else []
     except (ifcopenshell.Error, RuntimeError, OSError) as error:
         raise InputError(f"{path}: not an IFC that can be read ({one_line(error)}); export it anew") from None
     parts: list[tuple[Kind, str, str, Any, Any]] = []
