@@ -93,9 +93,7 @@ def picture(place: Path) -> Figure:
     (given, predicted), (spread, phone) = panels = figure.subplots(2, 2, sharex=True, sharey=True)
     given.plot(*record.tx_pos_m[rows][~heard, :2].T, ".", color="0.7", markersize=2)
     drawing.draw_values(given, record.tx_pos_m[rows][heard], levels[heard], powers, s=12)
-    given.set_title(
-        f"Given: plan, and {len(rows)} places on walks (colour: one access point of {len(record.receivers)})"
-    )
+    given.set_title(f"Given: plan, and walks with readings of {len(record.receivers)} access points, one of them shown")
     drawing.draw_layer(predicted, shown["x"].values, shown["y"].values, power, powers)
     predicted.set_title("Predicted power of this access point")
     drawing.draw_layer(spread, shown["x"].values, shown["y"].values, std_db, deviations)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest, quantile_test
 
+from wrf_mi.apps.table.entries import read_entry
 from wrf_mi.core import InputError
 from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.runs.sweep import dataset_files
@@ -32,8 +33,9 @@ from .comparison import STORED, say
 from .declared import lined
 from .sources import fit_key, source_files
 from .stress_rows import stages
+from .table_pages import STORED as ENTRIES
 from .table_plan import Row, available, plan
-from .tables import FOLDER, measure
+from .tables import measure
 
 RUNS = Path("runs/bench/sentinels")
 TABLE_ROWS = (
@@ -103,18 +105,18 @@ def _stored(name: str) -> dict[str, Any]:
 
 
 def _of_table(row: Row) -> Group:
-    stored, task = _stored(f"{FOLDER}/{row.name}"), TASKS[row.part.task]
-    if stored["command"] != row.command:
+    stored, task = read_entry(ENTRIES / f"{row.name}.json"), TASKS[row.part.task]
+    if stored.command != row.command:
         raise InputError(f"{row.name}: the tables plan it otherwise than it is stored; run wrf-mi bench tables first")
-    low, high = median_interval(stored["quantiles"], stored["n_test"])
+    low, high = median_interval(stored.quantiles, stored.n_test or 0)
     name = f"{row.part.dataset}, {row.part.split}: {row.method}, median {task.label}"
-    figure = Figure(name, stored["score"]["median"], low, high, task.higher_is_better)
+    figure = Figure(name, stored.score["median"], low, high, task.higher_is_better)
 
     def again(runs: Path) -> list[float]:
         measured = measure(runs, row)
-        if measured["data"] != stored.get("data", measured["data"]):
+        if stored.data not in (None, measured.data):
             raise InputError(f"{row.part.dataset}: other content than the stored figure's; fetch it again")
-        return [measured["score"]["median"]]
+        return [measured.score["median"]]
 
     return Group(row.name, (figure,), again, available(row.part))
 

@@ -54,7 +54,8 @@ def table(flat: Path, tmp_path: Path) -> Path:
 def predictions(flat: Path, tmp_path: Path) -> Path:
     """Predictions of the test rows by another program: a law of distance."""
     record = wrf_mi.load(flat)
-    test = record.official[1]  # type: ignore[index]
+    assert record.official is not None
+    test = record.official[1]
     prediction = record.observation[:, test] + np.array([[1.0], [-3.0]])
     np.savez(tmp_path / "mine.npz", row=test, prediction=prediction, ms_per_sample=2.0)
     return tmp_path / "mine.npz"
