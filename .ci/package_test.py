@@ -48,7 +48,8 @@ write_ble_folder("data", record)
 np.savetxt("positions.csv", positions_m[:3], delimiter=",", header="x,y,z", comments="")
 faces = [np.insert(rng.random((8000, 2)), axis, side, axis=1) for axis in range(3) for side in (0, 1)]
 np.savetxt("scan.xyz", np.concatenate(faces) * [5, 4, 2.7], fmt="%.4f")
-for name in ("capture.hdf5", "scan.laz", "room.usda"):  # refused without an extra before they are read
+# Refused without an extra before they are read.
+for name in ("capture.hdf5", "scan.laz", "room.usda", "a.dxf", "a.osm", "a.ifc"):
     Path(name).touch()
 """
 COMMANDS = (
@@ -80,6 +81,36 @@ corners = room.faces.ravel().tolist()
 mesh = f"point3f[] points = [{points}]\\nint[] faceVertexIndices = {corners}\\nint[] faceVertexCounts = {[3] * 12}"
 stated = '(\\n    metersPerUnit = 1\\n    upAxis = "Z"\\n)'
 Path("room.usda").write_text(f'#usda 1.0\\n{stated}\\ndef Mesh "Room"\\n{{\\n{mesh}\\n}}\\n')
+"""
+DRAWING = """
+import ezdxf
+
+document = ezdxf.new()
+document.header["$INSUNITS"] = 6
+corners = [(0, 0), (5, 0), (5, 4), (0, 4)]
+document.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "A-WALL"})
+document.saveas("a.dxf")
+nodes = "".join(f'<node id="{i}" lon="{x / 1e5}" lat="{y / 1e5}"/>' for i, (x, y) in enumerate(corners, 1))
+way = "".join(f'<nd ref="{i}"/>' for i in (1, 2, 3, 4, 1))
+Path("a.osm").write_text(f'<osm>{nodes}<way id="1">{way}<tag k="building" v="yes"/></way></osm>')
+"""
+MODEL = """
+import ifcopenshell.api.context
+import ifcopenshell.api.geometry
+import ifcopenshell.api.project
+import ifcopenshell.api.root
+import ifcopenshell.api.unit
+
+file = ifcopenshell.api.project.create_file()
+ifcopenshell.api.root.create_entity(file, "IfcProject")
+ifcopenshell.api.unit.assign_unit(file)
+model = ifcopenshell.api.context.add_context(file, "Model")
+body = ifcopenshell.api.context.add_context(file, "Model", "Body", "MODEL_VIEW", model)
+wall = ifcopenshell.api.root.create_entity(file, "IfcWall")
+ifcopenshell.api.geometry.edit_object_placement(file, wall)
+shape = ifcopenshell.api.geometry.add_wall_representation(file, body, length=5, height=3, thickness=0.2)
+ifcopenshell.api.geometry.assign_representation(file, wall, shape)
+file.write("a.ifc")
 """
 CAPTURE = """
 import h5py
@@ -143,6 +174,8 @@ EXTRAS = (
     Extra("lidar", tuple(f"mesh scan.{suffix} --out {suffix} --replace" for suffix in ("xyz", "laz")), SCAN),
     Extra("tables", tuple(f"data import table.{end} --out {end}" for end in ("csv", "parquet", "xlsx")), TABLES),
     Extra("meshes", ("mesh room.usda --out usda --replace",), ROOM),
+    Extra("cad", tuple(f"mesh {name} --wall-height 3 --out cad --replace" for name in ("a.dxf", "a.osm")), DRAWING),
+    Extra("bim", ("mesh a.ifc --out bim --replace",), MODEL),
     Extra("deepmimo", script=SCENARIO),
     Extra("docs", programs=(f"sphinx -q -b html -D execute_notebooks=0 {CHECKOUT / 'docs'} site",)),
     Extra("tests", programs=(f"pytest -q -p no:cacheprovider {CHECKOUT / 'tests' / 'core' / 'test_antenna.py'}",)),

@@ -13,9 +13,9 @@ from wrf_mi_scenes.mitsuba_xml import write_scene
 from wrf_mi_scenes.random_rooms import random_room
 
 from wrf_mi.apps.checking import Repair, check_scene, repair_scene
-from wrf_mi.apps.checking.material_repair import ascii_name, meant
 from wrf_mi.apps.checking.triangle_faults import wound_one_way
 from wrf_mi.core import InputError
+from wrf_mi.scene.material_names import ascii_name, meant
 from wrf_mi.tracing.sionna.scenes import open_scene
 
 CARRIER_HZ = 3.5e9
@@ -152,7 +152,7 @@ def test_materials_are_guessed_by_names_and_kept_where_they_are_radio(tmp_path):
     xml = write_scene(tmp_path / "room", random_room(5).parts, "room")
     text = xml.read_text("utf-8")
     shapes = ("floor", "ceiling", "wall_west", "wall_east")
-    for shape, name in zip(shapes, ("Brick Wall.001", "Window.003", "cabinet_steel", "Beton"), strict=True):
+    for shape, name in zip(shapes, ("Brick Wall.001", "Window.003", "cabinet_steel", "Fabric"), strict=True):
         text = use(text.replace("</scene>", f'<bsdf type="diffuse" id="{name}"/></scene>'), shape, name)
     xml.write_text(text, encoding="utf-8")
     repair = repair_scene(xml, tmp_path / "out", material="wood")

@@ -180,7 +180,9 @@ def test_other_commands_refuse_or_name_options_without_effect(flat_folder, room,
     command.refused(glb, "--replace belongs to formats that are folders, not to glb; omit it")
     scan = tmp_path / "scan.xyz"
     np.savetxt(scan, np.random.default_rng(0).uniform(0, 5, (100, 3)))
-    command.refused(["check", scan, "--dataset", flat_folder], "a scan; devices and carriers are checked in the scene")
+    command.refused(
+        ["check", scan, "--dataset", flat_folder], "a scan or plan; devices and carriers are checked in the scene"
+    )
     paths = ["export", room, "--format", "paths", "--tx", "1,1,1", "--rx", "2,1,1", "--frequency", "1e9"]
     paths += ["--out", tmp_path / "paths.csv"]
     for more, option in (("", "--depth"), (",scattering", "--paths scattering")):

@@ -316,7 +316,7 @@ def test_ceiling_is_taken_off_and_floor_stays():
 
 
 def test_paths_gaussians_and_devices_are_in_both_views():
-    ends = {"transmitters_m": np.array([[1.0, 1, 1]]), "receivers_m": np.array([[5.0, 1, 1]])}
+    ends: dict[str, Any] = {"transmitters_m": np.array([[1.0, 1, 1]]), "receivers_m": np.array([[5.0, 1, 1]])}
     figure = draw_scene(room(), points_m=np.zeros((3, 2)), paths=one_path(), gaussians=cloud(), title="all", **ends)
     slant, plan = figure.axes[:2]
     bounced = [c.get_segments()[0] for c in plan.collections if isinstance(c, LineCollection) and c.zorder == 6]

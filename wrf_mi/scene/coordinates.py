@@ -29,13 +29,13 @@ UNITS_M = {
 }  # length of each unit that a scan or mesh may be in
 FORMATS = ".e57, .pcd, .pts, .ptx, .ply, .las, .laz, .xyz, .txt, or .npz with points"  # files with points
 CONVERSIONS = {
-    ".ifc": "convert it by IfcConvert to .glb or .obj",
+    ".ifczip": "unpack it",
+    ".pbf": "convert it to .osm: osmium cat FILE.osm.pbf -o FILE.osm",
     ".fbx": "convert it, in Blender: File > Import > FBX, File > Export > glTF",
     ".blend": "export it as glTF or OBJ: File > Export in Blender",
     ".skp": "export it as COLLADA (.dae) or OBJ: File > Export > 3D Model in SketchUp",
-    **dict.fromkeys(
-        (".dxf", ".dwg"), "export its walls as faces in .obj or .stl, or draw the plan as a picture (.png)"
-    ),
+    **dict.fromkeys((".dxf", ".osm"), "a plan; make a scene of it: wrf-mi mesh FILE --wall-height M --out SCENE"),
+    ".dwg": "export it as .dxf: Save As in a CAD program, or the ODA File Converter",
     **dict.fromkeys((".step", ".stp", ".iges", ".igs"), "export it as .stl or .obj, in FreeCAD: File > Export"),
     **dict.fromkeys((".rvt", ".rfa", ".3ds", ".max", ".3dm"), "export it as .obj, .stl or glTF"),
     **dict.fromkeys((".rcp", ".rcs"), "export its points as .e57: Export in ReCap"),
@@ -44,8 +44,10 @@ CONVERSIONS = {
 }
 """How scenes in other formats become one that is read, by the ending of the file."""
 EXTRAS = {
-    **dict.fromkeys(("laspy", "open3d", "pye57", "lzf", "pyproj"), "lidar"),
+    **dict.fromkeys(("laspy", "open3d", "pye57", "lzf"), "lidar"),
     **dict.fromkeys(("collada", "pxr"), "meshes"),
+    **dict.fromkeys(("ezdxf", "pyproj"), "cad"),
+    "ifcopenshell": "bim",
 }
 """Extra of this package that installs a package; `SYSTEM` are libraries that Open3D needs and a small system lacks."""
 SYSTEM = "apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6"
@@ -55,7 +57,7 @@ LARGEST_M, HIGHEST_M, SMALLEST_M = 1000.0, 100.0, 0.5
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From z up to y up: x, y, z become x, z, -y."""
 Y_UP_SUFFIXES = (".glb", ".gltf")  # files whose specification has y up (glTF 2.0, section 3.4)
-STATING_UP = (*Y_UP_SUFFIXES, ".dae", ".usd", ".usda", ".usdc", ".usdz")  # files that state the axis that is up
+STATING_UP = (*Y_UP_SUFFIXES, ".dae", ".usd", ".usda", ".usdc", ".usdz", ".ifc")  # files that state the axis that is up
 FARTHEST_M = 2.0**14
 """Distance from the origin from which numbers of single precision, in which scenes are traced, are 2 mm apart."""
 LOST_M = 0.005  # steps of single precision in a file from which it is refused: nothing brings back what it has rounded

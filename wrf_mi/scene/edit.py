@@ -19,7 +19,7 @@ from ..core.files import listed
 from .folder import read_scene_folder, write_scene
 from .materials import Materials
 from .mesh.files import mesh_parts
-from .mesh.surfaces import KINDS, Kind, Surface, bounds, box_of, moved
+from .mesh.surfaces import Surface, bounds, box_of, moved, named_kind
 
 logger = logging.getLogger(__name__)
 
@@ -64,9 +64,7 @@ def read_surfaces(folder: str | Path) -> tuple[list[Surface], Materials]:
     for name, entry in scene.materials.surfaces.items():
         parts = mesh_parts(scene.folder / "meshes" / f"{name}.ply")
         mesh = cast(Any, trimesh.util.concatenate(parts))
-        # A corrected scene states a material in place of the kind, which the name still begins with.
-        kind = next((kind for kind in KINDS if entry == kind or name.startswith(kind)), "other")
-        surfaces.append(Surface(name, cast(Kind, kind), np.asarray(mesh.vertices), np.asarray(mesh.faces)))
+        surfaces.append(Surface(name, named_kind(name, entry), np.asarray(mesh.vertices), np.asarray(mesh.faces)))
     return surfaces, scene.materials
 
 

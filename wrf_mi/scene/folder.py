@@ -28,6 +28,7 @@ from .coordinates import require_near
 from .materials import FILE as MATERIALS_FILE
 from .materials import Materials, materials_text, read_materials
 from .mesh.surfaces import Surface, box_of
+from .plan.pictures import PlanDrawing
 from .xml_file import parsed_xml
 
 logger = logging.getLogger(__name__)
@@ -67,6 +68,8 @@ def write_scene(
     origin_m: Sequence[float] | None = None,
     description: str = "",
     points_m: ArrayLike | None = None,
+    drawing_below: PlanDrawing | None = None,
+    positions_m: ArrayLike | None = None,
     counts: Mapping[str, int] | None = None,
     replace: bool = False,
 ) -> Path:
@@ -82,6 +85,8 @@ def write_scene(
         origin_m: point [3] of the source that has become the origin already, before the registration, or None.
         description: one line.
         points_m: a sample of the scan [n, 3] or [n, 2] in the scene's frame for the preview.
+        drawing_below: the plan that the surfaces were made of, for the preview.
+        positions_m: measured positions [n, 2] or [n, 3] in the scene's frame, for the preview.
         counts: further numbers for ``scene.yml``.
         replace: replace an existing folder.
 
@@ -114,13 +119,14 @@ def write_scene(
         write_atomically(part / XML_FILE, scene_xml(full.by_surface(), full.constants))
         write_atomically(part / MATERIALS_FILE, materials_text(full))
         write_atomically(part / FACTS_FILE, yaml.safe_dump(facts, sort_keys=False, width=110))
-        write_figure(part / PREVIEW_FILE, draw_scene(surfaces, points_m=points_m))
+        drawn: dict[str, Any] = {"points_m": points_m, "drawing_below": drawing_below, "positions_m": positions_m}
+        write_figure(part / PREVIEW_FILE, draw_scene(surfaces, materials=full.by_surface(), **drawn))
     return folder
 
 
 def _complete(materials: Materials, surfaces: Sequence[Surface]) -> Materials:
     """Materials of all surfaces; `InputError` for those of a surface that is not among them."""
-    kinds = {surface.name: surface.kind for surface in surfaces}
+    kinds = {surface.name: surface.material or surface.kind for surface in surfaces}
     if len(kinds) < len(surfaces):
         raise ValueError("write_scene: two surfaces have the same name")
     if unknown := [name for name in materials.surfaces if name not in kinds]:

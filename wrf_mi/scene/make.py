@@ -29,17 +29,20 @@ from .coordinates import (
     require_fine,
     require_near,
     require_up,
+    source_file,
 )
 from .folder import SceneFolder, read_scene_folder, write_scene
 from .materials import Materials, read_materials
 from .mesh.facets import planes_of_mesh
 from .mesh.files import SUFFIXES, read_mesh
+from .mesh.ifc import read_ifc
 from .mesh.measured import is_measured
 from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
 from .mesh.surfaces import Surface, bounds, box_of, main_extent, moved, sampled, with_area
+from .plan.faces import PlanLines
 from .plan.geojson import GEOJSON_SUFFIXES, Extent
-from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES
-from .plan.sources import PlanGrid, Row0, read_layout, read_plan
+from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES, PlanDrawing
+from .plan.sources import PlanGrid, Row0, plan_pixels, read_layout, read_plan
 from .plan.storey import layout_walls, plan_surfaces
 from .plan.walked import warn_of_places, with_walked_floor
 from .positions import check_positions, in_plan, placed, read_positions, reflections
@@ -51,11 +54,12 @@ from .scan.points import Scan, read_scan, sampled_scan
 
 logger = logging.getLogger(__name__)
 
-PLAN_SUFFIXES = (*PICTURE_SUFFIXES, *SHEET_SUFFIXES, *GEOJSON_SUFFIXES, ".csv")
-PREVIEW_POINTS = 20_000
-Storey = tuple[float | None, float, float | None, Row0 | None, Extent | None]
-"""Options of a plan: height of the ceiling, z of the floor, side of a cell, side where the first row lies, extent."""
-UNSTATED: Storey = (None, 0.0, None, None, None)  # these options where none is given
+PLAN_SUFFIXES = (*PICTURE_SUFFIXES, *SHEET_SUFFIXES, *GEOJSON_SUFFIXES, ".csv", ".dxf")
+PREVIEW_POINTS, PREVIEW_PIXELS = 20_000, 1500
+Storey = tuple[float | None, float, float | None, Row0 | None, Extent | None, Sequence[str], str | None]
+"""Options of a plan: height of the ceiling, z of the floor, side of a cell, side where the first row lies, extent,
+layers of walls, and level."""
+UNSTATED: Storey = (None, 0.0, None, None, None, (), None)  # these options where none is given
 LEAST_TURN_DEG = 0.1  # smaller angles between walls and axes are errors of the planes
 RIGID = 1e-6  # largest deviation of a registration's rotation from orthonormal
 
@@ -76,6 +80,8 @@ def make_scene(
     positions: str | Path | None = None,
     row_0: Row0 | None = None,
     extent_m: Extent | None = None,
+    layers: Sequence[str] = (),
+    level: str | None = None,
     replace: bool = False,
 ) -> SceneFolder:
     r"""Make a scene folder that Mitsuba and Sionna RT both open, and return its content.
@@ -85,8 +91,8 @@ def make_scene(
             (`wrf_mi.scene.plan.sources.read_plan`), which becomes walls, floor and ceiling; or a mesh with faces, which
             are cut into triangles and else used as they are.
         out: path of the folder.
-        units: unit of a scan's or mesh's coordinates: m, dm, cm, mm, ft or in; None: that which COLLADA and USD state,
-            else m, which is refused for a LAS or LAZ whose header states another one.
+        units: unit of the coordinates of a scan, mesh or DXF: m, dm, cm, mm, ft or in; None: that which COLLADA, USD
+            and DXF state, else m, which is refused for a LAS or LAZ whose header states another one.
         up: axis of a scan or mesh that is up, y or z; None: that which COLLADA and USD state, y in glTF, else z, and
             coordinates that look otherwise are refused.
         origin_m: point [3] of the source, z up, metres, that becomes the origin before the registration: far from it,
@@ -104,6 +110,8 @@ def make_scene(
             source whose walls they cross, or that they fit better when mirrored, is refused.
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
         extent_m: width and height of a plan in longitude and latitude (`wrf_mi.scene.plan.geojson.read_geojson`).
+        layers: layers of walls in a DXF (`wrf_mi.scene.plan.dxf.read_dxf`).
+        level: level of the rooms of OpenStreetMap, or ``buildings``.
         replace: replace an existing folder.
 
     Raises:
@@ -130,7 +138,7 @@ def make_scene(
     materials = read_materials(materials) if isinstance(materials, str | Path) else materials
     matrix, known_walls, measured = _references(file, registration, register_walls_of, positions)
     shift = _shift(file, origin_m)
-    source = _read_source(files, units, up, (height_m, floor_m, resolution_m, row_0, extent_m))
+    source = _read_source(files, units, up, (height_m, floor_m, resolution_m, row_0, extent_m, tuple(layers), level))
     if origin_m is None and matrix is known_walls is measured is None:
         origin_m = local_origin(source.extent_m)
         shift = _shift(file, origin_m)
@@ -164,7 +172,8 @@ def make_scene(
         materials=materials,
         registration=registered,
         replace=replace,
-        **source.sample(motion),
+        positions_m=measured,
+        **source.drawn(motion),
     )
     return read_scene_folder(out)
 
@@ -196,6 +205,7 @@ class _Source:
     grid: PlanGrid | None = None
     scan: Scan | None = None
     yaw_rad: float = 0.0
+    drawing: PlanDrawing | None = None
 
     @property
     def extent_m(self) -> FloatArray:
@@ -264,10 +274,10 @@ class _Source:
         logger.warning(text, self.file, turn_deg)
         return np.asarray(trimesh.transformations.rotation_matrix(np.radians(turn_deg), [0, 0, 1]))
 
-    def sample(self, motion: FloatArray) -> dict[str, Any]:
-        """Arguments of `write_scene` for a scan: moved points for the preview, and the number of all points."""
+    def drawn(self, motion: FloatArray) -> dict[str, Any]:
+        """Arguments of `write_scene`: plan or moved points of a scan for the preview, and the number of all points."""
         if self.scan is None:
-            return {}
+            return {"drawing_below": self.drawing and replaced(self.drawing, motion=motion)}
         count = len(self.scan.points_m)
         # At random: every k-th point would show the scanner's pattern.
         chosen = np.random.default_rng(1).integers(count, size=min(PREVIEW_POINTS, count))
@@ -281,7 +291,11 @@ def _read_source(files: Sequence[Path], units: str | None, up: Up | None, storey
     if is_plan(file):
         return _read_plan(file, units, up, storey)
     if storey != UNSTATED:
-        raise InputError(f"{file}: no plan; leave out --wall-height, --floor, --resolution, --row-0 and --extent")
+        raise InputError(f"{file}: no plan; leave out the options of plans, from --wall-height to --level")
+    if file.suffix.lower() == ".ifc":
+        if units is not None or up is not None:
+            raise InputError(f"{file}: states its unit and has z up; leave out --units and --up")
+        return _Source(file, read_ifc(source_file(file, None, "a model in IFC")))
     if has_faces(file):
         raw = read_mesh(file, units, up)
         require_up(sampled(np.concatenate([surface.vertices_m[surface.faces] for surface in raw])), file, up)
@@ -325,21 +339,23 @@ def _rigid(registration: ArrayLike) -> FloatArray:
 
 
 def _read_plan(file: Path, units: str | None, up: Up | None, storey: Storey) -> _Source:
-    height_m, floor_m, resolution_m, row_0, extent_m = storey
+    height_m, floor_m, resolution_m, row_0, extent_m, layers, level = storey
     if file.suffix.lower() == ".csv" and _has_heights(file):
         text = f"{file}: has a column z or three numbers in a row, and a CSV is a plan of wall corners, x,y"
         raise InputError(f"{text}; for points in three dimensions leave out its header and call it .xyz")
-    if height_m is None:
-        raise InputError(f"{file}: a plan has no heights; give that of the ceiling in metres (--wall-height)")
-    if units not in (None, "m"):
-        raise InputError(f"{file}: a plan is in metres; give its cell with --resolution and leave out --units")
     if up is not None:
         raise InputError(f"{file}: a plan; leave out --up, which is for scans and meshes")
-    plan = read_plan(file, resolution_m, row_0, extent_m)
+    plan = read_plan(file, resolution_m, row_0, extent_m, units, layers, level)
+    below = None
+    if isinstance(plan, PlanGrid):
+        size_m = plan.resolution_m * np.array(plan.occupied.shape[::-1])
+        below = PlanDrawing(plan_pixels(file, plan, PREVIEW_PIXELS), np.stack([plan.origin_m, plan.origin_m + size_m]))
+    elif isinstance(plan, PlanLines):
+        below = PlanDrawing(lines_m=np.concatenate(list(plan.pieces_m.values())))
     walls = plan_surfaces(plan, height_m=height_m, floor_m=floor_m, name=str(file))
     if not isinstance(plan, PlanGrid):
-        return _Source(file, walls)
-    return _Source(file, walls, plan if plan.free.any() else None, yaw_rad=plan.yaw_rad)
+        return _Source(file, walls, drawing=below)
+    return _Source(file, walls, plan if plan.free.any() else None, yaw_rad=plan.yaw_rad, drawing=below)
 
 
 def _split(raw: Sequence[Surface], file: Path, up: Up | None) -> list[Surface]:

@@ -5,7 +5,8 @@ Surfaces, the scan they were made from, traced paths and the Gaussians of a fiel
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.transforms import Affine2D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,6 +26,7 @@ from ..core.angles import FloatArray, rotation_matrix, unit_vectors
 from ..core.paths import Paths
 from . import drawing
 from .mesh.surfaces import Surface, box_of, cut_lines
+from .plan.pictures import PlanDrawing
 
 KIND_COLOURS = {"floor": "#cfc6b8", "ceiling": "#e8e8e4", "wall": "#7d9cb5", "other": "#c58f5c"}
 MOST_POINTS, MOST_GAUSSIANS, MOST_PATHS = 20_000, 3_000, 300
@@ -34,6 +37,13 @@ EYE = unit_vectors(*np.radians([drawing.AZIMUTH_DEG, drawing.ELEVATION_DEG]))  #
 LIGHT = np.array([0.35, -0.5, 0.79])
 CUT = 0.45  # share of the height at which the plan is cut
 TOP = 0.8  # level faces above this share of the height are taken off like a ceiling
+MATERIAL_COLOURS = {
+    **{"itu_concrete": "#8a8f98", "itu_brick": "#b5523b", "itu_plasterboard": "#9fb8d0", "itu_wood": "#b98b4e"},
+    **{"itu_glass": "#35b5c9", "itu_metal": "#4a4e69", "itu_ceiling_board": "#d8d5c7", "itu_marble": "#c9b7d8"},
+}
+"""Colours of materials that are not those of most surfaces of their kind; of others, `OTHER_COLOUR`."""
+OTHER_COLOUR = "#6a994e"
+FLOOR_ALPHA = 0.45  # of the floor above the picture of a plan
 WHOLE_FACES = 50
 MOST_NAMED = 40  # number of walls up to which the plan has their names
 MOST_OUTLINED = 500  # number of faces above which a surface is drawn without its free edges
@@ -72,6 +82,9 @@ class GaussianCloud:
 def draw_scene(
     surfaces: Sequence[Surface],
     *,
+    materials: Mapping[str, str] | None = None,
+    drawing_below: PlanDrawing | None = None,
+    positions_m: ArrayLike | None = None,
     points_m: ArrayLike | None = None,
     paths: Paths | None = None,
     transmitters_m: ArrayLike | None = None,
@@ -85,6 +98,9 @@ def draw_scene(
 
     Args:
         surfaces: surfaces of the scene, at least one.
+        materials: material of each surface by its name, for colours and legend.
+        drawing_below: plan that the scene was made of, below the scene's.
+        positions_m: measured positions [n, 2] or [n, 3].
         points_m: a scan [n, 3] or [n, 2].
         paths: traced paths; the strongest `MOST_PATHS` are drawn, with ``transmitters_m`` and ``receivers_m``.
         transmitters_m: shape [n_tx, 3].
@@ -100,19 +116,22 @@ def draw_scene(
     slant: Any = figure.add_subplot(grid[0], projection="3d", computed_zorder=False)
     plan = figure.add_subplot(grid[1])
     low, high = box_of(surfaces)
-    _draw_slant(slant, surfaces, low, high)
-    _draw_plan(plan, surfaces, low, high)
+    colours, patches = _colours_of(surfaces, materials or {})
+    _draw_slant(slant, surfaces, colours, low, high)
+    if drawing_below is not None:
+        _draw_below(plan, drawing_below)
+    _draw_plan(plan, surfaces, colours, low, high, 1.0 if drawing_below is None else FLOOR_ALPHA)
     if points_m is not None:
         _draw_scan(slant, plan, np.asarray(points_m, float), low[2] + TOP * (high[2] - low[2]))
     if gaussians is not None:
         _draw_gaussians(figure, slant, plan, gaussians.strongest(MOST_GAUSSIANS))
     if paths is not None:
         _draw_paths(figure, slant, plan, paths, *ends)
-    kinds = dict.fromkeys(surface.kind for surface in surfaces)
-    kinds.pop("ceiling", None)
-    legend = [Patch(facecolor=KIND_COLOURS[k], edgecolor="0.3", linewidth=0.5, label=k) for k in kinds]
+    if positions_m is not None:
+        how: dict[str, Any] = {"marker": ".", "markersize": 3, "linestyle": "none", "color": "#c1121f", "zorder": 7}
+        patches += plan.plot(*np.asarray(positions_m, float).T[:2], label="position", **how)
     figure.legend(
-        handles=[*legend, *_draw_ends(slant, plan, ends)],
+        handles=[*patches, *_draw_ends(slant, plan, ends)],
         fontsize=8,
         loc="outside lower center",
         ncols=8,
@@ -120,6 +139,37 @@ def draw_scene(
     )
     figure.suptitle(title, fontsize=10)
     return figure
+
+
+def _colours_of(surfaces: Sequence[Surface], materials: Mapping[str, str]) -> tuple[dict[str, FloatArray], list[Any]]:
+    """Colour [3] of each surface by its name, and patches of the legend.
+
+    Those of the most frequent material of a kind have the kind's colour, others that of their material.
+    """
+    pairs = Counter((surface.kind, materials.get(surface.name, "")) for surface in surfaces)
+    usual = {kind: material for (kind, material), _ in reversed(pairs.most_common())}
+    chosen = {
+        (kind, material): KIND_COLOURS[kind]
+        if usual[kind] == material
+        else MATERIAL_COLOURS.get(material, OTHER_COLOUR)
+        for kind, material in pairs
+    }
+    patches = [
+        Patch(facecolor=colour, edgecolor="0.3", linewidth=0.5, label=f"{kind}: {material}" if material else kind)
+        for (kind, material), colour in chosen.items()
+        if kind != "ceiling"
+    ]
+    colours = {each.name: np.array(to_rgb(chosen[each.kind, materials.get(each.name, "")])) for each in surfaces}
+    return colours, patches
+
+
+def _draw_below(plan: Axes, below: PlanDrawing) -> None:
+    """The plan that a scene was made of, below all else."""
+    to_scene = Affine2D(below.motion[np.ix_([0, 1, 3], [0, 1, 3])]) + plan.transData
+    if below.pixels is not None:
+        (x0, y0), (x1, y1) = below.box_m
+        plan.imshow(below.pixels, extent=(x0, x1, y0, y1), transform=to_scene, zorder=0.5)
+    drawing.draw_outlines(plan, [below.lines_m], colors="0.55", linewidths=0.6, transform=to_scene, zorder=0.6)
 
 
 def _draw_scan(slant: Any, plan: Axes, scan: FloatArray, top_m: float) -> None:
@@ -207,7 +257,9 @@ def free_edges(surface: Surface, creases: bool = False) -> FloatArray:
     return np.asarray(surface.vertices_m[outer], float).reshape(-1, 2, 3)
 
 
-def _lit_faces(surface: Surface, low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _lit_faces(
+    surface: Surface, colour: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Corners [f, 3, 3] of faces below the ceiling, and colours [f, 4] lit from the side; walls in front fade."""
     corners = surface.vertices_m[surface.faces]
     (normal, level), centre = _normals(corners), corners.mean(axis=1)
@@ -216,20 +268,25 @@ def _lit_faces(surface: Surface, low: FloatArray, high: FloatArray) -> tuple[Flo
     place = centre if len(centre) > WHOLE_FACES else np.broadcast_to(centre.mean(axis=0), centre.shape)
     front = (place - (low + high) / 2)[:, :2] @ EYE[:2] > 0.05 * np.linalg.norm(high - low)
     alpha = np.where(front & ~level & (surface.kind != "floor"), 0.16, 0.95)
-    shade = np.clip(light[:, None] * to_rgb(KIND_COLOURS[surface.kind]), 0, 1)
+    shade = np.clip(light[:, None] * colour, 0, 1)
     drawn = ~ceiling_faces(surface, low, high)
     return corners[drawn], np.column_stack([shade, alpha])[drawn]
 
 
-def _draw_slant(axes: Any, surfaces: Sequence[Surface], low: FloatArray, high: FloatArray) -> None:
+def _draw_slant(
+    axes: Any, surfaces: Sequence[Surface], colours: Mapping[str, FloatArray], low: FloatArray, high: FloatArray
+) -> None:
     """Faces and free edges without the ceiling."""
     floors = [surface for surface in surfaces if surface.kind == "floor"]
     others = [surface for surface in surfaces if surface.kind not in ("floor", "ceiling")]
     for order, group in enumerate((floors, others), start=1):
         # The empty part serves groups without surfaces.
-        lit = [(np.empty((0, 3, 3)), np.empty((0, 4))), *(_lit_faces(surface, low, high) for surface in group)]
-        corners, colours = map(np.concatenate, zip(*lit, strict=True))
-        drawing.draw_faces(axes, corners, colours, zorder=order)
+        lit = [
+            (np.empty((0, 3, 3)), np.empty((0, 4))),
+            *(_lit_faces(surface, colours[surface.name], low, high) for surface in group),
+        ]
+        corners, shades = map(np.concatenate, zip(*lit, strict=True))
+        drawing.draw_faces(axes, corners, shades, zorder=order)
     # Thin lines along the free edges of walls and floors make the corners readable; closed bodies have none.
     if len(lines := np.concatenate([np.empty((0, 2, 3)), *map(free_edges, floors + others)])):
         axes.add_collection3d(Line3DCollection(lines, colors="#2b2d42", linewidths=0.5, alpha=0.7, zorder=3))
@@ -238,16 +295,25 @@ def _draw_slant(axes: Any, surfaces: Sequence[Surface], low: FloatArray, high: F
     axes.zaxis.labelpad = -8
 
 
-def _draw_plan(axes: Axes, surfaces: Sequence[Surface], low: FloatArray, high: FloatArray) -> None:
+def _draw_plan(
+    axes: Axes,
+    surfaces: Sequence[Surface],
+    colours: Mapping[str, FloatArray],
+    low: FloatArray,
+    high: FloatArray,
+    floor_alpha: float,
+) -> None:
     """The floor, and a cut through everything that stands on it, with the names of few walls."""
     level = float(low[2] + CUT * (high[2] - low[2]))
     named = sum(surface.kind == "wall" for surface in surfaces) <= MOST_NAMED
     for surface in surfaces:
-        colour = np.array(to_rgb(KIND_COLOURS[surface.kind]))
+        colour = colours[surface.name]
         if surface.kind == "floor":
             triangles = surface.vertices_m[surface.faces][..., :2]
             flat: dict[str, Any] = {"edgecolors": "none", "antialiased": False, "zorder": 1}
-            axes.add_collection(PolyCollection(list(triangles), facecolors=[0.45 * colour + 0.55], **flat))
+            axes.add_collection(
+                PolyCollection(list(triangles), facecolors=[[*(0.45 * colour + 0.55), floor_alpha]], **flat)
+            )
         elif len(cut := cut_lines(surface, level)):
             drawing.draw_outlines(axes, [cut], colors=[0.6 * colour], linewidths=2.2, zorder=3)
             if named and surface.kind == "wall":

@@ -104,10 +104,10 @@ def test_houses_of_several_floors_are_not_asked_for_their_unit(tmp_path):
     assert read_mesh(tmp_path / "house.stl")
 
 
-@pytest.mark.parametrize("name", ["a.ifc", "a.fbx", "a.dxf", "a.skp", "a.step", "a.rcp", "a.b3dm"])
+@pytest.mark.parametrize("name", ["a.dwg", "a.fbx", "a.dxf", "a.skp", "a.step", "a.rcp", "a.b3dm"])
 def test_formats_that_are_not_read_are_refused_with_their_conversion(name, tmp_path):
     (tmp_path / name).write_bytes(b"\0content")
-    with pytest.raises(InputError, match=rf"{name}: \.\w+ is not read; .*(convert|export)"):
+    with pytest.raises(InputError, match=rf"{name}: \.\w+ is not read; .*(convert|export|make)"):
         read_mesh(tmp_path / name)
 
 

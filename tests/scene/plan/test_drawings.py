@@ -2,14 +2,20 @@
 
 import numpy as np
 import pytest
-from made_plans import box, distance, read_grid
+from made_plans import L_ROOM_M, box, distance, read_grid
 from PIL import Image
+from scipy import ndimage
+from trimesh.transformations import rotation_matrix
 
 from wrf_mi.core import InputError
+from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.make import make_scene
-from wrf_mi.scene.plan.sources import read_plan
+from wrf_mi.scene.mesh.surfaces import level_area
+from wrf_mi.scene.plan.pictures import PlanDrawing
+from wrf_mi.scene.plan.sources import PlanGrid, plan_pixels, read_plan
 from wrf_mi.scene.plan.storey import floor_of, layout_walls, plan_surfaces
 from wrf_mi.scene.plan.walls import find_walls
+from wrf_mi.scene.preview import draw_scene
 
 CELL_M = 0.025
 # Outer walls of 0.5 m about 6 m x 5 m, two inner walls of 0.1 m along a corridor, each with a door.
@@ -88,3 +94,83 @@ def test_positions_in_a_room_that_is_open_to_the_outside_are_named(tmp_path):
     np.savetxt(tmp_path / "plan.csv", corners, "%.2f", ",", header="x,y", comments="")
     with pytest.raises(InputError, match=r"32 of 64 positions have no floor below; .* open to the outside"):
         make_scene(tmp_path / "plan.csv", tmp_path / "scene", height_m=2.7, positions=tmp_path / "walk.csv")
+
+
+FURNISHED = [(x, y, x + 0.04, y + 1.2) for x, y in ((1.1, 4.6), (2.0, 4.6))] + [
+    (1.1, 4.6, 2.0, 4.64),
+    (1.1, 5.8, 2.0, 5.84),
+]
+LETTERS = [(5 + 0.3 * letter, 3.4, 5.06 + 0.3 * letter, 3.8) for letter in range(6)]
+
+
+def furnished(file, grey=40, faces=False):
+    """The plan above at 2 cm a pixel, with rooms in colours, the outline of a bed and letters."""
+    cell = 0.02
+    colours = np.full((350, 400, 3), 255, np.uint8)
+
+    def fill(box, colour):
+        x0, y0, x1, y1 = np.round(np.array(box) / cell).astype(int)
+        colours[y0:y1, x0:x1] = colour
+
+    fill((1, 1, 7, 2.9), (250, 235, 200))
+    fill((1, 4.5, 7, 6), (205, 225, 245))
+    solid = np.zeros((350, 400), bool)
+    for box_m in [*OUTER, *INNER]:
+        x0, y0, x1, y1 = np.round(np.array(box_m) / cell).astype(int)
+        solid[y0:y1, x0:x1] = True
+    x0, y0, x1, y1 = np.round(np.array(ENTRANCE) / cell).astype(int)
+    solid[y0:y1, x0:x1] = False
+    inside = ndimage.binary_erosion(solid)
+    colours[solid] = 0 if faces else grey
+    if faces:
+        colours[inside] = 255
+    for box_m in [*FURNISHED, *LETTERS]:
+        fill(box_m, 0)
+    Image.fromarray(colours[::-1]).save(file)
+    return file
+
+
+@pytest.mark.parametrize(("name", "options"), [("a.png", {}), ("b.jpg", {"grey": 150}), ("c.png", {"grey": 200})])
+def test_walls_of_any_grey_are_told_from_furniture_letters_and_rooms_in_colours(tmp_path, caplog, name, options):
+    plan = read_plan(furnished(tmp_path / name, **options), 0.02)
+    floor, _, *walls = plan_surfaces(plan, height_m=2.7)
+    assert floor.mesh.area == pytest.approx(FLOOR_M2, abs=22 * 0.02)
+    assert len(walls) == 9
+    assert ("darker than grey 89" in caplog.text) == (not options)
+
+
+def test_walls_drawn_by_both_faces_are_filled(tmp_path, caplog):
+    floor, _, *walls = plan_surfaces(read_plan(furnished(tmp_path / "a.png", faces=True), 0.02), height_m=2.7)
+    assert "walls are drawn by both faces" in caplog.text
+    assert floor.mesh.area == pytest.approx(FLOOR_M2, abs=22 * 0.02)
+    ends = np.stack([wall.vertices_m[:2, :2] for wall in walls])
+    assert distance([4, 1], ends) < 0.021
+    assert distance([5, 2.95], ends) < 0.021
+
+
+def test_the_picture_of_a_scene_shows_its_plan_materials_and_positions(tmp_path):
+    plan = read_plan(drawing(tmp_path / "plan.png", OUTER + INNER, ENTRANCE), CELL_M)
+    assert isinstance(plan, PlanGrid)
+    turn = np.array(rotation_matrix(0.5, [0, 0, 1]))
+    pixels = plan_pixels(tmp_path / "plan.png", plan, 200)
+    assert pixels.shape == (175, 200, 3)
+    below = PlanDrawing(pixels, np.array([[0, 0], [8, 7]]), motion=turn)
+    surfaces = plan_surfaces(L_ROOM_M, height_m=2.5)
+    materials = {surface.name: "itu_glass" if surface.name == "wall_01" else "itu_brick" for surface in surfaces}
+    figure = draw_scene(surfaces, materials=materials, drawing_below=below, positions_m=[[1, 2, np.nan]])
+    axes = figure.axes[1]
+    (image,) = axes.images
+    corner = axes.transData.inverted().transform(image.get_transform().transform([8, 7]))
+    np.testing.assert_allclose(corner, (turn @ [8, 7, 0, 1])[:2], atol=1e-9)
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["floor: itu_brick", "wall: itu_glass", "wall: itu_brick", "position"]
+
+
+def test_paper_around_a_drawing_is_no_floor_though_a_position_stands_in_an_entrance(tmp_path):
+    drawing(tmp_path / "plan.png", OUTER + INNER, ENTRANCE)
+    x, y = np.meshgrid(np.arange(1.25, 7, 0.5), [2.0, 5.0])
+    places = np.concatenate([np.stack([x.ravel(), y.ravel()], axis=1), [[0.7, 3.7], [1.2, 3.7], [1.9, 3.7]]])
+    np.savetxt(tmp_path / "walk.csv", places, "%.2f", ",", header="x,y", comments="")
+    how = {"height_m": 2.7, "resolution_m": CELL_M, "positions": tmp_path / "walk.csv"}
+    made = make_scene(tmp_path / "plan.png", tmp_path / "scene", **how)
+    assert level_area([read_surfaces(made.folder)[0][0]]).area == pytest.approx(FLOOR_M2 + 0.3, abs=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from xml.etree.ElementTree import Element, SubElement
@@ -11,6 +10,7 @@ from xml.etree.ElementTree import Element, SubElement
 from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from ...scene.folder import plain_name
+from ...scene.material_names import ascii_name, meant
 from ...scene.scattering import SCATTERING
 from ...scene.xml_file import overruled
 from ...tracing.sionna.materials import BELOW_1_GHZ, in_itu_range
@@ -19,12 +19,6 @@ from .scene_xml_faults import BOUNDS, ITU, RADIO, SceneXml, bsdf_findings, is_it
 from .triangle_repair import label
 
 ODD = r"[^A-Za-z0-9_.-]"  # characters that ids and file names of a repaired scene do not have
-WORDS: Mapping[str, str] = {
-    **{material.replace("_", ""): material for material in ITU},
-    **{"ceilingtile": "ceiling_board", "drywall": "plasterboard", "gypsum": "plasterboard", "window": "glass"},
-    **{"steel": "metal", "alumin": "metal", "iron": "metal", "timber": "wood", "asphalt": "asphalt_concrete"},
-}
-"""Words in names of materials and shapes, without separators, and the material of ITU-R P.2040 that they mean."""
 SIONNA_THICKNESS_M = 0.1  # that of Sionna RT where a scene file states none: repair does not change it
 COLOURS = ("color", "reflectance", "base_color")
 
@@ -118,18 +112,6 @@ class MaterialRepair:
             bsdf.set("id", f"mat-{name}")
             self.bsdfs[identifier] = bsdf
         return self.bsdfs[identifier]
-
-
-def ascii_name(name: str) -> str:
-    """A name with the letters of ASCII that its letters are written with."""
-    return unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
-
-
-def meant(name: str) -> str | None:
-    """Material of ITU-R P.2040 that a name of a material or shape means; the longest word counts."""
-    plain = re.sub(r"[^a-z]", "", ascii_name(name).lower())
-    words = sorted((word for word in WORDS if word in plain), key=len)
-    return WORDS[words[-1]] if words else None
 
 
 def itu_bsdf(material: str, thickness_m: float, frequency_hz: float | None = None) -> Element:

@@ -34,7 +34,7 @@ from ...scene.coordinates import (
     up_of,
 )
 from ...scene.folder import FACTS_FILE, scene_file
-from ...scene.make import has_faces
+from ...scene.make import has_faces, is_plan
 from ...scene.materials import FILE as MATERIALS_FILE
 from ...scene.materials import read_materials, thicknesses
 from ...scene.mesh.measured import is_measured
@@ -48,6 +48,7 @@ from ...tracing.sionna.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ, in_itu_r
 from ...tracing.sionna.scenes import HIGHEST_M as HIGHEST_SCENE_M
 from ...tracing.sionna.scenes import REFUSALS, quiet_mitsuba, reason
 from .devices import device_findings
+from .plan_check import check_plan
 from .scene_findings import Finding, SceneReport
 from .scene_geometry import ShapePart, between_parts, mesh_file_parts, part_findings, scene_parts
 from .scene_xml_faults import SceneXml, itu_type, read_xml, xml_findings
@@ -80,7 +81,7 @@ SCENE = Largest(np.inf, HIGHEST_SCENE_M, 1.5 * HIGHEST_M)  # cities are kilometr
 
 @dataclass(frozen=True)
 class Source:
-    """What is checked: a scene file with what its folder states, a mesh, or a scan.
+    """What is checked: a scene file with what its folder states, a mesh, a scan or a plan.
 
     Attributes:
         path: the file.
@@ -114,7 +115,7 @@ def check_scene(
     """Find what keeps a scene from opening in Sionna RT, or makes its paths wrong.
 
     Args:
-        source: name of a scene of the package or of Sionna RT, a scene folder, a Mitsuba XML, a mesh or a scan.
+        source: name of a scene of the package or of Sionna RT, a scene folder, a Mitsuba XML, a mesh, a scan or a plan.
         data: measurements whose transmitters and receivers have to be outside of solids.
         frequency_hz: carrier at which materials and phases are checked; None: that of the data, if they have one.
         units: unit of a mesh's or scan's coordinates, a key of `wrf_mi.scene.coordinates.UNITS_M`.
@@ -150,8 +151,10 @@ def checked(
         return _check_xml(where, str(source), frame, record, carriers_hz)
     if not has_faces(where.path):
         if record is not None or frequency_hz is not None:
-            text = "a scan; devices and carriers are checked in the scene that wrf-mi mesh makes of it"
+            text = "a scan or plan; devices and carriers are checked in the scene that wrf-mi mesh makes of it"
             raise InputError(f"{source}: {text}; omit data set and frequency")
+        if is_plan(where.path):
+            return Checked(where, check_plan(where.path, str(source), units), None, ())
         return Checked(where, _check_scan(where.path, str(source), frame), None, ())
     findings, parts = _placed(mesh_file_parts(where.path), where.path, frame)
     findings += _of_triangles(parts, where.path, frame, record, carriers_hz)

@@ -63,6 +63,8 @@ KINDS: Mapping[str, tuple[Level, str]] = {
     "device-inside": ("warning", "transmitters or receivers inside a solid"),
     "no-floor": ("warning", "some transmitters or receivers without a floor below"),
     "not-opened": ("fault", "scene that Sionna RT refuses for another reason"),
+    "plan": ("note", "plan, of which wrf-mi mesh makes a scene"),
+    "unclear-plan": ("fault", "plan that is read only with an option, shows no walls, or is damaged"),
     "no-viewpoint": ("note", "scan that does not state where the scanner stood"),
 }
 """Kinds of findings: level and description. A fault does not open in Sionna RT, or gives wrong results."""

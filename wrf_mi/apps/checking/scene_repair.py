@@ -18,8 +18,10 @@ from ...core.angles import FloatArray
 from ...core.files import atomic_folder, listed, write_atomically
 from ...scene.coordinates import FARTHEST_M, Up
 from ...scene.folder import FACTS_FILE, XML_FILE, plain_name
+from ...scene.make import is_plan
+from ...scene.material_names import ascii_name
 from ...tracing.sionna.scenes import plain_ply
-from .material_repair import ODD, MaterialRepair, ascii_name
+from .material_repair import ODD, MaterialRepair
 from .scene_check import Checked, check_scene, checked, opened
 from .scene_findings import NAMED, Finding, SceneReport
 from .scene_geometry import ShapePart
@@ -124,8 +126,8 @@ def repair_scene(
     default = None if material is None else _known_material(material)
     of_shapes = {shape: _known_material(name) for shape, name in (shape_materials or {}).items()}
     before = checked(source, frequency_hz=frequency_hz, units=units, up=up)
-    if before.report.points:
-        raise InputError(f"{source}: a scan; make a scene of it by wrf-mi mesh")
+    if before.report.points or is_plan(before.source.path):
+        raise InputError(f"{source}: a scan or plan; make a scene of it by wrf-mi mesh")
     parts, origin_m, done = repaired_triangles(before.parts)
     if unknown := sorted(set(of_shapes) - {part.name for part in parts}):
         raise InputError(f"{source}: no shape {unknown[0]!r}; there are {listed(part.name for part in parts)}")

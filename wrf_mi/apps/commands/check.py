@@ -20,7 +20,7 @@ def add_parser(commands: Any) -> None:
     lines = [f"  {kind:<{width}}{level:<9}{description}" for kind, (level, description) in KINDS.items()]
     parser.epilog = "\n".join(["kinds of findings:", *lines])
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, mesh or scan")
+    add("scene", metavar="SCENE", help="name of a scene, scene folder, Mitsuba XML, mesh, scan or plan")
     text = "data set whose devices must not be inside solids, and whose carrier counts"
     add("--dataset", metavar="DATASET", help=text)
     add("--frequency", type=float, metavar="HZ", help="carrier at which materials and phases are checked")

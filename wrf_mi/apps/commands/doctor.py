@@ -21,7 +21,7 @@ from .options import Arguments, add_command
 from .output import show
 
 _PACKAGES = ("wrf-mi", "mitsuba", "drjit", "sionna-rt", "numpy", "scipy", "scikit-image")
-EXTRAS = ("lidar", "meshes", "tables", "view", "cluster", "maps", "argos")  # what commands of users need
+EXTRAS = ("lidar", "meshes", "cad", "bim", "tables", "view", "cluster", "maps", "argos")  # what commands of users need
 _DATA_VARIABLE = "WRF_MI_DATA"
 
 

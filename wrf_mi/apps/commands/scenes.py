@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ...core import InputError
 from .options import DATASET, SCENE, Arguments, add_antennas, add_command, add_rows, antenna_options, comma_numbers
 from .output import Watch, show
@@ -25,10 +27,13 @@ def _add_mesh(commands: Any) -> None:
     parser = add_command(commands, "mesh", mesh_command, text)
     add = parser.add_argument
     text = "scans of one place (E57, PCD, PTS, PTX, PLY, LAS, LAZ, XYZ, NPZ), a plan (NPZ, PNG, ROS map YAML, CSV, "
-    text += "GeoJSON) or a mesh (OBJ, STL, GLB, PLY, COLLADA, USD)"
+    text += "GeoJSON, OSM, DXF) or a mesh (OBJ, STL, GLB, PLY, COLLADA, USD, IFC)"
     add("points", nargs="+", metavar="POINTS", help=text)
     add("--out", required=True, metavar="DIR", help="scene folder to make")
-    add("--units", help="unit of the coordinates: m, dm, cm, mm, ft or in (default: that of COLLADA and USD, else m)")
+    add(
+        "--units",
+        help="unit of the coordinates: m, dm, cm, mm, ft or in (default: that of COLLADA, USD and DXF, else m)",
+    )
     text = "axis that is up in a scan or mesh (default: that of COLLADA and USD, y in GLB, else z)"
     add("--up", choices=("y", "z"), help=text)
     text = "point of the source (of a picture, from its lower left corner), metres, z up, that becomes the origin, "
@@ -43,6 +48,9 @@ def _add_mesh(commands: Any) -> None:
         "width and height of a plan in longitude and latitude, metres, from its lower left corner, such as 236.7,219.7"
     )
     add("--extent", type=comma_numbers(2, "WIDTH,HEIGHT"), metavar="WIDTH,HEIGHT", help=text)
+    text = "layers of walls in a DXF whose names do not say so; * and ? are wildcards"
+    add("--layers", type=_names, default=(), metavar="NAME,...", help=text)
+    add("--level", metavar="LEVEL", help="level of rooms in a file of OpenStreetMap, or buildings")
     add("--materials", metavar="FILE", help="materials.yml with rules and exceptions")
     add("--register-pairs", metavar="CSV", help="move by pairs of points: x,y[,z],to_x,to_y[,to_z]")
     add("--register-walls", metavar="CSV", help="move so that walls lie on those of a layout: x,y")
@@ -56,18 +64,23 @@ def mesh_command(a: Arguments) -> int:
     """Make a scene folder."""
     from ...scene.make import make_scene
     from ...scene.mesh.files import mesh_parts
+    from ...scene.mesh.surfaces import KINDS, named_kind
     from ...scene.register import read_pairs, register_pairs
     from ..checking import check_scene
 
     pairs = None if a.register_pairs is None else register_pairs(*read_pairs(a.register_pairs), name=a.register_pairs)
     source = {"units": a.units, "up": a.up, "origin_m": a.origin, "row_0": a.row_0, "resolution_m": a.resolution}
     storey = {"height_m": a.wall_height, "floor_m": a.floor, "extent_m": a.extent, "materials": a.materials}
+    storey |= {"layers": a.layers, "level": a.level}
     frame = {"registration": pairs, "register_walls_of": a.register_walls, "positions": a.positions}
     scene = make_scene(a.points, a.out, **source, **storey, **frame, replace=a.replace)
-    kinds = list(scene.materials.surfaces.values())
-    counts = {kind: kinds.count(kind) for kind in ("floor", "ceiling", "wall", "other")}
-    floors = [name for name, kind in scene.materials.surfaces.items() if kind == "floor"]
-    floor_m2 = sum(part.area for name in floors for part in mesh_parts(scene.folder / "meshes" / f"{name}.ply"))
+    kinds = {name: named_kind(name, entry) for name, entry in scene.materials.surfaces.items()}
+    counts = {kind: list(kinds.values()).count(kind) for kind in KINDS}
+    floors = [name for name, kind in kinds.items() if kind == "floor"]
+    parts = [part for name in floors for part in mesh_parts(scene.folder / "meshes" / f"{name}.ply")]
+    # Seen from above; a slab has an upper and a lower side.
+    level_m2 = [float(np.abs(part.face_normals[:, 2]) @ part.area_faces) for part in parts]
+    floor_m2 = sum(area / (1 + part.is_watertight) for area, part in zip(level_m2, parts, strict=True))
     facts: dict[str, Any] = {
         "scene": str(scene.folder),
         "xml": str(scene.xml),

@@ -20,6 +20,7 @@ from ...core.angles import FloatArray
 from ...core.files import one_line
 from ...core.types import IntArray
 from ..coordinates import FORMATS, UNITS_M, Up, check_extent, require_precise, source_file, turned, up_of
+from .ifc import read_ifc
 from .polygon_files import Polygons, read_obj, read_ply
 from .scene_files import USD_SUFFIXES, Beside, bare_gltf, gltf_facts, read_collada, read_usd
 from .sheets import as_sheets
@@ -29,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 STATING_READERS = {".dae": read_collada, **dict.fromkeys(USD_SUFFIXES, read_usd)}
 """Readers of files that state their unit and the axis that is up."""
-SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".gltf", *STATING_READERS)
+SUFFIXES = (".ply", ".stl", ".obj", ".glb", ".gltf", *STATING_READERS, ".ifc")
 POINTS_ELSEWHERE = f"complete it, or give its points as {FORMATS}"
 """Remedy for a mesh of a format that is not read as points."""
 POLYGON_READERS = {".obj": read_obj, ".ply": read_ply}
@@ -83,6 +84,8 @@ def _stored_parts(file: Path) -> tuple[list[trimesh.Trimesh], float | None, Up]:
     suffix, up = file.suffix.lower(), up_of(file, None)
     if suffix in POLYGON_READERS:
         return _polygon_parts(POLYGON_READERS[suffix](file)), None, up
+    if suffix == ".ifc":
+        return [surface.mesh for surface in read_ifc(file)], 1.0, "z"
     if suffix not in STATING_READERS:
         return _trimesh_parts(file), None, up
     contents, unit_m, up = STATING_READERS[suffix](file)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def as_sheets(surfaces: Sequence[Surface], name: str | Path) -> list[Surface]:
     for number, surface in enumerate(surfaces):
         if (rows := (owner == number) & ~copies).any():
             vertices, faces = np.unique(corners[rows].reshape(-1, 3), axis=0, return_inverse=True)
-            sheets.append(Surface(surface.name, surface.kind, vertices, faces.reshape(-1, 3)))
+            sheets.append(replace(surface, vertices_m=vertices, faces=faces.reshape(-1, 3)))
     return sheets
 
 

@@ -38,12 +38,14 @@ class Surface:
         kind: its role, which decides its material.
         vertices_m: shape [v, 3], metres.
         faces: vertex indices, shape [f, 3].
+        material: material of ITU-R P.2040 that its source states, else empty.
     """
 
     name: str
     kind: Kind
     vertices_m: FloatArray
     faces: IntArray
+    material: str = ""
 
     @property
     def mesh(self) -> trimesh.Trimesh:
@@ -98,6 +100,14 @@ def number_names(kinds: Sequence[str]) -> list[str]:
         number[kind] += 1
         names.append(kind if total[kind] == 1 else f"{kind}_{number[kind]:02d}")
     return names
+
+
+def named_kind(name: str, entry: str) -> Kind:
+    """Kind of a surface of a scene folder by its name and its entry in ``materials.yml``.
+
+    A stated material takes the place of the kind, with which the name still begins.
+    """
+    return next((kind for kind in KINDS if entry == kind or name.startswith(kind)), "other")
 
 
 def moved(surfaces: Sequence[Surface], matrix: FloatArray) -> list[Surface]:

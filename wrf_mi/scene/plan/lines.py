@@ -15,6 +15,7 @@ from skimage.transform import hough_line
 
 from ...core.angles import FloatArray
 from ..mesh.outline import large_parts
+from .faces import THICKEST_WALL_M
 from .sources import Mask, PlanGrid
 
 HALF_WIDTH_M = 0.1  # largest distance of cells that support a line: half the width of a blurred wall
@@ -23,7 +24,6 @@ CLEARED_M = 0.2
 LARGEST_HOLE_M = 0.25  # largest hole in a run, narrower than any door
 SHORTEST_RUN_M = 0.4  # least length of a run; shorter pieces may be clutter
 SOLID = 0.9  # least share of occupied cells in each row of a wall that is drawn thicker than the blur of a map
-THICKEST_WALL_M = 0.6  # solids thicker than an outer wall are blocks
 FILLED = 0.6  # least share of a run's length that holds occupied cells
 LARGEST_RISE_M = 0.2  # cells that rise by more across a run climb through its window: a wall of another direction
 SMALLEST_BLOB_CELLS = 4  # least number of connected occupied cells; fewer are stray returns

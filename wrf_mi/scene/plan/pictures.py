@@ -5,12 +5,14 @@ Source of the YAML and of how its modes read a pixel: https://wiki.ros.org/map_s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageOps
+from scipy import ndimage
 
 from ...core import InputError
 from ...core.angles import FloatArray
@@ -33,6 +35,14 @@ RAW_PERCENT = (
 OCCUPIED_PROBABILITY = 0.65
 """A cell more likely than this is occupied (``occupied_thresh`` of the ROS map_server's documentation)."""
 FREE_PROBABILITY = 0.196  # a cell less likely than this is free (``free_thresh`` there)
+
+DARK = WHITE * (1 - OCCUPIED_PROBABILITY)  # lightest grey of walls where nothing else is clear
+LIGHTEST, GREY_RANGE = 240.0, 25.0
+"""Grey from which nothing is drawn, and range of the greys of walls that are lighter than `DARK`."""
+CORE_M, LEAST_CORE = 0.04, 0.001
+"""Least distance of the middle of a wall from its faces, and least share of such pixels in a drawing."""
+MOST_WIDE, SPANNED = 0.1, 0.6
+"""Largest share of pixels of walls that are farther inside, and least share of the drawing's sides that walls span."""
 
 Mode = Literal["trinary", "scale", "raw"]
 
@@ -81,6 +91,23 @@ def read_sheet(file: Path, resolution_m: float | None) -> Sheet:
     return sheet
 
 
+@dataclass(frozen=True, eq=False)
+class PlanDrawing:
+    """Plan as it is drawn, for pictures of its scene.
+
+    Attributes:
+        pixels: picture [rows, columns, 3], its first row on top; None: there is none.
+        box_m: lowest and highest coordinates [2, 2] of the picture.
+        lines_m: lines [n, 2, 2].
+        motion: matrix [4, 4] from the drawing's frame to the scene's.
+    """
+
+    pixels: NDArray[np.uint8] | None = None
+    box_m: FloatArray = field(default_factory=lambda: np.zeros((2, 2)))
+    lines_m: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+    motion: FloatArray = field(default_factory=lambda: np.eye(4))
+
+
 @dataclass(frozen=True)
 class Pixels:
     """Pixels of a picture, its first row on top.
@@ -112,6 +139,44 @@ class Pixels:
     def is_saved_map(self) -> bool:
         """Whether the pixels have the greys of map_saver and no others."""
         return not self.coloured and bool(np.isin(np.round(WHITE * self.grey, 6), SAVED_GREYS).all())
+
+
+def wall_grey(grey: FloatArray, resolution_m: float, thickest_m: float) -> float:
+    """Lightest grey, 0 to 255, of the walls of a drawing [rows, columns] with values from 0 to 1.
+
+    It is `DARK` unless dark pixels lie in a small part of the drawing, or are lines, while those of a lighter grey are
+    bands along most of it, at most as wide as a wall.
+    """
+    levels = WHITE * grey
+    drawn = np.ptp(np.argwhere(levels < LIGHTEST), axis=0) if (levels < LIGHTEST).any() else np.zeros(2)
+
+    def looks_like_walls(mask: NDArray[np.bool_]) -> bool:
+        half_m = ndimage.distance_transform_edt(mask) * resolution_m
+        core = np.argwhere(half_m >= CORE_M)
+        if len(core) < LEAST_CORE * mask.size:
+            return False
+        wide = np.mean(half_m[mask] > thickest_m / 2)
+        return bool(wide < MOST_WIDE and (np.ptp(core, axis=0) >= SPANNED * drawn).all())
+
+    if looks_like_walls(levels <= DARK):
+        return DARK
+    ends = np.arange(DARK + GREY_RANGE, LIGHTEST, GREY_RANGE / 2)
+    bands = [end for end in ends if looks_like_walls((levels > end - GREY_RANGE) & (levels <= end))]
+    return float(bands[-1]) if bands and np.ptp(bands) <= GREY_RANGE else DARK
+
+
+def thumbnail(file: Path, most_pixels: int, side: int) -> NDArray[np.uint8] | None:
+    """Colours [rows, columns, 3] of a picture with at most some pixels along a side; None for 16 bits.
+
+    `read_pixels` refuses files that cannot be read.
+    """
+    with open_picture(file, most_pixels, FORMATS) as stored:
+        picture = ImageOps.exif_transpose(stored)
+        if picture.mode.startswith(("I", "F")):
+            return None
+        small = picture.convert("RGBA")
+        small.thumbnail((side, side))
+        return np.asarray(Image.alpha_composite(Image.new("RGBA", small.size, "white"), small).convert("RGB"))
 
 
 def read_pixels(file: Path, most_pixels: int) -> Pixels:

@@ -7,7 +7,7 @@ of a ROS map, is its top (largest y); an NPZ file states on which side its row 0
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -22,16 +22,23 @@ from ...core.array_files import stored_arrays
 from ...core.files import inside, listed, one_line, text_lines
 from ...core.types import IntArray
 from ...datasets.folder_files import read_columns
+from .buildings import Buildings
+from .dxf import read_dxf
+from .faces import THICKEST_WALL_M, PlanLines
 from .geojson import GEOJSON_SUFFIXES, Extent, read_geojson
 from .pictures import (
+    DARK,
     FREE_PROBABILITY,
     OCCUPIED_PROBABILITY,
     PICTURE_SUFFIXES,
+    SAVED_GREYS,
     SHEET_SUFFIXES,
     WHITE,
     Sheet,
     read_pixels,
     read_sheet,
+    thumbnail,
+    wall_grey,
 )
 
 logger = logging.getLogger(__name__)
@@ -44,6 +51,8 @@ NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m")  # arrays of numbers 
 POINT_CELL_M = 0.05  # side of the cells that points are counted in, as usual for maps of indoor robots
 LARGEST_GRID_CELLS = 4_000_000  # 100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away
 THINNEST_WALL_M = 0.05  # thinner lines of a drawing are door leaves, dimensions and letters
+PLANS = ".npz, .png, .pgm, .jpg, .yaml, .csv, .xyz, .geojson, .osm or .dxf"
+SMALLEST_PART_M = 0.8  # smaller parts that touch no others are letters, symbols and pillars
 LARGEST_PICTURE = 4 * LARGEST_GRID_CELLS
 """Most cells of an occupancy grid that is stated as such: the walls of more take hours to find."""
 
@@ -140,8 +149,14 @@ def grid_from_points(xy_m: ArrayLike, resolution_m: float | None = None) -> Plan
 
 
 def read_plan(
-    path: str | Path, resolution_m: float | None = None, row_0: Row0 | None = None, extent_m: Extent | None = None
-) -> PlanGrid | FloatArray:
+    path: str | Path,
+    resolution_m: float | None = None,
+    row_0: Row0 | None = None,
+    extent_m: Extent | None = None,
+    units: str | None = None,
+    layers: Sequence[str] = (),
+    level: str | None = None,
+) -> PlanGrid | PlanLines | Buildings | FloatArray:
     """Any file that shows a plan, recognised by its ending and its content.
 
     - ``.npz`` with ``log_odds`` [rows, columns], ``row_0`` ("top" or "bottom"), ``resolution_m``, and optionally
@@ -153,7 +168,9 @@ def read_plan(
       Without a YAML, and with other greys than those of map_saver, lines thinner than
       `THINNEST_WALL_M` are not walls (`without_thin_lines`), and a picture with colours has no unmapped cells.
     - ``.csv`` with the header ``x,y``: wall vertices (`read_layout`).
-    - ``.geojson``, ``.json``: outlines of rooms in longitude and latitude (`wrf_mi.scene.plan.geojson.read_geojson`).
+    - ``.geojson``, ``.json``, ``.osm``: outlines of rooms or buildings in longitude and latitude, and data of
+      OpenStreetMap (`wrf_mi.scene.plan.geojson.read_geojson`).
+    - ``.dxf``: lines on layers of walls, doors and windows (`wrf_mi.scene.plan.dxf.read_dxf`).
     - ``.xyz``, ``.txt``: points in two columns x, y (metres), separated by spaces, tabs or commas; # begins a comment.
 
     Args:
@@ -161,26 +178,38 @@ def read_plan(
         resolution_m: side of a cell of a grid; overrides that of the file.
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
         extent_m: width and height of the plan in GeoJSON.
+        units: unit of the coordinates of a DXF; None: that which it states.
+        layers: layers of walls in a DXF.
+        level: level of the rooms of OpenStreetMap, or ``buildings``.
 
     Returns:
-        A grid, whose cells are nowhere free where the file holds points, wall vertices [n, 2], or the straight pieces
-        of outlines [n, 2, 2].
+        A grid, whose cells are nowhere free where the file holds points, wall vertices [n, 2], lines or buildings.
 
     Raises:
-        InputError: missing, unreadable or incomplete, points with the times of their scans, ``row_0`` for a file
-            whose format fixes it, or ``extent_m`` for a file in metres.
+        InputError: missing, unreadable or incomplete, points with the times of their scans, or an option that does
+            not belong to the format of the file.
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: missing; give a plan as .npz, .png, .pgm, .jpg, .yaml, .csv, .xyz or .geojson")
+        raise InputError(f"{path}: missing; give a plan as {PLANS}")
     suffix = path.suffix.lower()
     if row_0 is not None and suffix != ".npz":
         fixed = suffix in (*PICTURE_SUFFIXES, *SHEET_SUFFIXES)
         raise _no_rows(path, "the first row of a picture is its top" if fixed else "this file has no rows of cells")
-    if suffix in GEOJSON_SUFFIXES:
-        return read_geojson(path, extent_m)
-    if extent_m is not None:
-        raise InputError(f"{path}: --extent is for plans in longitude and latitude (GeoJSON); leave it out")
+    is_map, is_dxf = suffix in GEOJSON_SUFFIXES, suffix == ".dxf"
+    for option, value, fits, of in (
+        ("--extent", extent_m, is_map, "plans in longitude and latitude (GeoJSON, OpenStreetMap)"),
+        ("--level", level, is_map, "plans of OpenStreetMap"),
+        ("--layers", layers or None, is_dxf, "DXF"),
+        ("--units", None if units == "m" else units, is_dxf, "plans in DXF; other plans are in metres"),
+        ("--resolution", resolution_m, not (is_map or is_dxf), "plans of cells, pixels or points"),
+    ):
+        if value is not None and not fits:
+            raise InputError(f"{path}: {option} is for {of}; leave it out")
+    if is_map:
+        return read_geojson(path, extent_m, level)
+    if is_dxf:
+        return read_dxf(path, units, layers)
     if suffix in (*PICTURE_SUFFIXES, *SHEET_SUFFIXES):
         return _read_picture(path, resolution_m)
     match suffix:
@@ -190,7 +219,7 @@ def read_plan(
             return read_layout(path)
         case ".xyz" | ".txt":
             return _grid_of_points(path, _read_text(path), resolution_m)
-    raise InputError(f"{path}: unknown ending; a plan is .npz, .png, .pgm, .jpg, .yaml, .csv, .xyz or .geojson")
+    raise InputError(f"{path}: unknown ending; a plan is {PLANS}")
 
 
 def read_layout(path: str | Path) -> FloatArray:
@@ -292,6 +321,17 @@ def picture_scale(
     return (rows, columns), resolution_m, (0.0, 0.0, 0.0) if sheet is None else sheet.origin
 
 
+def plan_pixels(path: Path, grid: PlanGrid, side: int) -> NDArray[np.uint8]:
+    """Picture [rows, columns, 3] of a plan of cells that has been read, at most some pixels along a side."""
+    if path.suffix.lower() in (*PICTURE_SUFFIXES, *SHEET_SUFFIXES):
+        pixels = thumbnail(_scaled_picture(path, grid.resolution_m)[0], LARGEST_PICTURE, side)
+        if pixels is not None:
+            return pixels
+    step = -(-max(grid.occupied.shape) // side)
+    grey = np.where(grid.occupied, 0, np.where(grid.free, 255, SAVED_GREYS[1]))[::-step, ::step]
+    return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
+
+
 def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
     path, resolution_m, sheet = _scaled_picture(path, resolution_m)
     pixels = read_pixels(path, LARGEST_PICTURE)
@@ -302,40 +342,67 @@ def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
         origin = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x  # in the turned frame
         grid = grid_from_probability(probability, resolution_m, "top", origin, str(path), thresholds)
         return replace(grid, yaw_rad=yaw)
-    if pixels.coloured:  # a drawing: what is no line is ground, of whatever colour
-        probability = np.where(probability > OCCUPIED_PROBABILITY, 1.0, 0.0)
+    level = DARK if pixels.is_saved_map else wall_grey(pixels.grey, resolution_m, THICKEST_WALL_M)
+    if pixels.coloured or level > DARK:  # a drawing: what is no line is ground, of whatever colour
+        probability = np.where(WHITE * pixels.grey <= level, 1.0, 0.0)
     grid = grid_from_probability(probability, resolution_m, "top", name=str(path))
     if pixels.is_saved_map:
         return grid
-    if pixels.coloured:
+    if pixels.coloured or level > DARK:
         text = (
-            "%s: %.2g %% of its pixels, those darker than grey %d, count as walls; if walls are lighter, darken them, "
+            "%s: %.2g %% of its pixels, those darker than grey %d, count as walls; if walls are others, darken these, "
         )
         text += "or state a lower occupied_thresh in the YAML of a ROS map beside it"
-        logger.warning(text, path, 100 * grid.occupied.mean(), WHITE * (1 - OCCUPIED_PROBABILITY))
+        logger.warning(text, path, 100 * grid.occupied.mean(), level)
     return without_thin_lines(grid, str(path))
 
 
 def without_thin_lines(grid: PlanGrid, name: str = "plan") -> PlanGrid:
     """A drawing without lines thinner than `THINNEST_WALL_M`, whose cells are free; how many is logged.
 
-    A drawing of which less than half remains has walls drawn as lines, and is returned as it is.
+    So are parts smaller than `SMALLEST_PART_M` that touch no others, such as letters. Where less than half remains,
+    walls are drawn as lines: narrow spaces between two of them are filled, as both are faces of a wall, and a drawing
+    of which less than half remains even so is returned as it is.
     """
-    # A disk, so that walls of any direction remain; of even diameter, too, hence the half cells.
-    cells = max(1, int(THINNEST_WALL_M / grid.resolution_m + 1e-6))
-    offset = np.arange(cells) - (cells - 1) / 2
-    disk = np.hypot(offset[:, None], offset) <= cells / 2
-    thick = ndimage.binary_opening(grid.occupied, disk)
-    lines = grid.occupied & ~ndimage.binary_dilation(thick, np.ones((3, 3)))
+    lines = _thin_lines(grid)
     if not lines.any():
         return grid
     share = lines.sum() / grid.occupied.sum()
     if share > 0.5:
+        filled = replace(grid, occupied=grid.occupied | _between_faces(grid))
+        lines = _thin_lines(filled)
+        if lines.sum() <= 0.5 * filled.occupied.sum():
+            text = "%s: walls are drawn by both faces; other lines are not walls (door leaves, furniture, dimensions)"
+            logger.warning(text, name)
+            return replace(filled, occupied=filled.occupied & ~lines, free=filled.free | lines)
         logger.warning("%s: walls are drawn as lines thinner than %g m, so every line is a wall", name, THINNEST_WALL_M)
         return grid
     text = "%s: lines thinner than %g m, %.2g %% of the dark cells, are not walls (door leaves, dimensions, letters)"
     logger.warning(f"{text}; draw those thicker that are", name, THINNEST_WALL_M, 100 * share)
     return replace(grid, occupied=grid.occupied & ~lines, free=grid.free | lines)
+
+
+def _thin_lines(grid: PlanGrid) -> Mask:
+    """Dark cells of lines thinner than `THINNEST_WALL_M`, and of small parts that touch no others."""
+    # A disk, so that walls of any direction remain; of even diameter, too, hence the half cells.
+    cells = max(1, int(np.ceil(THINNEST_WALL_M / grid.resolution_m - 1e-6)))
+    offset = np.arange(cells) - (cells - 1) / 2
+    disk = np.hypot(offset[:, None], offset) <= cells / 2
+    thick = ndimage.binary_opening(grid.occupied, disk)
+    parts, _ = ndimage.label(thick, np.ones((3, 3)))
+    boxes = ndimage.find_objects(parts)
+    sides_m = np.array([[0.0, 0.0], *([(axis.stop - axis.start) for axis in box] for box in boxes)]) * grid.resolution_m
+    if (sides_m.max(axis=1) >= SMALLEST_PART_M).any():
+        thick &= (sides_m.max(axis=1) >= SMALLEST_PART_M)[parts]
+    return np.asarray(grid.occupied & ~ndimage.binary_dilation(thick, np.ones((3, 3))))
+
+
+def _between_faces(grid: PlanGrid) -> Mask:
+    """Cells of spaces that lines enclose and that are nowhere wider than a wall."""
+    spaces, count = ndimage.label(~grid.occupied)
+    half_m = ndimage.distance_transform_edt(~grid.occupied) * grid.resolution_m
+    widest_m = ndimage.maximum(half_m, spaces, np.arange(count + 1))
+    return np.asarray((2 * widest_m <= THICKEST_WALL_M)[spaces] & ~grid.occupied)
 
 
 def _read_text(path: Path) -> FloatArray:

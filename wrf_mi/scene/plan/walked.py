@@ -89,7 +89,12 @@ def _free_space(grid: PlanGrid, floor: Any, places_m: FloatArray) -> list[Any]:
     points = shapely.points(places_m)
     about = shapely.buffer(points, NARROWEST_ROOM_M / 2, cap_style="square")
     walkable = opened(shapely.difference(free, floor), NARROWEST_ROOM_M / 2)
-    spaces = [part for part in polygons(walkable) if shapely.intersects(part, shapely.multipoints(points))]
+    # Free cells up to the edge of a drawing are paper, into which a room is open.
+    rows, columns = grid.free.shape
+    inner = shapely.box(*grid.origin_m, *(grid.origin_m + grid.resolution_m * np.array([columns, rows])))
+    inner = shapely.buffer(inner, -2 * grid.resolution_m)
+    walked = [part for part in polygons(walkable) if shapely.intersects(part, shapely.multipoints(points))]
+    spaces = [part for part in walked if shapely.covers(inner, part)]
     return [*shapely.intersection(about, free), *(shapely.simplify(part, grid.resolution_m) for part in spaces)]
 
 

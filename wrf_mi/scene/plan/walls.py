@@ -77,6 +77,12 @@ def find_walls(grid: PlanGrid) -> FloatArray:
 
 
 def joined(walls_m: FloatArray) -> FloatArray:
+    """Walls [m, 2, 2] of [n, 2, 2] as `met` moves their ends, without those of which nothing is left."""
+    result = met(walls_m)
+    return result[np.linalg.norm(result[:, 1] - result[:, 0], axis=-1) > TOUCHING_M]
+
+
+def met(walls_m: FloatArray) -> FloatArray:
     """Walls [n, 2, 2] whose ends are moved, along the wall, to where it meets another wall within `REACH_M`."""
     result = walls_m.copy()
     along = walls_m[:, 1] - walls_m[:, 0]
@@ -96,7 +102,7 @@ def joined(walls_m: FloatArray) -> FloatArray:
             nearest = int(np.argmin(way))
             if way[nearest] <= REACH_M:
                 result[i, end] = walls_m[i, 0] + meeting[nearest] * unit[i]
-    return result[np.linalg.norm(result[:, 1] - result[:, 0], axis=-1) > TOUCHING_M]
+    return result
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
