@@ -37,7 +37,7 @@ from wrf_mi.training.session import quiet
 SECONDS_TO_START = 120
 """Importing, compiling and a first step take some 3 s; a busy machine needs much longer."""
 COMMANDS = {"doctor", "check", "data", "mesh", "correct", "edit", "train", "trace", "sweep", "evaluate", "predict"}
-COMMANDS |= {"compare", "map", "locate", "view", "export", "import", "bench", "demo", "plan"}
+COMMANDS |= {"compare", "table", "map", "locate", "view", "export", "import", "bench", "demo", "plan"}
 
 
 def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
