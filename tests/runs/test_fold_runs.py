@@ -133,7 +133,7 @@ def test_commands_take_such_a_run(run: Path, table: Path, tmp_path: Path, comman
     command.refused(["evaluate", run, "--split", "random"], "every row is held out in one of its folds; omit --split")
     command.refused(
         ["locate", run, "--step", "1", "--out", tmp_path / "test.csv"],
-        "its split holds no rows out, which could be located",
+        "give strengths by --observed FILE, or train with --split random",
     )
 
 

@@ -123,7 +123,10 @@ def test_positions_from_a_file(tmp_path):
     file.write_text(",x,heading,y\n0,1,9,2\n")
     np.testing.assert_array_equal(read_positions(file), [[1, 2, np.nan]])
     for text, message in (
-        ("a,y\n1,2\n", "no column x"),
+        (
+            "X (px),Y (px),AP\n1,2,-40\n",
+            r"no columns x and y in metres: x \(px\), y \(px\), ap; .* --units px, by wrf-mi data import",
+        ),
         ("x,y\n1,2\n1,\n", "row 2: y is ''"),
         ("x,y\n", "no rows"),
         (None, "a.csv: no such file; give measured positions"),
@@ -131,6 +134,12 @@ def test_positions_from_a_file(tmp_path):
         file.unlink() if text is None else file.write_text(text)
         with pytest.raises(InputError, match=message):
             read_positions(file)
+
+
+def test_positions_of_a_data_folder(tmp_path):
+    (tmp_path / "receivers.csv").write_text("id,x,y,z\n1,0,0,2\n")
+    (tmp_path / "measurements.csv").write_text("x,y,z,rssi_1\n1,2,3,-50\n4,5,6,-60\n")
+    np.testing.assert_array_equal(read_positions(tmp_path), [[1, 2, 3], [4, 5, 6]])
 
 
 @needs("flat-ble")

@@ -106,8 +106,9 @@ def make_scene(
         registration: 4 x 4 rigid motion from the source's frame to the scene's, metres; None keeps the frame.
         register_walls_of: a layout file (`wrf_mi.scene.plan.sources.read_layout`) to whose walls the scene is
             registered (`wrf_mi.scene.register.register_walls`), in place of ``registration``.
-        positions: CSV file of measured positions in the scene's frame (`wrf_mi.scene.positions.read_positions`); a
-            source whose walls they cross, or that they fit better when mirrored, is refused.
+        positions: data folder or CSV file with measured positions in the scene's frame
+            (`wrf_mi.scene.positions.read_positions`); a source whose walls they cross, or that they fit better when
+            mirrored, is refused.
         row_0: side of the plan where the first row of an NPZ grid lies; overrides that of the file.
         extent_m: width and height of a plan in longitude and latitude (`wrf_mi.scene.plan.geojson.read_geojson`).
         layers: layers of walls in a DXF (`wrf_mi.scene.plan.dxf.read_dxf`).

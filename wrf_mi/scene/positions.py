@@ -21,6 +21,8 @@ from scipy.spatial import cKDTree
 
 from ..core import InputError
 from ..core.angles import FloatArray
+from ..core.files import listed
+from ..datasets import load
 from ..datasets.folder_files import read_csv
 from .mesh.surfaces import Surface, box_of, cut_lines, level_area, moved
 from .plan.sources import PlanGrid
@@ -46,15 +48,20 @@ LARGEST_SHARE = 0.1  # largest share of positions in conflict where no reflectio
 
 
 def read_positions(path: str | Path) -> FloatArray:
-    """Measured positions [n, 3], metres, from the columns x, y and perhaps z (else NaN) of a CSV file.
+    """Measured positions [n, 3], metres, from a data folder or the columns x, y and perhaps z (else NaN) of a CSV file.
 
     `InputError`: missing, no such column, or a field that is not a finite number.
     """
     path = Path(path)
+    if path.is_dir():
+        return load(path).tx_pos_m
     if not path.is_file():
         raise InputError(f"{path}: no such file; give measured positions with the header x,y or x,y,z in metres")
     table = read_csv(path, skip_blank=True)
     table = replace(table, header=[name.lower() for name in table.header])
+    if not {"x", "y"} <= set(table.header):
+        text = f"no columns x and y in metres: {listed(table.header)}; import the file, pixels with --units px, by"
+        raise InputError(f"{path}: {text} wrf-mi data import {path} --out DATA, and give --positions DATA")
     z = table.numbers("z") if "z" in table.header else np.full(len(table.rows), np.nan)
     return np.stack([table.numbers("x"), table.numbers("y"), z], axis=-1)
 

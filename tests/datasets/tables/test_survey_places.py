@@ -44,8 +44,10 @@ def test_pixels_of_a_plan_lie_where_its_walls_are(plan: Path, tmp_path: Path) ->
     np.testing.assert_allclose(report.record.tx_pos_m[1, :2], [9.0, 0.5])
     places = np.array([receiver.position_m[:2] for receiver in report.record.receivers])
     np.testing.assert_allclose(places, [[0, 0], [10, 5]], atol=1e-9)
-    shifted = imported(tmp_path, file, **options, origin_m=(1.0, 2.0, 0.0)).record
-    np.testing.assert_allclose(shifted.tx_pos_m[1, :2], [8.0, -1.5])
+    shifted = imported(tmp_path, file, **options, origin_m=(1.0, 2.0, 0.0))
+    np.testing.assert_allclose(shifted.record.tx_pos_m[1, :2], [8.0, -1.5])
+    command = "wrf-mi mesh plan.png --resolution 0.05 --origin 1,2,0 --wall-height M"
+    assert any(note.endswith(command) for note in shifted.notes)
 
 
 def test_pixels_outside_their_plan_are_refused(plan: Path, tmp_path: Path) -> None:

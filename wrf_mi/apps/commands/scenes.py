@@ -54,9 +54,9 @@ def _add_mesh(commands: Any) -> None:
     add("--materials", metavar="FILE", help="materials.yml with rules and exceptions")
     add("--register-pairs", metavar="CSV", help="move by pairs of points: x,y[,z],to_x,to_y[,to_z]")
     add("--register-walls", metavar="CSV", help="move so that walls lie on those of a layout: x,y")
-    text = "measured positions x,y[,z] in the scene's frame: refuse a plan that is mirrored or elsewhere, warn if it "
-    text += "fits better when moved"
-    add("--positions", metavar="CSV", help=text)
+    text = "measured positions in the scene's frame, a folder of `data import` or a CSV x,y[,z] in metres: refuse a "
+    text += "plan that is mirrored or elsewhere, warn if it fits better when moved"
+    add("--positions", metavar="DATA", help=text)
     add("--replace", action="store_true", help="replace an existing scene folder")
 
 

@@ -55,4 +55,6 @@ def registered_frame(
     affine = np.column_stack([scale_m * turn @ np.diag([1, -1]), turn @ [0, height * scale_m] + corner_m])
     note = f"positions are pixels of {Path(plan).name} ({height} rows, {scale_m:g} m each): y runs down there, up here"
     frame = LocalFrame(affine=tuple(map(tuple, affine.tolist())))
-    return frame, f"{note}; the frame is that of wrf-mi mesh {Path(plan).name}"
+    options = f" --resolution {resolution_m:g}" if resolution_m else ""
+    options += f" --origin {','.join(f'{value:g}' for value in origin_m)}" if len(origin_m) else ""
+    return frame, f"{note}; the frame is that of wrf-mi mesh {Path(plan).name}{options} --wall-height M"

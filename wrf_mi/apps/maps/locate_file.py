@@ -197,8 +197,8 @@ def test_observations(run: Run) -> tuple[FloatArray, FloatArray]:
     record = run.problem.record
     rows = load_rows(run.folder, record).test
     if not len(rows):
-        text = "its split holds no rows out, which could be located; give a file of strengths"
-        raise InputError(f"{run.folder}: {text} (positions of receivers are estimated by train)")
+        text = "its split holds no rows out, which could be located; give strengths by --observed FILE, or train with"
+        raise InputError(f"{run.folder}: {text} --split random (positions of receivers are estimated by train)")
     rows = rows[np.isfinite(record.observation[:, rows]).any(axis=0)]
     return np.asarray(record.observation[:, rows], float), np.asarray(record.tx_pos_m[rows, :2], float)
 
