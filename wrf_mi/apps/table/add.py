@@ -56,7 +56,7 @@ def add_entry(
         **stated: further fields of `Entry`: label, origin, paper, licence, machine and the costs.
 
     Returns:
-        Path of the entry. Predictions of up to a megabyte are stored beside it, so that others score them again.
+        Path of the entry. Whole predictions of up to a megabyte are stored beside it, so that others score them again.
 
     Raises:
         InputError: predictions that cannot be scored, a data set that the table lacks, or an entry that exists.
@@ -87,7 +87,8 @@ def add_entry(
             arrays = stored_arrays(folder / PREDICTIONS, PREDICTED)
         kept = Path(place) / "kept.npz"
         write_arrays(kept, arrays, compressed=True)
-        if kept.stat().st_size <= MOST_BYTES:
+        # Where a split holds receivers out, nothing is predicted at the others: no file of another program.
+        if kept.stat().st_size <= MOST_BYTES and np.isfinite(arrays["prediction"]).all():
             (table / KEPT).mkdir(exist_ok=True)
             write_atomically(table / KEPT / f"{entry.name}.npz", kept.read_bytes())
         return write_entry(table, entry)
