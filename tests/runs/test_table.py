@@ -159,7 +159,9 @@ def test_constant_and_simple_models_stand_beside_methods() -> None:
         ("constant: the mean", 9.0),
     ]
     assert [row["rank"] for row in rows] == [1, 2, 3, 4]
-    assert "behind the best simple model: kriging, 3.5; constant: constant: the mean, 9" in verdict(rows, "error")
+    assert "behind the best simple model: kriging, 3.5; constant: the mean, 9" in verdict(rows, "error")
+    level = group_rows([made("field", 3.501), made("kriging", 3.5)])
+    assert "level with the best simple model" in verdict(level, "error")
     pooled = [*entries, made("field", 2.0, seed=None)]
     assert [row["median"] for row in group_rows(pooled) if row["kind"] == "field"] == [2.0]
 

@@ -25,7 +25,7 @@ AMONG = "Positions among the measured ones"
 QUESTIONS = (REGIONS, FEW, RECEIVERS, CARRIERS, BUILDINGS, AMONG)
 SIMPLE = frozenset(("constant", "idw", "kriging", "trees", "mri", "linear", "reference"))
 """Methods without any knowledge of waves, beside which others are shown."""
-COLUMNS = {"method": "method", "rank": "rank", "median": "median", "mean": "mean", "interval": "95 % interval"}
+COLUMNS = {"method": "method", "rank": "rank", "median": "median", "mean": "mean", "interval": "95 % of the mean"}
 COLUMNS |= {"bias": "bias (dB)", "rmse": "RMSE (dB)", "p10": "p10", "p90": "p90", "inside_90": "inside 90 %"}
 COLUMNS |= {"seeds": "seeds", "n_train": "training rows", "n_test": "test rows", "train_seconds": "fit (s)"}
 COLUMNS |= {"ms_per_sample": "a row (ms)", "peak_memory_mb": "memory (MB)", "machine": "machine", "date": "date"}
@@ -108,12 +108,18 @@ def verdict(rows: Sequence[Mapping[str, Any]], label: str) -> str:
     simple = [row for row in rows if row["kind"] in SIMPLE and row["kind"] != CONSTANT]
     constant = [row for row in rows if row["kind"] == CONSTANT]
     named = [(words, found[0]) for words, found in (("best simple model", simple), ("constant", constant)) if found]
-    beside = "; ".join(f"{words}: {row['method']}, {row['median']:.3g}" for words, row in named)
+    beside = "; ".join(
+        f"{words}: {row['method'].removeprefix('constant: ')}, {row['median']:.3g}" for words, row in named
+    )
     if not learned:
         return beside
-    best, behind = learned[0], bool(simple) and simple[0]["rank"] < learned[0]["rank"]
-    ahead = "; behind the" if behind else "; ahead of the"
-    return f"{best['method']}: median {label} {best['median']:.3g}{ahead} {beside}"
+    best = learned[0]
+    place = "ahead of"
+    if simple and f"{simple[0]['median']:.3g}" == f"{best['median']:.3g}":
+        place = "level with"
+    elif simple and simple[0]["rank"] < best["rank"]:
+        place = "behind"
+    return f"{best['method']}: median {label} {best['median']:.3g}; {place} the {beside}"
 
 
 def _figure(rows: Sequence[Mapping[str, Any]], label: str, better: str) -> Figure | None:
@@ -166,7 +172,7 @@ def _question(number: int, question: str, groups: Mapping[Group, Sequence[Entry]
         better = "higher" if task.higher_is_better else "lower"
         figure = _figure(rows, task.label, better)
         parts += [f"<h3>{escaped(title)}</h3>", f"<p>{escaped(verdict(rows, task.label))}.</p>"]
-        parts.append(sorted_table(COLUMNS, rows, frozenset(COLUMNS) - TEXTS))
+        parts.append(f'<div class="flat">{sorted_table(COLUMNS, rows, frozenset(COLUMNS) - TEXTS)}</div>')
         if figure is not None:
             seen = "; ".join(f"{row['method']} {row['median']:.3g}" for row in rows)
             shown = picture(_png(figure), f"Time against error: {dataset}, {split}", f"points of methods: {seen}")
