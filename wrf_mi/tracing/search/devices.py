@@ -38,7 +38,8 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
     beyond = np.maximum(low - positions_m, positions_m - high).max(axis=1)
     outside = np.flatnonzero(beyond > OUTSIDE_M)
     if len(outside):
-        text = "%d of %d antennas lie outside the scene (first: %s, by %.2f m): check its frame and the unit, metres; estimated positions may"
+        text = "%d of %d antennas lie outside the scene (first: %s, by %.2f m): check its frame and the unit, metres; "
+        text += "estimated positions may"
         logger.warning(text, len(outside), len(positions_m), names[outside[0]], beyond[outside[0]])
 
 
