@@ -10,7 +10,7 @@ from wrf_mi.apps.table.entries import ALL_ROWS, Entry, write_entry
 from .buildings import HYBRID as ALONE_HYBRID
 from .buildings import SETS, WITH_PLAN
 from .comparison import MEASURED
-from .stages import ALONE, CELLS, CHANNELS, HYBRID, Cell
+from .stages import ALONE, CELLS, CHANNELS, COPIED, HYBRID, Cell
 from .table_plan import SEEDS, plan
 from .tables import FOLDER, LICENCE
 from .unmeasured import CARRIERS, LEFT, RECEIVERS, Held, gains
@@ -64,9 +64,7 @@ def _of_stage(cell: Cell, figures: Mapping[str, Any]) -> dict[str, Any]:
     facts = {"method": method, "label": f"{name}, knows the scene" if scene else name, "task": BLOCKS[figures["block"]]}
     facts |= {"dataset": cell.dataset, "split": cell.split, "score": figures["score"]}
     facts |= {"share": ALL_ROWS if cell.n_train is None else cell.n_train, "n_train": cell.n_train}
-    for key in ("train_seconds", "inside_90", "crps", "ms_per_sample"):
-        facts[key] = figures.get(key)
-    return facts
+    return facts | {key: figures[key] for key in COPIED if figures.get(key) is not None}
 
 
 def _buildings(results: Path) -> Iterator[Entry]:

@@ -51,6 +51,8 @@ LIMITS = {"ssim": 0.01, "abs_error_db": 0.1, "cea_db": 0.5}
 """Largest loss against a part that is allowed, in the unit of the score."""
 WORSE_SHARE = 0.02  # largest share of comparisons in which the hybrid may be clearly worse
 INSIDE = (0.85, 0.95)  # limits of the share of test values inside the 90 % intervals
+COPIED = ("train_seconds", "inside_90", "crps", "ms_per_sample", "n_train", "n_test", "constant", "constant_rmse")
+"""Keys of ``metrics.json`` that are stored of each model."""
 HYBRID, JOINT, CALIBRATED = "hybrid", "wrf-gs+", "ray-tracing, calibrated"
 MATERIALS, CORRECTED = "ray-tracing, calibrated materials", "ray-tracing, corrected scene"
 TRANSMISSION = ("transmission=true",)  # waves pass the slabs of a scene, furniture among them
@@ -120,7 +122,7 @@ def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, A
     figures = []
     for name, run in {HYBRID: hybrid, **others}.items():
         figure = {"model": name, "score": run.metrics[block], "block": block}
-        figure |= {key: run.metrics.get(key) for key in ("train_seconds", "inside_90", "crps", "ms_per_sample")}
+        figure |= {key: run.metrics.get(key) for key in COPIED}
         if name == HYBRID:
             figure["stages"] = run.metrics["stages"]
         else:
