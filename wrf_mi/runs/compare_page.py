@@ -99,7 +99,7 @@ def _section(section: Section) -> str:
 <h3>Scores</h3>
 <p class="note">{escaped(TASKS[section.runs[0].task].label)}, {_better(section.runs[0])}. Ranked by the median; click a
 heading to sort. Paired differences are of means: they may rank runs differently.</p>
-{sorted_table(shown, section.scores, NUMERIC)}
+{sorted_table(shown, sorted(section.scores, key=lambda row: int(row["rank"])), NUMERIC)}
 {_unbeaten(section.runs)}{_methods(section.methods)}<h3>Paired differences</h3>
 <p class="note">Each run against its best reference{escaped(others)}, on the test rows that both have: mean difference
 per row, positive in favour of the run, with the 95 % interval of 2,000 bootstrap resamples of blocks of rows: clusters

@@ -255,7 +255,7 @@ def _method(run: Results) -> Any:
 
 
 def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
-    """Rows of the table for a data set, best median first: each run, and each reference and constant once."""
+    """Rows of the table for a data set, ranked by the median: each run, and each reference and constant once."""
     task = TASKS[runs[0].task]
     means = common_means(runs)
     rows: list[dict[str, Any]] = [
@@ -267,8 +267,10 @@ def score_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
         rows.append(counts | run.metrics["reference"][key] | {"run": name, "model": key})
     rows += _constants(runs)
     shared = {"dataset": Path(runs[0].dataset).name or runs[0].dataset, "metric": task.label}
-    rows.sort(key=lambda row: float(row["median"]), reverse=task.higher_is_better)
-    return [{column: (row | shared | {"rank": n}).get(column) for column in COLUMNS} for n, row in enumerate(rows, 1)]
+    ranked = sorted(range(len(rows)), key=lambda k: float(rows[k]["median"]), reverse=task.higher_is_better)
+    for rank, k in enumerate(ranked, 1):
+        rows[k] |= {"rank": rank}
+    return [{column: (row | shared).get(column) for column in COLUMNS} for row in rows]
 
 
 def _constants(runs: Sequence[Results]) -> list[dict[str, Any]]:
