@@ -29,7 +29,7 @@ ON_PAGE = {
     **dict.fromkeys(("stages", "ablation"), "hybrid.md"),
     **{"rooms": "correction.md", "locate": "locate.md", "moved": "scenes.md"},
     **dict.fromkeys(("fdtd", "far-scans"), "correction.md"),
-    **{"buildings": "results.md", "devices": "models.md"},
+    **{"buildings": "results.md", "journey": "results.md", "devices": "models.md"},
     **{"reception": "maps.md", "plan": "maps.md", "closed-forms": "numerics.md"},
 }
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
@@ -38,7 +38,7 @@ NOT_LISTED = (
     *("elsewhere", "traced-and-splatted", "flat-plan", "phase-error", "training", "phone-scans"),
 )
 """Checks of many rows, or that the prose of a page summarises."""
-OTHER_BLOCKS = ("checks", *IN_RESULTS)
+OTHER_BLOCKS = ("checks", "questions", *IN_RESULTS)
 """Blocks of pages that are made from several results."""
 FIGURES = {"rows": [{"what": "walls", "value": "0.9", "asked": "0.8"}]}
 

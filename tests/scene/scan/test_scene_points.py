@@ -96,8 +96,8 @@ def test_options_that_do_not_fit_the_source(tmp_path):
     out = tmp_path / "out"
     for name, options, message in (
         ("plan", {}, "a plan has no heights; .*--wall-height"),
-        ("plan", {"height_m": 2.5, "units": "mm"}, "a plan is in metres"),
-        ("scan", {"height_m": 2.5}, "leave out --wall-height, --floor, --resolution, --row-0 and --extent"),
+        ("plan", {"height_m": 2.5, "units": "mm"}, "other plans are in metres"),
+        ("scan", {"height_m": 2.5}, "leave out the options of plans, from --wall-height to --level"),
         ("scan", {"registration": np.diag([2.0, 2.0, 2.0, 1.0])}, "registration: not rigid"),
         ("scan", {"registration": np.eye(3)}, "registration: give a 4 x 4 matrix"),
     ):
