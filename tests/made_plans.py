@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from wrf_mi.scene.plan.sources import PlanGrid, grid_from_points, read_plan
+from wrf_mi.scene.plan.grid import PlanGrid
+from wrf_mi.scene.plan.sources import grid_from_points, read_plan
 
 WIDTH_M, DEPTH_M, INNER_M = 6.0, 4.0, 3.5
 DOOR_M = (1.0, 1.9)

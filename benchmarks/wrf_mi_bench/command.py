@@ -38,7 +38,7 @@ def _measure(a: argparse.Namespace) -> int:
     from wrf_mi.parallel import open_scheduler
 
     from .bench import CHECKS, REFUSED, BenchFailed, CheckRefused, all_here, bench, own_table
-    from .entries import write_entries
+    from .entries import OF, write_entries
 
     with open_scheduler(a.scheduler) as scheduler:
         workers = scheduler if a.scheduler else None
@@ -51,7 +51,8 @@ def _measure(a: argparse.Namespace) -> int:
         else:
             try:
                 rows = bench(a.names or all_here(), Path(a.out), Path(a.runs), workers)
-                write_entries(Path(a.out))
+                if OF & {row["case"] for row in rows}:
+                    write_entries(Path(a.out))
             except CheckRefused:  # printed on standard error by the check
                 return REFUSED
             for row in rows if not a.json else ():

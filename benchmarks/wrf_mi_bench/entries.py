@@ -13,15 +13,30 @@ from .comparison import MEASURED
 from .stages import ALONE, CELLS, CHANNELS, COPIED, HYBRID, Cell
 from .table_plan import SEEDS, plan
 from .tables import FOLDER, LICENCE
-from .unmeasured import CARRIERS, LEFT, RECEIVERS, Held, gains
+from .unmeasured import (
+    CARRIER,
+    CARRIERS,
+    IDW,
+    LAW,
+    LEFT,
+    OWN_KRIGING,
+    OWN_TREES,
+    RECEIVERS,
+    Held,
+    gains,
+)
 
 BLOCKS = {"ssim": "spectrum", "abs_error_db": "rssi", "cea_db": "csi"}  # task by key of its score in ``metrics.json``
 OPEN = ("rfid-lab",)  # data sets without a scene
 METHODS = {"wrf-gs+": "wrf-gs+-joint", "ray-tracing, calibrated": "ray-tracing-calibrated"}
 METHODS |= {"ray-tracing, calibrated materials": "ray-tracing-materials", ALONE_HYBRID: "hybrid"}
 METHODS |= {"ray-tracing, corrected scene": "ray-tracing-corrected", "ray tracing": "ray-tracing"}
-METHODS |= {"ray tracing, corrected scene": "ray-tracing-corrected", "IDW": "idw", "one law": "mri"}
+METHODS |= {"ray tracing, corrected scene": "ray-tracing-corrected", IDW: "idw", LAW: "mri", CARRIER: "carrier"}
+METHODS |= {OWN_KRIGING: "kriging", OWN_TREES: "trees"}
 """Names of methods in the table, where a benchmark has another."""
+
+
+OF = frozenset(("stages", "buildings", "new-carriers", "new-receivers"))  # benchmarks with entries
 
 
 def write_entries(results: Path) -> None:
@@ -82,7 +97,7 @@ def _buildings(results: Path) -> Iterator[Entry]:
 
 def _unmeasured(results: Path) -> Iterator[Entry]:
     for case in CARRIERS:
-        yield from _of_held(case, case.kind, results / "new-carriers", f"{case.dataset}")
+        yield from _of_held(case, case.kind, results / "new-carriers", case.dataset)
     for case in RECEIVERS:
         for left in LEFT:
             split = f"{case.kind}+{left}" if left else case.kind

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wrf_mi.apps.table.entries import ALL_ROWS, Entry, read_entries
+from wrf_mi.apps.table.entries import ALL_ROWS, Entry, read_entries, rows_in_words
 
 from .declared import pivoted
 from .entries import OPEN
@@ -68,8 +68,8 @@ def question_table(table: Path = ENTRIES) -> str:
     """Markdown table of medians over test rows from a folder of entries, the best of each line bold."""
     rows, entries = [], read_entries(table).values()
     for question in QUESTIONS:
-        wanted = question.dataset, question.split, question.share, type(question.share)
-        chosen = [entry for entry in entries if (entry.dataset, entry.split, entry.share, type(entry.share)) == wanted]
+        wanted = question.dataset, question.split, rows_in_words(question.share)
+        chosen = [entry for entry in entries if (entry.dataset, entry.split, entry.rows) == wanted]
         chosen = [entry for entry in chosen if entry.seed is not None]
         medians, task = medians_of(question, chosen), chosen[0].of
         best = (max if task.higher_is_better else min)(medians.values())

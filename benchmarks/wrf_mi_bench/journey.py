@@ -5,6 +5,7 @@ held out. The figures are stored, and the picture is drawn from the files that t
 """
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -57,7 +58,8 @@ def main() -> dict[str, Any]:
     """Figures of the journey, and its picture in a checkout."""
     source_folder(MALL)
     place = RUNS / fit_key(source_files())
-    place.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(place, ignore_errors=True)  # of a stopped journey, whose folders the commands would refuse
+    place.mkdir(parents=True)
     printed = travel(place)
     metrics, positions = printed["train"], printed["locate"]
     idw, located = metrics["reference"]["idw"], positions["error_m"]

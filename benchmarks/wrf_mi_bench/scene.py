@@ -23,7 +23,8 @@ from wrf_mi.core.types import IntArray
 from wrf_mi.datasets.newrf import KEYS, read_arrays
 from wrf_mi.scene.coordinates import extra_package
 from wrf_mi.scene.make import make_scene
-from wrf_mi.scene.plan.sources import PlanGrid, Row0, read_layout, read_plan
+from wrf_mi.scene.plan.grid import PlanGrid
+from wrf_mi.scene.plan.sources import Row0, read_layout, read_plan
 from wrf_mi.scene.plan.storey import layout_walls
 from wrf_mi.scene.plan.walls import find_walls
 from wrf_mi.scene.register import best_scale, register_walls, sample_walls

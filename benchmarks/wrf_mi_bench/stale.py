@@ -21,6 +21,7 @@ from .bench import CASES, CHECKS, modules_of
 from .comparison import MEASURED
 from .quick import FILE as QUICK
 from .sources import PACKAGES, SOURCE, by_folder, modules_of_benchmark, modules_of_command, needed_files, source_digests
+from .table_plan import plan
 from .tables import FOLDER
 
 UNKNOWN = "unknown"  # source of a result that states none, outside a git repository
@@ -49,6 +50,7 @@ def stale(out: Path) -> tuple[list[dict[str, Any]], int]:
 
 def results(out: Path) -> Iterator[tuple[Path, dict[str, Any], tuple[str, ...], str]]:
     """Each result's file, content, modules and command; other JSON files are passed over."""
+    planned = {row.name for row in plan()}
     for path in sorted([*out.rglob("*.json"), *(out.parent / FOLDER).glob("*.json")]):
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
@@ -59,7 +61,8 @@ def results(out: Path) -> Iterator[tuple[Path, dict[str, Any], tuple[str, ...], 
             yield path, content, modules_of(name), f"wrf-mi bench {name}"
         elif path.parent == out and name.startswith(Path(QUICK).stem):
             yield path, content, modules_of_benchmark(f"{__package__}.quick"), content["command"]
-        elif folder == FOLDER and (words := str(content.get("command")).split())[1:2] == ["train"]:
+        elif folder == FOLDER and name in planned:
+            words = content["command"].split()
             yield path, content, modules_of_command(words), f"rm {path}; wrf-mi bench tables"
         elif folder in CHECKS:
             yield path, content, modules_of(folder), f"rm {path}; wrf-mi bench {folder}"

@@ -14,7 +14,7 @@ from playwright.sync_api import Browser
 
 import wrf_mi
 from wrf_mi.apps.commands.main import main
-from wrf_mi.apps.table.add import KEPT, add_entry, faults
+from wrf_mi.apps.table.add import KEPT, add_entry, check_table
 from wrf_mi.apps.table.entries import Entry, read_entries, read_entry, write_entry
 from wrf_mi.apps.table.page import BUILDINGS, FEW, QUESTIONS, REGIONS, group_rows, question_of, table_page, verdict
 from wrf_mi.apps.table.sources import FOLDER, read_sources
@@ -90,7 +90,8 @@ def test_a_run_folder_becomes_an_entry_whose_command_has_no_place(table: Path, f
     assert entry.name == "rssi-flat-official-idw-12rows-seed0"
     assert entry.score["median"] == run.metrics["abs_error_db"]["median"]
     assert entry.command == "wrf-mi train flat --model idw --split official --n-train 12 --out RUN"
-    assert list(faults(table)) == []
+    assert main(["table", "add", str(run.folder), "--split", "random", "--table", str(table)]) == 2  # it has its own
+    assert check_table(table).faults == []
 
 
 def test_what_differs_from_the_table_is_found(table: Path, flat: Path, predictions: Path, tmp_path: Path) -> None:
@@ -101,13 +102,14 @@ def test_what_differs_from_the_table_is_found(table: Path, flat: Path, predictio
     # Another split, and a score that its predictions do not have; the data set is found by its folder's name.
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(home)
-        assert list(faults(table)) == []
+        before = check_table(table)
+        assert (before.entries, before.scored, before.absent, before.faults) == (1, 1, [], [])
         stated = source.read_text()
         source.write_text(re.sub(r"(official: )\w+", r"\g<1>0123456789abcdef", stated))
         content = json.loads(path.read_text())
         content["score"]["median"] += 0.01
         path.write_text(json.dumps(content))
-        found = list(faults(table))
+        found = check_table(table).faults
     assert any("split official" in fault and "0123456789abcdef" in fault for fault in found)
     assert any("median" in fault and "its predictions score" in fault for fault in found)
     assert len(found) == 2
@@ -139,6 +141,18 @@ def test_entries_that_cannot_be_read_are_named(tmp_path: Path, change: dict[str,
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match=re.escape(words)):
         read_entries(tmp_path)
+
+
+def test_a_table_that_is_not_there_and_data_that_are_not_here_are_named(
+    table: Path, flat: Path, predictions: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["table", "page", "--out", str(tmp_path / "x.html"), "--table", str(tmp_path / "no")]) == 2
+    assert "no such folder" in capsys.readouterr().err
+    add_entry(table, predictions, str(flat), "mine")
+    assert main(["table", "check", "--table", str(table)]) == 0
+    out = capsys.readouterr().out
+    assert "1 entries, 0 with predictions that were scored again" in out
+    assert "not on this machine, and not checked: flat" in out
 
 
 def made(method: str, median: float, **more: object) -> Entry:
@@ -189,4 +203,4 @@ def test_stored_table_has_nothing_wrong_and_its_page_fits_a_telephone(browser: B
 
 @pytest.mark.slow
 def test_stored_predictions_score_as_their_entries_state() -> None:
-    assert list(faults(CHECKOUT / "benchmarks" / "table")) == []
+    assert check_table(CHECKOUT / "benchmarks" / "table").faults == []

@@ -24,7 +24,7 @@ from wrf_mi.backend.vectors import Float64
 from wrf_mi.core import InputError
 from wrf_mi.core.antenna import ANTENNA
 from wrf_mi.scene.materials import SINGLE_MAX
-from wrf_mi.scene.plan.sources import PlanGrid
+from wrf_mi.scene.plan.grid import PlanGrid
 from wrf_mi.scene.plan.storey import plan_surfaces
 from wrf_mi.tracing import TraceOptions, open_scene, recompute, trace_paths
 from wrf_mi.tracing.paths import result as result_module

@@ -41,8 +41,9 @@ from .mesh.polygon_files import FACES, LONGEST_HEADER, ply_header
 from .mesh.surfaces import Surface, bounds, box_of, main_extent, moved, sampled, with_area
 from .plan.faces import PlanLines
 from .plan.geojson import GEOJSON_SUFFIXES, Extent
+from .plan.grid import PlanGrid
 from .plan.pictures import PICTURE_SUFFIXES, SHEET_SUFFIXES, PlanDrawing
-from .plan.sources import PlanGrid, Row0, plan_pixels, read_layout, read_plan
+from .plan.sources import Row0, plan_pixels, read_layout, read_plan
 from .plan.storey import layout_walls, plan_surfaces
 from .plan.walked import warn_of_places, with_walked_floor
 from .positions import check_positions, in_plan, placed, read_positions, reflections

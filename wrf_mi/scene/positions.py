@@ -25,7 +25,7 @@ from ..core.files import listed
 from ..datasets import load
 from ..datasets.folder_files import read_csv
 from .mesh.surfaces import Surface, box_of, cut_lines, level_area, moved
-from .plan.sources import PlanGrid
+from .plan.grid import PlanGrid
 from .plan.storey import LARGEST_GAP_M
 from .plan.walked import with_walked_floor
 from .register import best_motion, wall_points

@@ -14,7 +14,8 @@ from survey_tables import imported, strengths, written
 
 from wrf_mi import import_measurements
 from wrf_mi.apps.importing.observed import read_observed
-from wrf_mi.scene.plan.sources import PlanGrid, read_plan
+from wrf_mi.scene.plan.grid import PlanGrid
+from wrf_mi.scene.plan.sources import read_plan
 
 pandas = pytest.importorskip("pandas")
 pytest.importorskip("pyproj")

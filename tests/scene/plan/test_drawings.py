@@ -11,8 +11,9 @@ from wrf_mi.core import InputError
 from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.mesh.surfaces import level_area
+from wrf_mi.scene.plan.grid import PlanGrid
 from wrf_mi.scene.plan.pictures import PlanDrawing
-from wrf_mi.scene.plan.sources import PlanGrid, plan_pixels, read_plan
+from wrf_mi.scene.plan.sources import plan_pixels, read_plan
 from wrf_mi.scene.plan.storey import floor_of, layout_walls, plan_surfaces
 from wrf_mi.scene.plan.walls import find_walls
 from wrf_mi.scene.preview import draw_scene

@@ -14,7 +14,8 @@ from wrf_mi.core import InputError
 from wrf_mi.scene.edit import read_surfaces
 from wrf_mi.scene.make import make_scene
 from wrf_mi.scene.mesh.surfaces import level_area
-from wrf_mi.scene.plan.sources import PlanGrid, read_plan
+from wrf_mi.scene.plan.grid import PlanGrid
+from wrf_mi.scene.plan.sources import read_plan
 from wrf_mi.scene.plan.storey import plan_surfaces
 from wrf_mi.scene.plan.walked import FREE, OUTSIDE, UNMAPPED, WALL, cells_at, mapped_part
 

@@ -12,7 +12,7 @@ import trimesh
 from ...core import Record
 from ...core.angles import FloatArray
 from ...scene.mesh.surfaces import bodies
-from ...scene.plan.sources import Mask
+from ...scene.plan.grid import Mask
 from ...scene.positions import TOLERATED_SHARE
 from ...tracing.search.devices import winding_number
 from .scene_findings import Finding

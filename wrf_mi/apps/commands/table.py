@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from ...core import InputError
-from .options import Arguments, add_command, add_n_train, add_replace
+from .options import Arguments, add_command, add_n_train, refuse
 from .output import show
 
 COSTS = {"train-seconds": "time of the fit, s", "ms-per-sample": "time of a prediction of one row, ms"}
@@ -34,26 +35,29 @@ def _add_add(actions: Any) -> None:
     text = "predictions as of `wrf-mi evaluate --predictions`, outputs of NeRF2 and WRF-GS+ among them, or a run folder"
     add("predictions", metavar="PREDICTIONS", help=text)
     add("--dataset", metavar="DATASET", help="data set of the table: a name or a folder; omit it with a run folder")
-    add("--split", default="official", help="split (default: official)")
+    add("--split", help="split (default: official, or that of the run folder)")
     add("--method", metavar="NAME", help="name of the method (default: model of the run folder)")
-    add("--seed", type=int, default=0, metavar="N", help="seed of the split (default: 0)")
+    add("--seed", type=int, metavar="N", help="seed of the split (default: 0, or that of the run folder)")
     add_n_train(parser)
     for name, words in ABOUT.items():
         add(f"--{name}", metavar="TEXT", help=words)
     for name, words in COSTS.items():
         add(f"--{name}", type=float, metavar="X", help=words)
-    add_replace(parser)
+    add("--replace", action="store_true", help="replace the entry of the same method, data, rows and seed")
     _table(parser)
 
 
 def add_entry_command(a: Arguments) -> int:
     """Score predictions, and write an entry of the table."""
+    from ...runs.folder import CONFIG
     from ..table.add import add_entry
     from ..table.entries import read_entry
 
     names = [name.replace("-", "_") for name in (*ABOUT, *COSTS)]
     stated = {name: getattr(a, name) for name in names if getattr(a, name) is not None}
-    rows = {"split": a.split, "n_train": a.n_train, "seed": a.seed, "replace": a.replace}
+    if (Path(a.predictions) / CONFIG).exists():
+        refuse(a, ("split", "n_train", "seed"), "is stated by the run folder")
+    rows = {"split": a.split or "official", "n_train": a.n_train, "seed": a.seed or 0, "replace": a.replace}
     path = add_entry(Path(a.table), a.predictions, a.dataset, a.method, **rows, **stated)
     entry = read_entry(path)
     scores = ", ".join(f"{key} {value:.4g}" for key, value in entry.score.items())
@@ -91,16 +95,14 @@ def _add_check(actions: Any) -> None:
 
 def check_command(a: Arguments) -> int:
     """Check a table; exit status 2 where anything is wrong."""
-    from ..table.add import faults
-    from ..table.entries import read_entries
+    from ..table.add import check_table
 
     table = Path(a.table)
-    if not table.is_dir():
-        raise InputError(f"{table}: no such folder; give that of the entries by --table")
-    if found := list(faults(table)):
-        raise InputError("; ".join(found))
-    count = len(read_entries(table))
-    return show(a.json, {"entries": count}, f"{count} entries: nothing wrong")
+    if (checked := check_table(table)).faults:
+        raise InputError("; ".join(checked.faults))
+    text = f"{checked.entries} entries, {checked.scored} with predictions that were scored again: nothing wrong"
+    text += f"\nnot on this machine, and not checked: {', '.join(checked.absent)}" if checked.absent else ""
+    return show(a.json, asdict(checked), text)
 
 
 def _add_page(actions: Any) -> None:

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator
+from dataclasses import dataclass
 from dataclasses import replace as replace_fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...core import InputError
+from ...core import InputError, Record
 from ...core.array_files import stored_arrays, write_arrays
 from ...core.files import readable, write_atomically
 from ...core.yaml_files import read_yaml
+from ...datasets.registry import KNOWN
 from ...runs.compare_page import command
 from ...runs.folder import CONFIG, PREDICTIONS, RunConfig, is_finished, known_config, stored_versions
 from ...runs.other_models import score_predictions
 from ...runs.results import REMEDY, STD_MEAN, Results, read_run
 from ...runs.sweep import dataset_files
 from ...synthetic import load_record
-from .entries import ALL_ROWS, entry_of, predictions_digest, read_entries, write_entry
+from .entries import ALL, ALL_ROWS, Entry, entry_of, predictions_digest, read_entries, write_entry
 from .sources import faults_of, read_sources, source_of
 
 KEPT, MOST_BYTES = "predictions", 1_000_000
@@ -88,9 +89,12 @@ def add_entry(
         kept = Path(place) / "kept.npz"
         write_arrays(kept, arrays, compressed=True)
         # Where a split holds receivers out, nothing is predicted at the others: no file of another program.
+        stored = _predictions(table, entry.name)
         if kept.stat().st_size <= MOST_BYTES and np.isfinite(arrays["prediction"]).all():
-            (table / KEPT).mkdir(exist_ok=True)
-            write_atomically(table / KEPT / f"{entry.name}.npz", kept.read_bytes())
+            stored.parent.mkdir(exist_ok=True)
+            write_atomically(stored, kept.read_bytes())
+        else:
+            stored.unlink(missing_ok=True)  # of the entry that is replaced
         return write_entry(table, entry)
 
 
@@ -109,33 +113,51 @@ def config_in_table(config: RunConfig, dataset: str) -> RunConfig:
     return replace_fields(config, dataset=dataset, scene=config.scene and Path(config.scene).name)
 
 
-def faults(table: Path) -> Iterator[str]:
-    """What is wrong with a table, in words: unknown data sets, changed splits, and predictions that score otherwise.
+@dataclass(frozen=True)
+class Checked:
+    """What a check of a table found."""
 
-    Data sets that are not on this machine are passed over.
-    """
+    entries: int  # number of entries
+    scored: int  # number of entries whose stored predictions were scored again
+    absent: list[str]  # data sets that are not on this machine, of which nothing was checked
+    faults: list[str]  # unknown data sets, changed splits, and predictions that score otherwise, in words
+
+
+def check_table(table: Path) -> Checked:
+    """Check a table: entries, data sets and splits of this machine, and stored predictions."""
     entries, sources = read_entries(table), read_sources(table)
-    yield from (f"{e.name}: data set {e.dataset} has no file" for e in entries.values() if e.dataset not in sources)
-    records: dict[str, Any] = {}
-    for source in sources.values():
-        try:
-            if not dataset_files(source.name):  # it would be traced for minutes
-                continue
-            records[source.name] = load_record(source.name)
-        except InputError:
-            continue
-        yield from faults_of(source, records[source.name])
-    for name, entry in entries.items():
-        file = table / KEPT / f"{name}.npz"
-        if not file.exists() or entry.dataset not in records:
-            continue
-        with tempfile.TemporaryDirectory() as place:
-            share = None if entry.share == ALL_ROWS and isinstance(entry.share, float) else entry.share
-            where = records[entry.dataset], file, Path(place) / "run", f"{entry.method} again"
-            score_predictions(*where, entry.split, share, entry.seed or 0)
-            again = entry_of(run := read_run(Path(place) / "run"), method="", label="", dataset="", split="", date="")
-            for key, value in entry.score.items():
-                if not np.isclose(again.score[key], value, rtol=SAME, atol=SAME):
-                    yield f"{name}: {key} {value}, its predictions score {again.score[key]}"
-            if predictions_digest(run) != entry.predictions:
-                yield f"{name}: {file} holds other predictions than its entry states"
+    found = [
+        f"{each.name}: data set {each.dataset} has no file" for each in entries.values() if each.dataset not in sources
+    ]
+    # Known data sets that are not here would be traced for minutes, and others have no name of their own.
+    here = {data.name for data in KNOWN} | {name for name in sources if Path(name).exists()}
+    records = {name: load_record(name) for name in sources if name in here and dataset_files(name)}
+    for name, record in records.items():
+        found += faults_of(sources[name], record)
+    stored = [
+        name for name, entry in entries.items() if entry.dataset in records and _predictions(table, name).exists()
+    ]
+    for name in stored:
+        found += _scored_again(table, entries[name], records[entries[name].dataset])
+    return Checked(len(entries), len(stored), sorted(sources.keys() - records.keys()), found)
+
+
+def _predictions(table: Path, name: str) -> Path:
+    return table / KEPT / f"{name}.npz"
+
+
+def _scored_again(table: Path, entry: Entry, record: Record) -> list[str]:
+    """What differs between an entry and the scores of its stored predictions."""
+    with tempfile.TemporaryDirectory() as place:
+        share = None if entry.rows == ALL else entry.share
+        where = record, _predictions(table, entry.name), Path(place) / "run", f"{entry.method} again"
+        again = score_predictions(*where, entry.split, share, entry.seed or 0)
+        scores = {key: again.metrics[entry.of.block][key] for key in entry.score}
+        found = [
+            f"{entry.name}: {key} {value}, its predictions score {scores[key]}"
+            for key, value in entry.score.items()
+            if not np.isclose(scores[key], value, rtol=SAME, atol=SAME)
+        ]
+        if predictions_digest(read_run(again.folder)) != entry.predictions:
+            found.append(f"{entry.name}: other predictions are stored than its entry states")
+        return found

@@ -21,10 +21,21 @@ from ...tasks import TASKS, Task
 from ...tasks.scores import block_bootstrap
 
 QUANTILES = 101  # number of equally spaced quantiles of an entry's scores
-ALL_ROWS = 1.0  # share of the training rows of a split, all of them
+ALL_ROWS, ALL = 1.0, "all rows"  # share of the training rows of a split, all of them, and its words
 COPIED = ("n_train", "n_test", "reference", "train_seconds", "ms_per_sample", "peak_memory_mb")
 STATED = (CONSTANT, CONSTANT_RMSE, "inside_90", "crps")
 """Keys of ``metrics.json`` that an entry copies: always, and where they are there."""
+
+
+def rows_in_words(share: float) -> str:
+    """Number or share of training rows in words.
+
+    >>> rows_in_words(1.0), rows_in_words(1), rows_in_words(0.3)
+    ('all rows', '1 rows', '30 % of the rows')
+    """
+    if isinstance(share, int):
+        return f"{share} rows"
+    return ALL if share == ALL_ROWS else f"{100 * share:.0f} % of the rows"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +86,11 @@ class Entry:
         seed = "seeds" if self.seed is None else f"seed{self.seed}"
         name = "-".join((self.task, self.dataset, self.split, self.method, count, seed))
         return re.sub(r"[^\w.+-]+", "-", name)
+
+    @property
+    def rows(self) -> str:
+        """Training rows in words."""
+        return rows_in_words(self.share)
 
     @property
     def of(self) -> Task:
@@ -135,7 +151,12 @@ def read_entry(path: Path) -> Entry:
 
 
 def read_entries(folder: Path) -> dict[str, Entry]:
-    """Entries of a folder by their names, sorted; `InputError` for a file whose name is not that of its content."""
+    """Entries of a folder by their names, sorted.
+
+    `InputError`: no such folder, or a file whose name is not that of its content.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give that of the entries (--table)")
     entries = {path.stem: read_entry(path) for path in sorted(folder.glob("*.json"))}
     for name, entry in entries.items():
         if name != entry.name:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from ...runs.baselines import CONSTANT
 from ...runs.figures import time_scatter
 from ...runs.page import definitions, document, escaped, picture, sorted_table
 from ...runs.results import reference_words
-from .entries import ALL_ROWS, Entry, read_entries
+from .entries import ALL, Entry, read_entries
 from .sources import Source, read_sources
 
 PUBLISHED = "published.yml"  # file of the figures that papers state, in the folder of the entries
@@ -23,7 +23,7 @@ REGIONS, FEW, RECEIVERS = "Regions without measurements", "Few measurements", "R
 CARRIERS, BUILDINGS = "Carriers without measurements", "Measured buildings, other walks"
 AMONG = "Positions among the measured ones"
 QUESTIONS = (REGIONS, FEW, RECEIVERS, CARRIERS, BUILDINGS, AMONG)
-SIMPLE = frozenset(("constant", "idw", "kriging", "trees", "mri", "linear", "reference"))
+SIMPLE = frozenset(("constant", "idw", "kriging", "trees", "mri", "linear", "carrier", "reference"))
 """Methods without any knowledge of waves, beside which others are shown."""
 COLUMNS = {"method": "method", "rank": "rank", "median": "median", "mean": "mean", "interval": "95 % of the mean"}
 COLUMNS |= {"bias": "bias (dB)", "rmse": "RMSE (dB)", "p10": "p10", "p90": "p90", "inside_90": "inside 90 %"}
@@ -32,7 +32,7 @@ COLUMNS |= {"ms_per_sample": "a row (ms)", "peak_memory_mb": "memory (MB)", "mac
 COLUMNS |= {"code": "code", "licence": "licence", "predictions": "predictions (SHA-256)"}
 TEXTS = frozenset(("method", "interval", "machine", "date", "code", "licence", "predictions"))
 SHOWN_DIGITS = 12  # hexadecimal digits of a digest
-Group = tuple[str, str, float | int]  # data set, split, share of the training rows
+Group = tuple[str, str, str]  # data set, split, training rows in words
 
 
 def question_of(entry: Entry, sources: Mapping[str, Source]) -> str:
@@ -40,7 +40,7 @@ def question_of(entry: Entry, sources: Mapping[str, Source]) -> str:
     by_split = {"blocked": REGIONS, "receiver": RECEIVERS, "frequency": CARRIERS, "frequency-known": CARRIERS}
     if (kind := entry.split.partition(":")[0].partition("+")[0]) in by_split:
         return by_split[kind]
-    if entry.share != ALL_ROWS or isinstance(entry.share, int):
+    if entry.rows != ALL:
         return FEW
     source = sources.get(entry.dataset)
     return BUILDINGS if source is not None and source.building else AMONG
@@ -146,7 +146,7 @@ def table_page(table: Path) -> str:
     questions: dict[str, dict[Group, list[Entry]]] = {question: {} for question in QUESTIONS}
     for entry in entries:
         groups = questions[question_of(entry, sources)]
-        groups.setdefault((entry.dataset, entry.split, entry.share), []).append(entry)
+        groups.setdefault((entry.dataset, entry.split, entry.rows), []).append(entry)
     asked = {question: groups for question, groups in questions.items() if groups}
     links = " · ".join(f'<a href="#q{number}">{escaped(question)}</a>' for number, question in enumerate(asked))
     body = f"""<h1>Radio fields on the same held-out rows</h1>
@@ -164,10 +164,8 @@ Times are of the machine that is named; compare them on equal ones. Entries come
 
 def _question(number: int, question: str, groups: Mapping[Group, Sequence[Entry]]) -> str:
     parts = [f'<h2 id="q{number}">{escaped(question)}</h2>']
-    for (dataset, split, share), entries in sorted(groups.items(), key=lambda item: str(item[0])):
+    for (dataset, split, count), entries in sorted(groups.items()):
         task, rows = entries[0].of, group_rows(entries)
-        rows_of = {int: f"{share} rows", float: f"{100 * share:.0f} % of the rows"}
-        count = "all rows" if (share, type(share)) == (ALL_ROWS, float) else rows_of[type(share)]
         title = f"{dataset}, {split}, {count}: {task.label}"
         better = "higher" if task.higher_is_better else "lower"
         figure = _figure(rows, task.label, better)
@@ -187,7 +185,7 @@ def _published(table: Path) -> str:
     return sorted_table(columns, rows, frozenset())
 
 
-def _data(sources: Sequence[Source] | Any) -> str:
+def _data(sources: Iterable[Source]) -> str:
     facts = {}
     for source in sources:
         rights = "may be passed on" if source.redistributable else "get it from its authors"

@@ -15,10 +15,10 @@ import numpy as np
 import shapely
 
 from ...core import InputError
-from ...core.angles import FloatArray
 from ..material_names import meant
 from ..mesh.outline import triangulated
 from ..mesh.surfaces import Surface, number_names
+from .faces import straight_pieces
 
 logger = logging.getLogger(__name__)
 
@@ -86,14 +86,15 @@ def building_surfaces(buildings: Buildings, height_m: float | None, floor_m: flo
         raise InputError(f"{name}: a building from {base[wrong[0]]:g} m up to {top[wrong[0]]:g} m; correct its height")
     # Common edges once: a wall on each side would be two.
     rings = shapely.union_all(shapely.boundary(outlines), grid_size=EDGE_M / 2)
-    edges = np.concatenate([_pieces(shapely.get_coordinates(line)) for line in shapely.get_parts(rings)])
+    edges = straight_pieces(shapely.get_coordinates(line) for line in shapely.get_parts(rings))
     middles = shapely.points(edges.mean(axis=1))
     edge, owner = shapely.STRtree(shapely.boundary(outlines)).query(middles, predicate="dwithin", distance=EDGE_M)
     edge_top, edge_base = np.full(len(edges), -np.inf), np.full(len(edges), np.inf)
     np.maximum.at(edge_top, edge, top[owner])
     np.minimum.at(edge_base, edge, base[owner])
     highest = np.full(len(edges), -1)
-    highest[edge[np.argsort(top[owner], kind="stable")]] = owner[np.argsort(top[owner], kind="stable")]
+    rising = np.argsort(top[owner], kind="stable")
+    highest[edge[rising]] = owner[rising]
     area = shapely.box(*shapely.total_bounds(outlines)).buffer(GROUND_M, join_style="mitre")
     ground, faces = triangulated(area)
     surfaces = [Surface("floor", "floor", np.insert(ground, 2, floor_m, axis=1), faces)]
@@ -112,10 +113,6 @@ def building_surfaces(buildings: Buildings, height_m: float | None, floor_m: flo
             halves = (4 * np.arange(len(rows))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
             surfaces.append(Surface(wall, "wall", corners, halves, of_wall))
     return surfaces
-
-
-def _pieces(xy: FloatArray) -> FloatArray:
-    return np.stack([xy[:-1], xy[1:]], axis=1)
 
 
 def _without_whole(buildings: Buildings) -> tuple[Any, list[Mapping[str, str]]]:

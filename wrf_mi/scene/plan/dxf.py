@@ -17,7 +17,7 @@ from ...core.angles import FloatArray
 from ...core.files import listed, one_line
 from ..coordinates import LARGEST_M, SMALLEST_M, UNITS_M, extra_package
 from ..material_names import ascii_name, meant
-from .faces import DOOR, GLASS, SAG_M, WALL, PlanLines
+from .faces import DOOR, GLASS, SAG_M, WALL, PlanLines, straight_pieces
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ def read_dxf(path: Path, units: str | None = None, layers: Sequence[str] = ()) -
     lines = {role: [c for layer in names for c in drawn[layer]] for role, names in roles.items()}
     leaves = [circle for curve in lines.get(DOOR, []) if (circle := _circle(curve))]
     _check_unit(path, np.concatenate([curve for role in lines if role != DOOR for curve in lines[role]]), leaves, unit)
-    pieces = {role: _pieces(parts) for role, parts in lines.items() if role != DOOR}
+    pieces = {role: straight_pieces(parts) for role, parts in lines.items() if role != DOOR}
     if closed := _closed_leaves(leaves, pieces):
         pieces[DOOR] = np.array(closed)
     text = "%s: %s; %d of %d doors are closed, and windows are of glass from floor to ceiling"
@@ -137,10 +137,6 @@ def _roles(path: Path, drawn: dict[str, list[FloatArray]], stated: Sequence[str]
         text = f"no layer {', '.join(stated)}" if stated else "no layer is named as one of walls"
         raise InputError(f"{path}: {text}; state those of walls by --layers NAME,NAME, of {listed(names) or 'none'}")
     return roles
-
-
-def _pieces(curves: list[FloatArray]) -> FloatArray:
-    return np.concatenate([np.stack([xy[:-1], xy[1:]], axis=1) for xy in curves])
 
 
 def _check_unit(path: Path, points_m: FloatArray, leaves: Sequence[Leaf], unit: str) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import shapely
@@ -20,6 +21,11 @@ LAYER_M = 0.12  # widest layer of a wall beside two faces, such as its insulatio
 LEAST_PAIRED = 0.5  # least share of the length that has an opposite face in a plan whose walls are drawn by both
 MARGIN_M = 0.02  # distance within which an end of a line touches a wall
 SAG_M = 0.005  # largest distance of a curve from its chords
+
+
+def straight_pieces(curves: Iterable[NDArray[Any]]) -> FloatArray:
+    """Straight pieces [n, 2, 2] of curves through points [k, 2]."""
+    return np.concatenate([np.empty((0, 2, 2)), *(np.stack([xy[:-1], xy[1:]], axis=1) for xy in curves)])
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from ...core.files import readable
 from ..coordinates import LARGEST_M, LATITUDE, LONGITUDE, extra_package, local_projection
 from ..material_names import meant
 from .buildings import Buildings, stated_height
-from .faces import DOOR, WALL, PlanLines
+from .faces import DOOR, WALL, PlanLines, straight_pieces
 from .osm import Feature, osm_elements, osm_features
 
 logger = logging.getLogger(__name__)
@@ -156,7 +156,7 @@ def _straight(lines: Any) -> FloatArray:
     """Straight pieces [n, 2, 2] of lines."""
     parts = shapely.get_parts(shapely.get_parts(lines))
     corners = [shapely.get_coordinates(part) for part in parts if part.geom_type in ("LineString", "LinearRing")]
-    return np.concatenate([np.empty((0, 2, 2)), *(np.stack([xy[:-1], xy[1:]], axis=1) for xy in corners)])
+    return straight_pieces(corners)
 
 
 def _in_metres(path: Path, outlines: Any, extent_m: Extent | None, largest_m: float = LARGEST_M) -> Any:

@@ -16,7 +16,7 @@ from skimage.transform import hough_line
 from ...core.angles import FloatArray
 from ..mesh.outline import large_parts
 from .faces import THICKEST_WALL_M
-from .sources import Mask, PlanGrid
+from .grid import Mask, PlanGrid
 
 HALF_WIDTH_M = 0.1  # largest distance of cells that support a line: half the width of a blurred wall
 CLEARED_M = 0.2

@@ -8,24 +8,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.array_files import stored_arrays
 from ...core.files import inside, listed, one_line, text_lines
-from ...core.types import IntArray
 from ...datasets.folder_files import read_columns
 from .buildings import Buildings
 from .dxf import read_dxf
 from .faces import THICKEST_WALL_M, PlanLines
 from .geojson import GEOJSON_SUFFIXES, Extent, read_geojson
+from .grid import PlanGrid, without_thin_lines
 from .pictures import (
     DARK,
     FREE_PROBABILITY,
@@ -43,54 +42,15 @@ from .pictures import (
 
 logger = logging.getLogger(__name__)
 
-Mask = NDArray[np.bool_]
 Row0 = Literal["top", "bottom"]
 """Side of a plan where the first row of a grid lies: top is the largest y, bottom the smallest."""
 
 NUMBERS = ("log_odds", "resolution_m", "origin_m", "xy_m")  # arrays of numbers in an NPZ file
 POINT_CELL_M = 0.05  # side of the cells that points are counted in, as usual for maps of indoor robots
 LARGEST_GRID_CELLS = 4_000_000  # 100 m x 100 m in cells of 5 cm; more is a mistake of units or a stray point far away
-THINNEST_WALL_M = 0.05  # thinner lines of a drawing are door leaves, dimensions and letters
 PLANS = ".npz, .png, .pgm, .jpg, .yaml, .csv, .xyz, .geojson, .osm or .dxf"
-SMALLEST_PART_M = 0.8  # smaller parts that touch no others are letters, symbols and pillars
 LARGEST_PICTURE = 4 * LARGEST_GRID_CELLS
 """Most cells of an occupancy grid that is stated as such: the walls of more take hours to find."""
-
-
-@dataclass(frozen=True)
-class PlanGrid:
-    """A plan in square cells; cell (row, column) has its centre at origin + resolution (column + 1/2, row + 1/2).
-
-    Attributes:
-        occupied: cells where something stands, shape [rows, columns].
-        free: cells seen empty, same shape; without any, openings and hidden places are unknown.
-        resolution_m: side of a cell.
-        origin_m: lower left corner, shape [2].
-        yaw_rad: angle by which the map is turned about (0, 0) in the frame of its file.
-    """
-
-    occupied: Mask
-    free: Mask
-    resolution_m: float
-    origin_m: FloatArray
-    yaw_rad: float = 0.0
-
-    @property
-    def unmapped(self) -> Mask:
-        """Cells of which it is not known what is there [rows, columns]."""
-        return ~(self.occupied | self.free)
-
-    def cell_indices(self, xy_m: FloatArray) -> tuple[tuple[IntArray, IntArray], Mask]:
-        """Row and column [...] of the cells of points [..., 2], and whether they lie in the grid; (0, 0) outside it."""
-        column, row = np.moveaxis(np.floor((xy_m - self.origin_m) / self.resolution_m).astype(int), -1, 0)
-        rows, columns = self.occupied.shape
-        within = np.asarray((row >= 0) & (row < rows) & (column >= 0) & (column < columns))
-        return (np.where(within, row, 0), np.where(within, column, 0)), within
-
-    def centres_m(self, mask: Mask) -> FloatArray:
-        """Centres [n, 2] of the cells of a mask."""
-        row, column = np.nonzero(mask)
-        return self.origin_m + self.resolution_m * (np.stack([column, row], axis=-1) + 0.5)
 
 
 def grid_from_probability(
@@ -166,7 +126,8 @@ def read_plan(
     - ``.png``, ``.pgm``, ``.jpg``: a picture, dark where occupied, transparent pixels on white, with or without the
       ``.yaml`` of a ROS map beside it, which may be given in its place (`wrf_mi.scene.plan.pictures.read_sheet`).
       Without a YAML, and with other greys than those of map_saver, lines thinner than
-      `THINNEST_WALL_M` are not walls (`without_thin_lines`), and a picture with colours has no unmapped cells.
+      `wrf_mi.scene.plan.grid.THINNEST_WALL_M` are not walls (`without_thin_lines`), and a picture with colours has
+      no unmapped cells.
     - ``.csv`` with the header ``x,y``: wall vertices (`read_layout`).
     - ``.geojson``, ``.json``, ``.osm``: outlines of rooms or buildings in longitude and latitude, and data of
       OpenStreetMap (`wrf_mi.scene.plan.geojson.read_geojson`).
@@ -355,54 +316,6 @@ def _read_picture(path: Path, resolution_m: float | None) -> PlanGrid:
         text += "or state a lower occupied_thresh in the YAML of a ROS map beside it"
         logger.warning(text, path, 100 * grid.occupied.mean(), level)
     return without_thin_lines(grid, str(path))
-
-
-def without_thin_lines(grid: PlanGrid, name: str = "plan") -> PlanGrid:
-    """A drawing without lines thinner than `THINNEST_WALL_M`, whose cells are free; how many is logged.
-
-    So are parts smaller than `SMALLEST_PART_M` that touch no others, such as letters. Where less than half remains,
-    walls are drawn as lines: narrow spaces between two of them are filled, as both are faces of a wall, and a drawing
-    of which less than half remains even so is returned as it is.
-    """
-    lines = _thin_lines(grid)
-    if not lines.any():
-        return grid
-    share = lines.sum() / grid.occupied.sum()
-    if share > 0.5:
-        filled = replace(grid, occupied=grid.occupied | _between_faces(grid))
-        lines = _thin_lines(filled)
-        if lines.sum() <= 0.5 * filled.occupied.sum():
-            text = "%s: walls are drawn by both faces; other lines are not walls (door leaves, furniture, dimensions)"
-            logger.warning(text, name)
-            return replace(filled, occupied=filled.occupied & ~lines, free=filled.free | lines)
-        logger.warning("%s: walls are drawn as lines thinner than %g m, so every line is a wall", name, THINNEST_WALL_M)
-        return grid
-    text = "%s: lines thinner than %g m, %.2g %% of the dark cells, are not walls (door leaves, dimensions, letters)"
-    logger.warning(f"{text}; draw those thicker that are", name, THINNEST_WALL_M, 100 * share)
-    return replace(grid, occupied=grid.occupied & ~lines, free=grid.free | lines)
-
-
-def _thin_lines(grid: PlanGrid) -> Mask:
-    """Dark cells of lines thinner than `THINNEST_WALL_M`, and of small parts that touch no others."""
-    # A disk, so that walls of any direction remain; of even diameter, too, hence the half cells.
-    cells = max(1, int(np.ceil(THINNEST_WALL_M / grid.resolution_m - 1e-6)))
-    offset = np.arange(cells) - (cells - 1) / 2
-    disk = np.hypot(offset[:, None], offset) <= cells / 2
-    thick = ndimage.binary_opening(grid.occupied, disk)
-    parts, _ = ndimage.label(thick, np.ones((3, 3)))
-    boxes = ndimage.find_objects(parts)
-    sides_m = np.array([[0.0, 0.0], *([(axis.stop - axis.start) for axis in box] for box in boxes)]) * grid.resolution_m
-    if (sides_m.max(axis=1) >= SMALLEST_PART_M).any():
-        thick &= (sides_m.max(axis=1) >= SMALLEST_PART_M)[parts]
-    return np.asarray(grid.occupied & ~ndimage.binary_dilation(thick, np.ones((3, 3))))
-
-
-def _between_faces(grid: PlanGrid) -> Mask:
-    """Cells of spaces that lines enclose and that are nowhere wider than a wall."""
-    spaces, count = ndimage.label(~grid.occupied)
-    half_m = ndimage.distance_transform_edt(~grid.occupied) * grid.resolution_m
-    widest_m = ndimage.maximum(half_m, spaces, np.arange(count + 1))
-    return np.asarray((2 * widest_m <= THICKEST_WALL_M)[spaces] & ~grid.occupied)
 
 
 def _read_text(path: Path) -> FloatArray:

@@ -14,9 +14,9 @@ from ...core.angles import FloatArray
 from ..mesh.outline import merged, opened, triangulated
 from ..mesh.surfaces import Kind, Surface, number_names
 from .buildings import Buildings, building_surfaces
-from .faces import DOOR, GLASS, SAG_M, THICKEST_WALL_M, WALL, PlanLines, middle_lines, without_openings
+from .faces import DOOR, GLASS, SAG_M, THICKEST_WALL_M, WALL, PlanLines, middle_lines, straight_pieces, without_openings
+from .grid import PlanGrid
 from .lines import HALF_WIDTH_M
-from .sources import PlanGrid
 from .walked import NARROWEST_ROOM_M, mapped_part
 from .walls import REACH_M, find_walls, joined, met
 
@@ -35,8 +35,7 @@ STRAIGHT_M = 0.05  # largest deviation of vertices of such outlines from a strai
 
 def layout_walls(vertices_m: FloatArray) -> FloatArray:
     """Straight walls of a path of vertices [n, 2] that may double back and cross: end points [m, 2, 2]."""
-    pieces = np.stack([vertices_m[:-1], vertices_m[1:]], axis=1)
-    return merged_walls(pieces)
+    return merged_walls(straight_pieces([vertices_m]))
 
 
 def merged_walls(pieces_m: FloatArray, grid_m: float | None = None, tolerance_m: float = 1e-6) -> FloatArray:
@@ -51,7 +50,7 @@ def merged_walls(pieces_m: FloatArray, grid_m: float | None = None, tolerance_m:
     # The union cuts at crossings and keeps doubled stretches once; merging undoes needless cuts.
     lines = shapely.line_merge(shapely.union_all(shapely.linestrings(pieces), grid_size=grid_m))
     paths = [shapely.get_coordinates(shapely.simplify(line, tolerance_m)) for line in shapely.get_parts(lines)]
-    return np.concatenate([np.stack([xy[:-1], xy[1:]], axis=1) for xy in paths])
+    return straight_pieces(paths)
 
 
 def floor_of(walls_m: FloatArray) -> BaseGeometry:

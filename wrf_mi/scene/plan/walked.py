@@ -16,8 +16,8 @@ from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..mesh.outline import boxes, large_parts, merged, opened, polygons, triangulated
 from ..mesh.surfaces import Surface, level_area
+from .grid import PlanGrid
 from .lines import SMALLEST_ROOM_M2
-from .sources import PlanGrid
 from .walls import FURNITURE_DEPTH_M
 
 logger = logging.getLogger(__name__)

@@ -20,8 +20,8 @@ from scipy.sparse.csgraph import connected_components
 
 from ...core import InputError
 from ...core.angles import FloatArray
+from .grid import Mask, PlanGrid
 from .lines import CLEARED_M, HALF_WIDTH_M, WallRun, dominant_direction, find_runs, rotation_2d, turned, without_specks
-from .sources import Mask, PlanGrid
 
 REACH_M = 0.35  # largest way of an end to meet another wall: the blur of a map cuts corners, a door (0.6 m) stays open
 SHORTEST_LOOSE_M = 0.8  # a shorter piece has to meet other walls at both ends: legs of tables and chairs do not
