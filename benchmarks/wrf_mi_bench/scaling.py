@@ -4,32 +4,38 @@ import gc
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sionna.rt
 from threadpoolctl import threadpool_limits
 from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.estimators.interpolation.strengths import fit_strengths
+from wrf_mi.estimators.model import Inputs
 from wrf_mi.gaussians import FIELDS
 from wrf_mi.gaussians.parameters import gaussians_in_parts
 from wrf_mi.graph.graph import Graph
 from wrf_mi.receivers import antenna_csi, bartlett_spectrum
+from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.receivers.registry import PIXEL, ObservationSpec
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tasks.scores import Interval
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.tracing.search.surfaces import scene_surfaces
+from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.fields import make_field
 from wrf_mi.training.predictor import Predictor
 
 from .comparison import line, opened
 from .timing import Call, exponent, interleaved, larger_half, memory_mb, n_log_n
-from .workloads import HEIGHT, WIDTH, field, integrator, parameters, size_deg, splatting, tracer
+from .workloads import HEIGHT, WIDTH, field, integrator, parameters, size_deg, splatting, strengths, tracer
 
 logger = logging.getLogger(__name__)
 
@@ -126,6 +132,38 @@ def _planes(kind: str, triangles: int) -> Call:
     return lambda: len(scene_surfaces(scene).normal)
 
 
+def _fit(rows: int = 200, receivers: int = 4) -> Call:
+    """Kriging of signal strengths with calibrated intervals."""
+    record = strengths(rows, receivers)
+    return lambda: fit_strengths(record, np.arange(rows)).widen
+
+
+def _map(points: int) -> Call:
+    """Means and standard deviations of a receiver's strengths, kriged from 200 rows."""
+    fitted = fit_strengths(strengths(200, 4), np.arange(200))
+    inputs = Inputs(strengths(points, 1).tx_pos_m)
+    return lambda: fitted.predict(inputs, 0).stated_std
+
+
+def _carriers(carriers: int) -> Call:
+    """Channels of transmitters by traced paths whose materials depend on the carrier."""
+    instrument = Instrument("csi", (RECEIVER,), FREQUENCY_HZ * np.linspace(0.9, 1.1, carriers + 1)[1:])
+    return partial(RayTracer("laboratory", instrument, OPTIONS), transmitter_path(16))
+
+
+def _city(triangles: int) -> Call:
+    """One transmitter in the middle of a city, 70 m from a receiver on a roof or mast."""
+    scene = open_scene(Path(str(getattr(sionna.rt.scene, CITIES[triangles]))), CITY_HZ)
+    middle_m = scene_surfaces(scene).centre_m
+    tx_m, mast = middle_m + np.array([60, 30, 0]), replace(RECEIVER, position_m=middle_m + np.array([0, 0, 20]))
+    return lambda: len(trace_paths(scene, tx_m, mast, OPTIONS).paths)
+
+
+CITY_HZ = 3.5e9
+CITIES = {13_098: "etoile", 38_936: "munich", 268_041: "san_francisco"}
+"""Cities of Sionna RT by their numbers of triangles."""
+ROWS, RECEIVERS, POINTS = (10, 100, 1000, 3000, 10_000), (1, 10, 100, 1000), (10**3, 10**4, 10**5, 10**6)
+CARRIERS = (1, 4, 16, 64)
 TENS, HALF_TENS = (10**3, 10**4, 10**5, 300_000, 10**6), (1000, 3000, 10_000, 30_000, 100_000)
 DIRECTIONS = tuple(HEIGHT * WIDTH * k for k in (1, 4, 9, 16))
 ANTENNAS, TRANSMITTERS = (16, 64, 256, 1024), (1, 16, 256, 4096)
@@ -144,6 +182,11 @@ AXES: list[Axis] = [
     Axis("triangles-planes", "finding planes, divided walls", "triangles", TRIANGLES, partial(_planes, "walls")),
     Axis("triangles-walls", "one trace, divided walls", "triangles", TRIANGLES, partial(_trace, "walls")),
     Axis("triangles-clutter", "one trace, clutter", "triangles", TRIANGLES, partial(_trace, "clutter")),
+    Axis("triangles-cities", "one trace, cities", "triangles", tuple(CITIES), _city),
+    Axis("rows-strengths", "kriging of 4 receivers", "rows", ROWS, _fit),
+    Axis("receivers-strengths", "kriging of 200 rows", "receivers", RECEIVERS, partial(_fit, 200)),
+    Axis("points-map", "map of a receiver", "points", POINTS, _map),
+    Axis("carriers-tracer", "ray tracer", "carriers", CARRIERS, _carriers),
 ]
 """All axes. Networks and integrator end at 1e5 Gaussians, as ten times as many take gigabytes."""
 

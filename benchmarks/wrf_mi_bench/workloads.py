@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wrf_mi.backend.device import to_float
-from wrf_mi.core import Record
+from wrf_mi.core import Receiver, Record
+from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.gaussians import random_gaussians
 from wrf_mi.gaussians.blend import splat
@@ -71,6 +72,17 @@ def tracer(options: TraceOptions) -> RayTracer:
     receivers = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),)
     instrument = Instrument("array", receivers, np.array([FREQUENCY_HZ]), size=(HEIGHT, WIDTH))
     return RayTracer("laboratory", instrument, options)
+
+
+def strengths(rows: int, receivers: int) -> Record:
+    """Signal strengths in a square of 40 m with shadowing that is smooth over metres."""
+    rng = np.random.default_rng(0)
+    tx_m, rx_m = (rng.uniform((0, 0, 1), (40, 40, 2), (count, 3)) for count in (rows, receivers))
+    waves, phases = rng.normal(0, 0.4, (receivers, 12, 2)), rng.uniform(0, 2 * np.pi, (receivers, 12, 1))
+    power_dbm = 2 * np.cos(waves @ tx_m[:, :2].T + phases).sum(axis=1) + rng.normal(0, 2, (receivers, rows))
+    power_dbm -= 40 + 20 * np.log10(np.linalg.norm(tx_m - rx_m[:, None], axis=2))
+    places = tuple(Receiver(f"r{k}", place, np.array(UPRIGHT)) for k, place in enumerate(rx_m))
+    return Record("walk", "rssi", tx_m, places, power_dbm.astype(np.float32), frequencies_hz=np.array([2.44e9]))
 
 
 def record(rows: int, **more: Any) -> Record:

@@ -242,6 +242,19 @@ def test_fine_and_coarse_walls_give_the_same_paths(shoebox_xml, tmp_path):
     np.testing.assert_allclose(found[1].gain, found[0].gain, atol=1e-5 * np.abs(found[0].gain).max())
 
 
+def test_planes_are_found_once_until_an_object_moves(shoebox_xml):
+    scene = open_scene(shoebox_xml, FREQUENCY_HZ)
+    before = scene_surfaces(scene)
+    assert scene_surfaces(scene) is before
+    name = before.names[0]
+    scene.objects[name].position = np.asarray(scene.objects[name].position).ravel() + [0, 0, 0.5]
+    after, own = scene_surfaces(scene), before.object_of(np.arange(len(before.triangles))) == 0
+    np.testing.assert_allclose(
+        after.triangles[own] - before.triangles[own], np.broadcast_to([0, 0, 0.5], (own.sum(), 3, 3)), atol=1e-6
+    )
+    np.testing.assert_array_equal(after.triangles[~own], before.triangles[~own])
+
+
 BRICK = '<bsdf type="diffuse" id="mat-itu_brick"/>'
 SOAK = '<bsdf type="absorber-radio-material" id="mat-soak"><rgb name="color" value="0.1 0.2 0.3"/></bsdf>'
 OPTIONS = TraceOptions(depth=2, transmission=True)

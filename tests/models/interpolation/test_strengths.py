@@ -13,7 +13,7 @@ from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.estimators.interpolation import strengths
 from wrf_mi.estimators.interpolation.pooled_process import Basis, PooledProcess, ReceiverObservations
-from wrf_mi.estimators.interpolation.strength_fit import folds, widening
+from wrf_mi.estimators.interpolation.strength_fit import folds, held_out, widening
 from wrf_mi.estimators.interpolation.strength_settings import StrengthSettings
 from wrf_mi.estimators.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
 from wrf_mi.estimators.interpolation.strengths import Strengths, fit_strengths
@@ -100,6 +100,37 @@ def test_posterior_and_likelihood_equal_those_of_one_dense_covariance_matrix() -
         np.testing.assert_allclose(mean, cross @ np.linalg.solve(dense, y), rtol=1e-6)
         np.testing.assert_allclose(variance, own - (cross @ np.linalg.solve(dense, cross.T)).diagonal(), rtol=1e-6)
         assert process.cost == pytest.approx(y @ np.linalg.solve(dense, y) + np.linalg.slogdet(dense)[1], rel=1e-6)
+        # Without two and one of the observations, and without all of the second receiver.
+        folds = [[np.array([0, 2]), np.array([1])], [np.array([], int), np.arange(5)]]
+        for fold, found in zip(folds, process.without(folds), strict=True):
+            left = np.concatenate([fold[0], 7 + fold[1]])
+            known = np.setdiff1d(np.arange(12), left)
+            gain = dense[np.ix_(left, known)] @ np.linalg.inv(dense[np.ix_(known, known)])
+            np.testing.assert_allclose(np.concatenate(found.mean), gain @ y[known], rtol=1e-6)
+            unknown = (dense[np.ix_(left, left)] - gain @ dense[np.ix_(known, left)]).diagonal()
+            unknown = unknown - np.concatenate(noise)[left]
+            np.testing.assert_allclose(np.concatenate(found.variance), unknown, rtol=1e-6)
+
+
+@pytest.mark.parametrize("trees", [0, 10])
+def test_rows_of_a_fold_are_predicted_as_by_a_fit_without_it(trees: int) -> None:
+    record = made(90, noise_db=1.0)
+    fitted = fit_strengths(record, np.arange(90), settings=replace(DEFAULTS, shadowing="trees" if trees else None))
+    plain = replace(fitted.field, rounds=0, trees=trees)
+    measured = Measured(plain.stops.poses, plain.stops.value_dbm, np.arange(len(plain.stops.poses)))
+    mean, std = held_out(plain, measured, np.arange(len(measured.rows)), trees=trees)
+    assert np.isfinite(mean).all()
+    train, out = next(iter(folds(measured.poses.position_m)))
+    stops = replace(
+        plain.stops,
+        poses=measured.poses.take(train),
+        **{name: getattr(plain.stops, name)[..., train] for name in ("value_dbm", "count", "row")},
+    )
+    without = replace(plain, stops=stops, forest=None)
+    for receiver in range(3):
+        ((value, variance),) = without.predict([measured.poses.take(out)], receiver)
+        np.testing.assert_allclose(mean[receiver, out], value, rtol=1e-6)
+        np.testing.assert_allclose(std[receiver, out], np.sqrt(variance + plain.noise), rtol=1e-6)
 
 
 def test_reweighting_is_robust_to_outliers() -> None:

@@ -20,10 +20,10 @@ unique neighborhood" (1983) (rows left out).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,6 +59,16 @@ def correlation(a: FloatArray, b: FloatArray, kernel: str = "exponential") -> Fl
     return KERNELS[kernel](cdist(a, b))
 
 
+class Block(NamedTuple):
+    """What the other rows of a `KrigingSystem` tell of the m rows of a block."""
+
+    error: Values  # observations less their prediction without a trend [m]
+    gap: Values  # the same of the columns of the trend [m, p]
+    variance: FloatArray  # variance of an observation, noise included, about its prediction at a known trend [m]
+    information: Values  # what the trend's `KrigingSystem.information` loses without the block [p, p]
+    projected: Values  # what `KrigingSystem.projected` loses without it [p]
+
+
 class KrigingSystem:
     """Covariance of n rows, factored, with the columns of a trend.
 
@@ -85,6 +95,13 @@ class KrigingSystem:
     def solve(self, values: Values) -> Values:
         """K^-1 v of columns v [n, q] or one [n]."""
         return np.asarray(cho_solve((self._lower, True), values, check_finite=False))
+
+    @property
+    def inverse_diagonal(self) -> FloatArray:
+        """Diagonal of K^-1 [n]."""
+        (trtri,) = get_lapack_funcs(("trtri",), (self._lower,))
+        half, _ = trtri(self._lower, lower=True)  # a third of the operations of solving for the unit matrix
+        return np.asarray(np.einsum("ij,ij->j", half, half.conj()).real)
 
     @property
     def log_determinant(self) -> float:
@@ -148,13 +165,33 @@ class KrigingSystem:
     @property
     def precision(self) -> Values:
         """K^-1 - K^-1 B (B^T K^-1 B)^-1 B^T K^-1, [n, n]: inverse covariance of contrasts free of the trend."""
-        (potri,) = get_lapack_funcs(("potri",), (self._lower,))
-        half, _ = potri(self._lower, lower=True)  # a third of the operations of solving for the unit matrix
+        half = self._half_inverse()
         inverse: Values = np.tril(half) + np.tril(half, -1).conj().T
         if not self.trend.shape[1]:
             return inverse
         columns = inverse @ self.trend
         return np.asarray(inverse - columns @ np.linalg.solve(self.information, columns.conj().T))
+
+    def _half_inverse(self) -> Values:
+        """Lower triangle of K^-1 [n, n]; the rest is of no meaning."""
+        (potri,) = get_lapack_funcs(("potri",), (self._lower,))
+        half, _ = potri(self._lower, lower=True)  # a third of the operations of solving for the unit matrix
+        return np.asarray(half)
+
+    def without(self, blocks: Sequence[IntArray], values: Values) -> list[Block]:
+        """Prediction of observations [n] of each block of rows, ascending, by all rows but these.
+
+        It takes no further factor of n rows: a block of K^-1 is the inverse of the covariance of its rows given all
+        others, and so its inverse times K^-1 y is what these others leave of the block's observations (Dubrule, 1983).
+        """
+        half, trend, solved = self._half_inverse(), self.solve(self.trend), self.solve(values)
+        found = []
+        for rows in blocks:
+            system = KrigingSystem(half[np.ix_(rows, rows)])
+            error, gap = system.solve(solved[rows]), system.solve(trend[rows])
+            lost = trend[rows].T @ gap, trend[rows].T @ error
+            found.append(Block(error, gap, system.inverse_diagonal, *lost))
+        return found
 
     def restricted_cost(self, root: FloatArray, least: float) -> float:
         """Minus twice the logarithm of the restricted likelihood of one component, the field's variance at its best.

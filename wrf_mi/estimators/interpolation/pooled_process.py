@@ -23,7 +23,7 @@ import numpy as np
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ...parallel.threads import on_threads, one_blas_thread
-from .kriging_equations import KrigingSystem
+from .kriging_equations import Block, KrigingSystem
 
 Result = TypeVar("Result")
 Kernel = Callable[[Any, Any], FloatArray]
@@ -58,6 +58,14 @@ class ReceiverObservations:
     basis: Basis
     value: FloatArray
     variance: FloatArray
+
+
+class LeftOut(NamedTuple):
+    """Posterior without a fold: beta [k]; and mean and variance of phi . beta + f at the fold's observations [m]."""
+
+    beta: FloatArray
+    mean: list[FloatArray]  # of each receiver
+    variance: list[FloatArray]  # of each receiver
 
 
 class PooledProcess:
@@ -100,12 +108,12 @@ class PooledProcess:
         self._systems = of_each(system, parts, sum(len(p.value) for p in parts))
         triples = [(system, part.basis.used, part.value) for system, part in zip(self._systems, parts, strict=True)]
         # Receivers are independent given beta: their information adds up to the prior's (equation 2.41).
-        self._information, projected = np.diag(1 / np.square(self._prior_sd)), np.zeros(len(self._prior_sd))
+        self._information, self._projected = np.diag(1 / np.square(self._prior_sd)), np.zeros(len(self._prior_sd))
         for each, used, value in triples:
             self._information[np.ix_(used, used)] += each.information
-            projected[used] += each.projected(value)
+            self._projected[used] += each.projected(value)
         vars(self).pop("covariance", None)
-        self.beta = np.linalg.solve(self._information, projected)
+        self.beta = np.linalg.solve(self._information, self._projected)
         self._weights = [each.weights(value, self.beta[used]) for each, used, value in triples]
 
     @cached_property
@@ -130,6 +138,35 @@ class PooledProcess:
         covariance = self.covariance[np.ix_(basis.used, basis.used)]
         return mean, self._systems[receiver].variance(self._point_variance, cross, basis.columns, covariance)
 
+    def without(self, folds: Sequence[Sequence[IntArray]]) -> list[LeftOut]:
+        """Posteriors without the observations of each fold, by the factors and the noise of all.
+
+        A fold has numbers of the observations of each receiver, ascending.
+        """
+
+        def blocks(receiver: int) -> list[Block]:
+            rows = [fold[receiver] for fold in folds]
+            return self._systems[receiver].without(rows, self._parts[receiver].value)
+
+        numbers = range(len(self._parts))
+        of_receivers = of_each(blocks, numbers, sum(len(part.value) for part in self._parts))
+        found = []
+        for fold, of_fold in zip(folds, zip(*of_receivers, strict=True), strict=True):
+            information, projected = self._information.copy(), self._projected.copy()
+            for part, block in zip(self._parts, of_fold, strict=True):
+                information[np.ix_(part.basis.used, part.basis.used)] -= block.information
+                projected[part.basis.used] -= block.projected
+            covariance = np.linalg.inv(information)
+            beta, means, variances = covariance @ projected, list[FloatArray](), list[FloatArray]()
+            for part, rows, block in zip(self._parts, fold, of_fold, strict=True):
+                used = part.basis.used
+                means.append(part.value[rows] - block.error + block.gap @ beta[used])
+                field = np.maximum(block.variance - part.variance[rows], 0)  # rounding may take it below zero
+                trend = np.einsum("mp,mp->m", block.gap @ covariance[np.ix_(used, used)], block.gap)
+                variances.append(field + trend)
+            found.append(LeftOut(beta, means, variances))
+        return found
+
     def trend(self, basis: Basis) -> FloatArray:
         """Posterior mean [m] of phi . beta."""
         return np.asarray(basis.columns @ self.beta[basis.used])
@@ -138,10 +175,10 @@ class PooledProcess:
         """Inputs of a receiver's observations, and weights [n] of the field's covariances with them in a mean."""
         return self._inputs.take(self._parts[receiver].rows), self._weights[receiver]
 
-    def residual(self, receiver: int) -> tuple[IntArray, FloatArray]:
-        """Numbers of the inputs of a receiver's observations [n], and what phi . beta leaves of these [n]."""
-        part = self._parts[receiver]
-        return part.rows, part.value - self.trend(part.basis)
+    def residuals(self, beta: FloatArray | None = None) -> list[tuple[IntArray, FloatArray]]:
+        """Of each receiver the numbers of its inputs [n], and what phi . beta leaves; ``beta``: that of all rows."""
+        chosen = self.beta if beta is None else beta
+        return [(part.rows, part.value - part.basis.columns @ chosen[part.basis.used]) for part in self._parts]
 
     def _reweighted(self, variance: Sequence[FloatArray]) -> list[ReceiverObservations]:
         """Parts with the noise variances that their residuals imply for Student-t noise.
@@ -154,9 +191,8 @@ class PooledProcess:
             part, system, weights = self._parts[receiver], self._systems[receiver], self._weights[receiver]
             scale = variance[receiver]
             # y - f = V K^-1 (y - B beta); the field's posterior variance is the diagonal of V - V K^-1 V.
-            precision = np.square(system.whiten(np.eye(len(part.value)))).sum(axis=0)
             residual = part.variance * weights
-            square = residual**2 + np.maximum(part.variance - part.variance**2 * precision, 0)
+            square = residual**2 + np.maximum(part.variance - part.variance**2 * system.inverse_diagonal, 0)
             return replace(part, variance=scale * (DEGREES + square / scale) / (DEGREES + 1))
 
         return of_each(reweighted, range(len(variance)), sum(len(scale) for scale in variance))

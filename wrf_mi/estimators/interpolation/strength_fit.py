@@ -6,11 +6,13 @@ The processes of the receivers are those of `wrf_mi.estimators.interpolation.poo
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
@@ -97,7 +99,7 @@ class StrengthPosterior:
         self._spread = self.spread or self.hyperparameters
         self._process = self._process_of(self.hyperparameters)
         if self.trees and self.forest is None:
-            self.forest = Forest.grown(self._process, self.stops.poses, len(self.prior.receivers_m), self.trees)
+            self.forest = Forest.grown(self._process.residuals(), self.stops.poses, self.trees)
 
     @cached_property
     def _moved(self) -> Poses:
@@ -127,6 +129,13 @@ class StrengthPosterior:
     def _spread_process(self) -> PooledProcess:
         return self._process if self._spread == self.hyperparameters else self._process_of(self._spread)
 
+    def with_spread(self, spread: Hyperparameters | None) -> StrengthPosterior:
+        """The posterior of the same means with the deviations of other hyperparameters."""
+        other = copy(self)
+        other.spread, other._spread = spread, spread or self.hyperparameters
+        vars(other).pop("_spread_process", None)
+        return other
+
     def cost(self, prior: PriorMean, h: Hyperparameters) -> float:
         """Minus twice the logarithm of the marginal likelihood of the stops, up to a constant.
 
@@ -153,6 +162,33 @@ class StrengthPosterior:
         spread = self._spread_process
         _ = spread.covariance  # computed here, not on threads
         return of_each(posterior, range(len(poses)), sum(map(len, poses)))
+
+    def without(self, left: Sequence[NDArray[np.bool_]], trees: int = 0) -> list[tuple[FloatArray, FloatArray]]:
+        """Mean in dBm and variance of the local mean power, [n_rx, s] each, without stops, where these are; else NaN.
+
+        ``left`` are masks [n_rx, s] of the stops that a fold leaves out, ``trees`` the number of trees of each fold.
+        """
+        received = [terms[0] for terms in self._terms]
+        blocks = [[np.flatnonzero(mask[k, rows]) for k, rows in enumerate(received)] for mask in left]
+        folds = self._process.without(blocks)
+        spread = folds if self._spread_process is self._process else self._spread_process.without(blocks)
+        found = []
+        for mask, block, means, variances in zip(left, blocks, folds, spread, strict=True):
+            mean, variance = np.full((2, *mask.shape), np.nan)
+            residuals = self._process.residuals(means.beta)
+            known = [(rows[~mask[k, rows]], value[~mask[k, rows]]) for k, (rows, value) in enumerate(residuals)]
+            forest = Forest.grown(known, self.stops.poses, trees) if self.trees else None
+            for k, rows in enumerate(received):
+                out, (_, _, value) = rows[block[k]], self._terms[k]
+                # Values of the process are less what is expected.
+                expected = self.stops.value_dbm[k, out] - value[block[k]]
+                mean[k, out], variance[k, out] = expected + means.mean[k], variances.variance[k]
+                if forest is not None:
+                    mean[k, out], variance[k, out] = np.add(
+                        (mean[k, out], variance[k, out]), forest.predict(self.stops.poses.take(out), k)
+                    )
+            found.append((mean, variance))
+        return found
 
     @property
     def noise(self) -> float:
@@ -324,58 +360,41 @@ def run_folds(run: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
         yield np.flatnonzero(number != fold), np.flatnonzero(number == fold)
 
 
-class Fit:
-    """Predictions of rows that are held out of the training rows; ``join`` makes stops of rows.
+def held_out(
+    field: StrengthPosterior,
+    measured: Measured,
+    stop: IntArray,
+    new_runs: bool = False,
+    unheard: bool = False,
+    trees: int = 0,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (dBm) and standard deviation of a reading [n_rx, n] of each row by the fold without it; NaN where none.
 
-    Held out are stretches (`folds`), or with ``new_runs`` runs.
+    Held out are stretches (`folds`), or with ``new_runs`` runs, and hyperparameters are those of all rows. With
+    ``unheard``, receivers are predicted from the others: every second one by the first two folds.
+
+    Args:
+        field: posterior of all rows.
+        measured: the rows.
+        stop: number of the stop of each row in the posterior [n], -1 where it has none.
+        new_runs: whether runs are held out.
+        unheard: whether receivers are.
+        trees: number of trees of each fold, if the posterior has any.
     """
-
-    def __init__(
-        self, prior: PriorMean, measured: Measured, join: Callable[[Measured], Stops], new_runs: bool = False
-    ) -> None:
-        self._prior, self._measured = prior, measured
-        self.spread: Hyperparameters | None = None
-        self.trees = 0  # number of trees of each fold
-        by_run = new_runs and measured.poses.run is not None
-        used = run_folds(cast(IntArray, measured.poses.run)) if by_run else folds(measured.poses.position_m)
-        self._folds = [(join(measured.take(train)), held_out) for train, held_out in used]
-
-    def held_out(
-        self, hyperparameters: Hyperparameters, rounds: int = 0, unheard: bool = False
-    ) -> tuple[FloatArray, FloatArray]:
-        """Mean (dBm) and standard deviation of a reading [n_rx, n] of each row by the fold without it; NaN where none.
-
-        With ``unheard``, receivers are predicted from the others: every second one by the first two folds.
-        """
-        mean = np.full(self._measured.value_dbm.shape, np.nan)
-        std = mean.copy()
-        for number, (stops, out) in enumerate(self._folds[:2] if unheard else self._folds):
-            hidden = (np.arange(len(mean)) % 2 == number) & unheard
-            value_dbm = np.where(hidden[:, None], np.nan, stops.value_dbm)
-            field = StrengthPosterior(
-                self._prior,
-                hyperparameters,
-                replace(stops, value_dbm=value_dbm),
-                rounds,
-                self.spread,
-                self.trees,
-            )
-            predicts = hidden | (not unheard)
-            measured_dbm = np.where(predicts[:, None], self._measured.value_dbm, np.nan)
-            received = [out[np.isfinite(values[out])] for values in measured_dbm]
-            if self._prior.traced is not None and self._prior.traced.exact:
-                self._prior.traced.traced_dbm(self._measured.poses.take(out).position_m)  # traced here, not on threads
-
-            def predicted(
-                receiver: int, field: StrengthPosterior = field, received: list[IntArray] = received
-            ) -> tuple[FloatArray, FloatArray]:
-                return field.predict([self._measured.poses.take(received[receiver])], receiver)[0]
-
-            predictions = of_each(predicted, range(len(mean)), sum(map(len, received)))
-            for receiver, (value, variance) in enumerate(predictions):
-                total = variance + field.noise
-                mean[receiver, received[receiver]], std[receiver, received[receiver]] = value, np.sqrt(total)
-        return mean, std
+    by_run, receivers = new_runs and measured.poses.run is not None, np.arange(len(measured.value_dbm))
+    every = run_folds(cast(IntArray, measured.poses.run)) if by_run else folds(measured.poses.position_m)
+    used, left = list(every)[: 2 if unheard else None], list[NDArray[np.bool_]]()
+    hidden = [(receivers % 2 == number) & unheard for number in range(len(used))]
+    for (train, _), unknown in zip(used, hidden, strict=True):
+        others = np.delete(stop, train)
+        left.append(np.isin(np.arange(len(field.stops.poses)), others) | unknown[:, None])
+    mean, std = np.full((2, *measured.value_dbm.shape), np.nan)
+    for (_, out), unknown, (value, variance) in zip(used, hidden, field.without(left, trees), strict=True):
+        for receiver in np.flatnonzero(unknown | (not unheard)):
+            rows = out[np.isfinite(measured.value_dbm[receiver, out]) & (stop[out] >= 0)]
+            mean[receiver, rows] = value[receiver, stop[rows]]
+            std[receiver, rows] = np.sqrt(variance[receiver, stop[rows]] + field.noise)
+    return mean, std
 
 
 def widening(residual_db: FloatArray, std_db: FloatArray) -> FloatArray:

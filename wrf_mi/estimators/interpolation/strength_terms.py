@@ -236,7 +236,7 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
     """
     position, heading, value_dbm = measured.poses.position_m, measured.poses.heading_rad, measured.value_dbm
     weight = np.ones(value_dbm.shape) if measured.precision is None else measured.precision
-    number = _stop_numbers(measured, reach_m, turn_rad, most)
+    number = stop_numbers(measured, reach_m, turn_rad, most)
     count = int(number.max(initial=-1)) + 1
     size = np.maximum(np.bincount(number, minlength=count), 1)
 
@@ -263,7 +263,8 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
     return Stops(Poses(centre, direction, run), value, total, mean(measured.rows.astype(float)))
 
 
-def _stop_numbers(measured: Measured, reach_m: float, turn_rad: float, most: int) -> IntArray:
+def stop_numbers(measured: Measured, reach_m: float, turn_rad: float, most: int) -> IntArray:
+    """Number of the stop of each row [n] before any are thinned out, see `stops_of`."""
     position, heading, rows = measured.poses.position_m.tolist(), measured.poses.heading_rad, measured.rows
     number, first, run = np.zeros(len(rows), np.int64), 0, measured.poses.run
     for k in range(1, len(rows)):

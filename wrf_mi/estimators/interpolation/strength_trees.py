@@ -6,13 +6,13 @@ with enough stops, and add nothing at the others.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...core.angles import FloatArray
-from .pooled_process import PooledProcess
+from ...core.types import IntArray
 from .strength_terms import Poses
 from .trees import GrownTrees, Trees
 
@@ -28,11 +28,10 @@ class Forest:
     of_receiver: Mapping[int, GrownTrees]
 
     @classmethod
-    def grown(cls, process: PooledProcess, poses: Poses, receivers: int, trees: int) -> Forest:
-        """Trees of the residuals of the mean terms of a process over poses."""
+    def grown(cls, residuals: Iterable[tuple[IntArray, FloatArray]], poses: Poses, trees: int) -> Forest:
+        """Trees of what the mean terms leave of each receiver at poses: their numbers [n], and residuals [n] in dB."""
         kind, of_receiver = Trees(trees, LEAF), dict[int, GrownTrees]()
-        for receiver in range(receivers):
-            rows, residual_db = process.residual(receiver)
+        for receiver, (rows, residual_db) in enumerate(residuals):
             if len(rows) >= LEAST_STOPS:
                 places = poses.take(rows)
                 # A seed for each receiver, lest all have the same cuts.

@@ -31,11 +31,11 @@ from ..model import Arrays, Fitted, Inputs
 from .by_receiver import finite_positions
 from .run_offsets import RunOffsets
 from .strength_fit import (
-    Fit,
     PriorMean,
     StrengthPosterior,
     by_likelihood,
     by_search,
+    held_out,
     likely_deviations,
     widening,
 )
@@ -52,7 +52,7 @@ from .strength_settings import (
     TREES,
     StrengthSettings,
 )
-from .strength_terms import Hyperparameters, Measured, Poses, Stops, run_numbers, stops_of
+from .strength_terms import Hyperparameters, Measured, Poses, Stops, run_numbers, stop_numbers, stops_of
 from .strength_trees import TREES as TREES_OF_ALL
 from .strength_trees import TREES_OF_FOLD
 
@@ -272,30 +272,29 @@ def calibrated(
     the record's are predicted, and so runs are held out in place of stretches.
     """
     field, facts = strengths.field, dict(strengths.fit_facts)
-    prior, hyperparameters = field.prior, field.hyperparameters
     measured = _measured(record, rows, field.headings)
     if len(measured.rows) < 2:
         return strengths
     # Rows of a run that is held out have an offset that nobody knows.
     known = measured if new_runs else _without_offsets(measured, record, strengths.offsets)
     values, variance = known.value_dbm, strengths.offsets.sd_db**2 if new_runs and strengths.offsets else 0.0
-    fit = Fit(prior, _without_offsets(measured, record, strengths.offsets), _stops, new_runs)
-    fit.trees = min(TREES_OF_FOLD, field.trees)
-    fit.spread = _deviations(strengths, stated)
-    on_progress("strengths: held-out rows", 0.8)
-    mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS)
+    spread = _deviations(strengths, stated)
+    field = field.with_spread(spread)
+    on_progress("strengths: held-out rows", 0.9)
+    # Without weights of Student-t noise, which are by the residuals of all rows: outliers would be known.
+    plain = StrengthPosterior(field.prior, field.hyperparameters, field.stops, 0, spread, field.trees, field.forest)
+    by_fold = partial(held_out, plain, measured, _stop_of_rows(field.stops, measured), new_runs, trees=TREES_OF_FOLD)
+    mean, std = by_fold()
     residual = values - mean
     widen = widening(residual, np.sqrt(std**2 + variance))
     few = np.isfinite(values).sum(axis=1) < FEW_ROWS
     if few.any() and len(few) - few.sum() >= LEAST_HEARD:
         # At receivers without rows nearby errors are those of the common terms, as at others that are left out.
-        mean, std = fit.held_out(hyperparameters, ROBUST_ROUNDS, unheard=True)
+        mean, std = by_fold(unheard=True)
         widen[few] = np.maximum(widen, widening(values - mean, np.sqrt(std**2 + variance)))[few]
     if np.isfinite(residual).any():
         facts["held_out_db"] = float(np.nanmedian(np.abs(residual)))
-    on_progress("strengths: all rows", 0.9)
-    field = StrengthPosterior(prior, hyperparameters, field.stops, ROBUST_ROUNDS, fit.spread, field.trees, field.forest)
-    on_progress("strengths: all rows", 1.0)
+    on_progress("strengths: held-out rows", 1.0)
     return replace(strengths, field=field, widen=widen, fit_facts=facts)
 
 
@@ -338,6 +337,14 @@ def _stops(measured: Measured) -> Stops:
     # Of each receiver the stops that it received count: the hundreds of a building hear a few per cent of them.
     covariances = np.square(np.isfinite(stops.value_dbm).sum(axis=1, dtype=float)).sum()
     return stops.thinned(int(len(stops.poses) * min(1.0, np.sqrt(MOST_COVARIANCES / max(covariances, 1.0)))))
+
+
+def _stop_of_rows(stops: Stops, measured: Measured) -> IntArray:
+    """Number of the stop of each row [n] among some that may be thinned out, -1 for none."""
+    number = stop_numbers(measured, STOP_M, STOP_RAD, STOP_ROWS)
+    middle = (np.bincount(number, measured.rows) / np.bincount(number))[number]
+    place = np.minimum(np.searchsorted(stops.row, middle), len(stops.row) - 1)
+    return np.where(stops.row[place] == middle, place, -1)
 
 
 def _prior(record: Record, measured: Measured, power_map: Traced | None, settings: StrengthSettings) -> PriorMean:

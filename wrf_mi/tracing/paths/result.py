@@ -87,7 +87,8 @@ class TraceResult:
 
     def unabsorbed(self, scene: Any) -> TraceResult:
         """The paths without gain zero: no absorber of the ``sionna.rt.Scene``, no mirror where all is scattered."""
-        materials = [scene.objects[name].radio_material for name in self.paths.object_names]
+        objects = scene.objects  # a copy in each access
+        materials = [objects[name].radio_material for name in self.paths.object_names]
         all_scattered = {name for name, share in scattering_coefficients(scene).items() if share == 1}
         absorbing, rough = (
             np.isin(self.paths.objects, [number for number, material in enumerate(materials) if is_one(material)])

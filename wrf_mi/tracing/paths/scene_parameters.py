@@ -159,7 +159,8 @@ def read_materials(scene: Any) -> SlabMaterials:
 def slabs_of_faces(scene: Any, surfaces: Surfaces, grouping: MaterialGrouping) -> tuple[SlabMaterials, IntArray]:
     """Slabs of a ``sionna.rt.Scene``, by named material or surface, and the index of each face's slab [f], -1: none."""
     named = read_materials(scene)
-    kinds = [scene.objects[name].radio_material.name for name in surfaces.names]
+    objects = scene.objects  # a copy in each access
+    kinds = [objects[name].radio_material.name for name in surfaces.names]
     number = np.array([named.names.index(kind) if kind in named.names else -1 for kind in kinds], np.int64)
     object_index = surfaces.object_of(np.arange(len(surfaces.plane)))
     slab_of_face = number[object_index] if len(object_index) else np.zeros(0, np.int64)

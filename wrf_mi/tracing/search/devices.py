@@ -34,7 +34,7 @@ def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[s
         raise InputError(f"{names[first]} at ({at}) m is inside the solid {solid}; move one of them")
     if not len(surfaces.triangles):
         return
-    low, high = bounds(surfaces.triangles)
+    low, high = surfaces.box_m
     beyond = np.maximum(low - positions_m, positions_m - high).max(axis=1)
     outside = np.flatnonzero(beyond > OUTSIDE_M)
     if len(outside):

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import shapely
@@ -91,9 +92,14 @@ class Surfaces:
         return to_uint(self.first_by_shape), to_uint(self.plane)
 
     @cached_property
+    def box_m(self) -> FloatArray:
+        """Least and largest coordinates [2, 3] of the scene, zero without faces."""
+        return bounds(self.triangles) if len(self.triangles) else np.zeros((2, 3))
+
+    @cached_property
     def centre_m(self) -> FloatArray:
         """Middle of the box around the scene [3], from which single precision is finest; the origin without faces."""
-        return bounds(self.triangles).sum(axis=0) / 2 if len(self.triangles) else np.zeros(3)
+        return self.box_m.sum(axis=0) / 2
 
     @cached_property
     def scale_m(self) -> float:
@@ -195,23 +201,31 @@ class Surfaces:
         return np.searchsorted(self.first_face, face, side="right") - 1
 
 
-def scene_surfaces(scene: Any) -> Surfaces:
-    """Read the triangles of a ``sionna.rt.Scene`` and find its planes."""
-    import mitsuba as mi
+_FOUND: WeakKeyDictionary[Any, Surfaces] = WeakKeyDictionary()
 
-    names = tuple(scene.objects)
+
+def scene_surfaces(scene: Any) -> Surfaces:
+    """Read the triangles of a ``sionna.rt.Scene`` and find its planes, once while they stay where they are."""
+    objects = scene.objects  # a copy in each access
+    names = tuple(objects)
     ids, files, triangles = [], [], [np.zeros((0, 3, 3))]
     for name in names:
-        mesh = scene.objects[name].mi_mesh
-        parameters = mi.traverse(mesh)
-        corners = np.asarray(parameters["vertex_positions"], float).reshape(-1, 3)
-        triangles.append(corners[np.asarray(parameters["faces"], np.int64).reshape(-1, 3)])
+        mesh = objects[name].mi_mesh
+        corners = np.asarray(mesh.vertex_positions_buffer(), float).reshape(-1, 3)
+        triangles.append(corners[np.asarray(mesh.faces_buffer(), np.int64).reshape(-1, 3)])
         ids.append(shape_id(mesh))
         stated_file = MESH_FILE.search(str(mesh))
         files.append(stated_file[1] if stated_file else "")
-    first = np.cumsum([len(part) for part in triangles])
-    surfaces = find_planes(names, np.asarray(ids, np.uint32), first, np.concatenate(triangles))
-    return replace(surfaces, files=tuple(files))
+    first, every = np.cumsum([len(part) for part in triangles]), np.concatenate(triangles)
+    known, stated = _FOUND.get(scene), (names, tuple(ids), tuple(files))
+    if (
+        known is None
+        or (known.names, tuple(known.shape_ids), known.files) != stated
+        or (known.triangles != every).any()
+    ):
+        known = replace(find_planes(names, np.asarray(ids, np.uint32), first, every), files=stated[2])
+        _FOUND[scene] = known
+    return known
 
 
 def shape_id(mesh: Any) -> int:
