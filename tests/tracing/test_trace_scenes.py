@@ -247,7 +247,7 @@ def test_planes_are_found_once_until_an_object_moves(shoebox_xml):
     before = scene_surfaces(scene)
     assert scene_surfaces(scene) is before
     name = before.names[0]
-    scene.objects[name].position = np.asarray(scene.objects[name].position).ravel() + [0, 0, 0.5]
+    scene.objects[name].position = np.asarray(scene.objects[name].position).ravel() + np.array([0, 0, 0.5])
     after, own = scene_surfaces(scene), before.object_of(np.arange(len(before.triangles))) == 0
     np.testing.assert_allclose(
         after.triangles[own] - before.triangles[own], np.broadcast_to([0, 0, 0.5], (own.sum(), 3, 3)), atol=1e-6
