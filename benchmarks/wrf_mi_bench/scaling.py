@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 import sionna.rt
+from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
 from wrf_mi_scenes.divided import cluttered_room, divided_room
 
 from wrf_mi.backend.device import to_tensor
 from wrf_mi.core.arrays import planar_array
+from wrf_mi.core.files import write_figure
 from wrf_mi.estimators.interpolation.strengths import fit_strengths
 from wrf_mi.estimators.model import Inputs
 from wrf_mi.gaussians import FIELDS
@@ -27,7 +29,7 @@ from wrf_mi.receivers.registry import PIXEL, ObservationSpec
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
 from wrf_mi.tasks.scores import Interval
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
-from wrf_mi.tracing.search.surfaces import scene_surfaces
+from wrf_mi.tracing.search.surfaces import find_planes, scene_surfaces
 from wrf_mi.tracing.tracer import RayTracer
 from wrf_mi.training.config import TrainConfig
 from wrf_mi.training.fields import make_field
@@ -122,14 +124,14 @@ def _opened(kind: str, triangles: int) -> Any:
 
 
 def _trace(kind: str, triangles: int) -> Call:
-    """One transmitter in an opened mesh: its planes, rays, paths and gains."""
+    """One transmitter in an opened mesh whose planes are known: rays, paths and gains."""
     scene, tx = _opened(kind, triangles), transmitter_path(1)
     return lambda: len(trace_paths(scene, tx, RECEIVER, OPTIONS).paths)
 
 
 def _planes(kind: str, triangles: int) -> Call:
-    scene = _opened(kind, triangles)
-    return lambda: len(scene_surfaces(scene).normal)
+    known = scene_surfaces(_opened(kind, triangles))
+    return lambda: len(find_planes(known.names, known.shape_ids, known.first_face, known.triangles).normal)
 
 
 def _fit(rows: int = 200, receivers: int = 4) -> Call:
@@ -240,9 +242,37 @@ def rows(results: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
     return lines
 
 
+def growth_figure(results: Sequence[dict[str, Any]]) -> Figure:
+    """Time and memory of each axis against its size, both logarithmic, with a line of n log n."""
+    columns = 4
+    count = -(-len(results) // columns)
+    figure = Figure(figsize=(3 * columns, 2.4 * count), layout="constrained", facecolor="white")
+    panels = figure.subplots(count, columns, squeeze=False).ravel()
+    for panel in panels[len(results) :]:
+        panel.set_axis_off()
+    for panel, result in zip(panels, results, strict=False):
+        sizes, ms = np.array(result["sizes"], float), np.array(result["ms"])
+        bound = sizes * np.log(np.maximum(sizes, 2))
+        panel.loglog(sizes, bound / bound[-1] * ms[-1], "--", color="0.6", label="n log n")
+        panel.loglog(sizes, ms, "o-", color="C0", label="time (ms)")
+        # Less than a megabyte is what the allocator keeps, not the call's.
+        panel.loglog(sizes, np.maximum(result["memory_mb"], 1), "s:", color="C1", label="memory (MB)")
+        panel.set_title(result["title"], fontsize=9)
+        panel.set_xlabel(result["work"], fontsize=8)
+        panel.tick_params(labelsize=7)
+        panel.grid(alpha=0.3)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+PICTURE = Path("docs/images/scaling.png")  # written only in a checkout of the project
+
+
 def main() -> dict[str, Any]:
-    """All axes, some ten minutes on two cores."""
+    """All axes, some twenty minutes on two cores."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     with threadpool_limits(1, "blas"):
         results = [scale(axis) for axis in AXES]
+    if PICTURE.parent.is_dir():
+        write_figure(PICTURE, growth_figure(results))
     return {"rows": rows(results), "axes": results}

@@ -74,10 +74,10 @@ def tracer(options: TraceOptions) -> RayTracer:
     return RayTracer("laboratory", instrument, options)
 
 
-def strengths(rows: int, receivers: int) -> Record:
-    """Signal strengths in a square of 40 m with shadowing that is smooth over metres."""
+def strengths(rows: int, receivers: int, length_m: float = 40.0, width_m: float = 40.0) -> Record:
+    """Signal strengths in a rectangle, with shadowing that is smooth over metres."""
     rng = np.random.default_rng(0)
-    tx_m, rx_m = (rng.uniform((0, 0, 1), (40, 40, 2), (count, 3)) for count in (rows, receivers))
+    tx_m, rx_m = (rng.uniform((0, 0, 1), (length_m, width_m, 2), (count, 3)) for count in (rows, receivers))
     waves, phases = rng.normal(0, 0.4, (receivers, 12, 2)), rng.uniform(0, 2 * np.pi, (receivers, 12, 1))
     power_dbm = 2 * np.cos(waves @ tx_m[:, :2].T + phases).sum(axis=1) + rng.normal(0, 2, (receivers, rows))
     power_dbm -= 40 + 20 * np.log10(np.linalg.norm(tx_m - rx_m[:, None], axis=2))

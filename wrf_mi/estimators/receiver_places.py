@@ -31,13 +31,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.special import ndtr, ndtri
-from threadpoolctl import threadpool_limits
 
 from ..core import InputError, Record, Split
 from ..core.angles import FloatArray
 from ..core.antenna import AS_STATED
 from ..core.files import MOST_LISTED, listed, readable, write_atomically
 from ..core.types import IntArray
+from ..parallel.threads import one_blas_thread
 from ..tasks.scores import LEVEL, REAL_90
 from ..training.session import OnProgress, quiet
 from .model import Model, Problem
@@ -232,7 +232,7 @@ def placed(
             if receiver.position_std_m is not None:  # estimated from more rows, from which nothing may remain
                 stated_m = np.where(receiver.position_std_m > 0, np.nan, stated_m)
             of_rows = tx_pos_m[received], observed[received]
-            with threadpool_limits(1, "blas"):  # of matrices of a hundred rows threads would mostly wait for each other
+            with one_blas_thread():  # of matrices of a hundred rows threads would mostly wait for each other
                 place_m, std_m = place_of_receiver(*of_rows, extent_m, stated_m, height_m)
             receivers[number] = replace(receiver, position_m=place_m, position_std_m=std_m)
         report("places of receivers", done / len(lacking))
