@@ -95,7 +95,6 @@ CASES: Mapping[str, Case] = {
 
 _STORED: Any = {"resumes": True}  # of checks that keep their parts
 _OWN: Mapping[str, Check] = {
-    "traced-and-splatted": _here("Mitsuba integrator", "traced:main"),
     "image-method": _here("traced paths against MATLAB", "trace:newrf", CONFERENCE, OFFICE),
     "scan-to-paths": _here("mesh from a scan", "scene:scans", CONFERENCE, OFFICE),
     "large-scan": _here("mesh from a scan", "scene:large_scan", OFFICE),
@@ -104,8 +103,7 @@ _OWN: Mapping[str, Check] = {
     "stress": _here("numbers under stress", "stress:main", quick="stress:quick"),
     "pareto": _here("run time against error", "table_pages:pareto", resumes=True, table="table_pages:front_table"),
     "scaling": _here("cost against work", "scaling:main"),
-    "operator": _here("prediction by operator", "operator:main", table="operator:table"),
-    "training": _here("training", "training:main", RFID),
+    "side-by-side": _here("side by side", "side_by_side:main", resumes=True, table="side_by_side:table"),
     "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="stages:table"),
     "new-carriers": _here("carriers without measurements", "unmeasured:carriers", table="unmeasured:table", **_STORED),
     "new-receivers": _here(

@@ -13,18 +13,7 @@ from .comparison import MEASURED
 from .stages import ALONE, CELLS, CHANNELS, COPIED, HYBRID, Cell
 from .table_plan import SEEDS, plan
 from .tables import FOLDER, LICENCE
-from .unmeasured import (
-    CARRIER,
-    CARRIERS,
-    IDW,
-    LAW,
-    LEFT,
-    OWN_KRIGING,
-    OWN_TREES,
-    RECEIVERS,
-    Held,
-    gains,
-)
+from .unmeasured import CARRIER, CARRIERS, IDW, LAW, LEFT, OWN_KRIGING, OWN_TREES, RECEIVERS, Held, gains
 
 BLOCKS = {"ssim": "spectrum", "abs_error_db": "rssi", "cea_db": "csi"}  # task by key of its score in ``metrics.json``
 OPEN = ("rfid-lab",)  # data sets without a scene

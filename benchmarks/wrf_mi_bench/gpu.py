@@ -1,7 +1,7 @@
 """Run time on a GPU beside two and all cores of the same machine's CPU; `wrf_mi_bench.elsewhere` has the differences.
 
 `wrf_mi_bench.gpu_job` measures each in a process of its own. Fits to their final scores run on the GPU alone, since
-those of the CPU take many minutes; their scores are to be compared with the stored ones of `waits` and `training`.
+those of the CPU take many minutes; their scores are to be compared with the stored ones of `waits`.
 
 A machine with a GPU may be there for some minutes only: the GPU's figures are measured first, the CPU's while
 `ENOUGH_S` have not passed, and each part is kept by the content of the packages' files, so that a further call

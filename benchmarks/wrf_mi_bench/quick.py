@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from wrf_mi.backend import init
 from wrf_mi.backend.device import Recorded, on_device, to_tensor
-from wrf_mi.core import InputError
+from wrf_mi.core import InputError, Record
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.core.files import one_line, write_atomically
 from wrf_mi.core.settings import with_settings
@@ -63,26 +63,21 @@ class Pair:
     make: Callable[[], tuple[Call, Call]]
 
 
-def _splatting() -> tuple[Call, Call]:
-    scene = field(500, 5.0, opacity=0.3)
-    return splatting(*scene), Within(_stock(*scene).render, rgb_variant)
-
-
-def _integrator() -> tuple[Call, Call]:
+def _evaluated(way: Callable[..., Call], anew: bool) -> tuple[Call, Call]:
     gaussians, receiver = field(500, 5.0, opacity=0.3)
-    theirs = partial(_stock(gaussians, receiver).field, gaussians)
-    return integrator(gaussians, receiver), Within(theirs, rgb_variant)
-
-
-def _stock(gaussians: Any, receiver: Any) -> StockRenderer:
     stock = StockRenderer(receiver, HEIGHT, WIDTH)
     stock.field(gaussians)
-    return stock
+    return way(gaussians, receiver), Within(partial(stock.field, gaussians) if anew else stock.render, rgb_variant)
+
+
+def endless_trainer(record: Record, model: str = "wrf-gs+", *options: str) -> Trainer:
+    """Trainer of nothing but steps on a random split."""
+    config = with_settings(TrainConfig(model=model), ["steps=100000", *ONLY_STEPS, *options])
+    return Trainer(record, make_splits(record, "random")[0], config)
 
 
 def _training() -> tuple[Call, Call]:
-    config, split = with_settings(TrainConfig(), ["steps=100000", *ONLY_STEPS]), make_splits(record(20), "random")[0]
-    frozen, fresh = (Trainer(record(20), split, config) for _ in range(2))
+    frozen, fresh = (endless_trainer(record(20)) for _ in range(2))
 
     def ours() -> None:
         frozen.run(stop=lambda: True)  # asked after each step: one is taken
@@ -190,8 +185,12 @@ def one_thread() -> Iterator[None]:
 
 
 PAIRS: list[Pair] = [
-    Pair("splatting", "splatting 500 Gaussians over `volprim_rf_basic`", _splatting),
-    Pair("integrator", "our Mitsuba integrator over `volprim_rf_basic`, geometry new", _integrator),
+    Pair("splatting", "splatting 500 Gaussians over `volprim_rf_basic`", partial(_evaluated, splatting, anew=False)),
+    Pair(
+        "integrator",
+        "our Mitsuba integrator over `volprim_rf_basic`, geometry new",
+        partial(_evaluated, integrator, anew=True),
+    ),
     Pair("frozen", "a frozen training step over one that is traced anew", _training),
     Pair("batch", "16 transmitters at once over one after the other", _batch),
     Pair(

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import shapely
 from wrf_mi_scenes.mitsuba_xml import PERFECT
 
@@ -60,10 +59,7 @@ def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, see
     fixed = clear_of_walls(data["tx_pos"], moving, triangles)
     with tempfile.TemporaryDirectory() as folder:
         scan = write_arrays(Path(folder) / f"{file.stem}.npz", {"points": points})
-        start = time.perf_counter()
         measured = make_scene(scan, Path(folder) / "scene")
-        seconds = time.perf_counter() - start
-        memory = peak_memory_mb()
         other = open_scene(measured.folder, frequency_hz)
         agreement = path_agreement(original, other, [(fixed, chosen)], seed)
     return {
@@ -75,9 +71,6 @@ def scan_to_paths(room: str | Path, receivers: int = 40, poses: int = POSES, see
         "surfaces": measured.counts["surfaces"],
         "receivers": len(chosen),
         **agreement,
-        "make_seconds": seconds,
-        "peak_memory_mb": memory,
-        "memory_mb": psutil.Process().memory_info().rss / 1e6,
     }
 
 
@@ -214,7 +207,7 @@ def flat_plan() -> dict[str, Any]:
     """Walls from ``lidar/gridmap.npz`` of flat-ble, registered to ``layout.csv``.
 
     An upper bound for any method is the share of the layout near an occupied cell. Figures are shares, what can be
-    seen, walls, scale of the registration, seconds.
+    seen, walls, and the scale of the registration.
     """
     home = data_folder("flat-ble")
     true = layout_walls(read_layout(home / "layout.csv"))
@@ -229,9 +222,7 @@ def flat_plan() -> dict[str, Any]:
 
 
 def _measured_plan(grid: PlanGrid, true: FloatArray) -> dict[str, Any]:
-    begin = time.perf_counter()
     walls, cells = find_walls(grid), grid.centres_m(grid.occupied)
-    seconds = time.perf_counter() - begin
     motion = register_walls(sample_walls(walls), true)
     walls, cells = (points @ motion[:2, :2].T + motion[:2, 3] for points in (walls, cells))
     scale, _ = best_scale(sample_walls(walls), np.zeros(3), true)
@@ -245,5 +236,4 @@ def _measured_plan(grid: PlanGrid, true: FloatArray) -> dict[str, Any]:
         "walls": len(walls),
         "length_m": float(np.linalg.norm(walls[:, 1] - walls[:, 0], axis=-1).sum()),
         "scale": scale,
-        "seconds": seconds,
     }

@@ -139,11 +139,11 @@ def _integrator() -> Group:
         errors = worst(against_splatted(FIELDS))
         return [errors["lowest_ssim"], errors["largest_complex_error"]]
 
-    stored = _stored("traced-and-splatted")["figures"]["small"]
+    stored = _stored("side-by-side")["figures"]["small"]
     words = "Mitsuba integrator against splatting"
     ssim = Figure(f"{words}, lowest SSIM", stored["lowest_ssim"], LOWEST_SSIM, 1.0, True)
     error = Figure(f"{words}, largest L2 error", stored["largest_complex_error"], 0.0, LARGEST_ERROR, False)
-    return Group("traced-and-splatted", (ssim, error), again)
+    return Group("integrator", (ssim, error), again)
 
 
 def _image_method(room: str, stored: Mapping[str, Any]) -> Group:

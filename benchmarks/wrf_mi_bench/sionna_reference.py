@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.constants import speed_of_light
 
+from wrf_mi.core import Paths
 from wrf_mi.core.types import FloatArray, IntArray
 from wrf_mi.tracing import TraceOptions
 
@@ -57,11 +58,21 @@ def sionna_paths(
         )
     finally:
         scene.remove([*names, "rx"])
-    valid = paths.valid.numpy()[0]
-    real, imaginary = (part.numpy()[0, 0, :, 0] for part in paths.a)
-    length = paths.tau.numpy()[0].astype(float) * speed_of_light
-    point = np.full((*valid.shape, 3), np.nan)
-    if options.depth:
-        met = paths.interactions.numpy()[0, 0] != 0
-        point[met] = paths.vertices.numpy()[0, 0][met]
-    return np.nonzero(valid)[0], (real + 1j * imaginary)[valid], length[valid], point[valid]
+    found = as_paths(paths)
+    point = found.vertices_m[:, 0] if options.depth else np.full((len(found), 3), np.nan)
+    return found.tx, found.gain, found.length_m, point
+
+
+def as_paths(solved: Any) -> Paths:
+    """Paths of single antennas from a ``sionna.rt.Paths``, without their directions and surfaces.
+
+    Gains have no phase exp(-j k length), and lengths are from delays in single precision.
+    """
+    rx, tx, path = which = np.nonzero(solved.valid.numpy())
+    real, imaginary = (part.numpy()[:, 0, :, 0] for part in solved.a)
+    kinds = np.moveaxis(solved.interactions.numpy(), 0, -1)[which].astype(np.uint8)
+    points = np.moveaxis(solved.vertices.numpy(), 0, -2)[which].astype(float)
+    points[kinds == 0] = np.nan
+    gain, length = (real + 1j * imaginary)[which], solved.tau.numpy()[which].astype(float) * speed_of_light
+    aside, counts = np.full((len(path), 3), np.nan), reversed(solved.valid.shape[:2])
+    return Paths(tx, rx, gain, length, aside, aside, kinds, points, np.full(kinds.shape, -1, np.int32), (), *counts)

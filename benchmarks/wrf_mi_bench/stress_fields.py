@@ -142,15 +142,15 @@ def layers(rng: Rng, count: int = 50_000, **replaced: Any) -> StressField:
 
 
 def truth(
-    field: StressField, blending: str, size: Size, on_rays: bool = False, sphere: bool = False
+    field: StressField, blending: str, size: Size, on_rays: bool = False, sphere: bool = False, every: int = 1
 ) -> tuple[ComplexArray, NDArray[np.bool_]]:
     """Image [height, width] in float64, and a mask of pixels off all footprints' edges, where the image jumps.
 
     Splatting takes a Gaussian's response in the tangent plane (`field_oracle`), the Mitsuba plugin the largest one on a
     ray (``on_rays``); both agree in the limit of small angles. With ``sphere`` the lower hemisphere is appended:
-    [2 * height, width].
+    [2 * height, width]; of ``every`` so many rows the first is computed.
     """
-    directions = pixel_directions(*size)
+    directions = pixel_directions(*size)[::every]
     if sphere:
         directions = np.concatenate([directions, directions * [1, -1, -1]])
     view = field_oracle.project(field.position_m, field.scale_m, field.rotation, RECEIVER)

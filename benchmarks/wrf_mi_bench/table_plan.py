@@ -59,10 +59,7 @@ FURNISHED = {
     "ray-tracing": Entry("ray tracing in the scan", "ray-tracing", NAMED, THROUGH_WALLS),
     "ray-tracing-corrected": Entry("ray tracing in the scan, corrected", "ray-tracing", CORRECTED, THROUGH_WALLS),
 }
-UNSEEN = {
-    **SPECTRUM,
-    "ray-tracing": Entry("ray tracing, line of sight alone", "ray-tracing", NAMED, few_seeds=ONE),
-}
+UNSEEN = {**SPECTRUM, "ray-tracing": Entry("ray tracing, line of sight alone", "ray-tracing", NAMED, few_seeds=ONE)}
 """Methods without a mesh, where only the direct path can be traced."""
 RSSI: Mapping[str, Entry] = {
     "wrf-gs+": Entry("WRF-GS+", "wrf-gs+", quick=SHORT, seeds=SEEDS),

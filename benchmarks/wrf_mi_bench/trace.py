@@ -1,6 +1,5 @@
 """Ray tracing compared with MATLAB's image method in two CAD rooms (the NeWRF data)."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -8,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.optimize import linear_sum_assignment
@@ -47,11 +45,9 @@ def image_method_agreement(room: str | Path, rays: Any = "auto") -> dict[str, An
     wavelength = speed_of_light / frequency_hz
     scene = open_scene(file.with_suffix(".stl"), frequency_hz, material=PERFECT)
     access_point = Receiver("access-point", data["tx_pos"].astype(float), np.array([0.0, 0.0, 0.0, 1.0]))
-    start = time.perf_counter()
     options = TraceOptions(transmission=False, depth=2, rays=rays, seed=1)
     # The moving end is the transmitter, by reciprocity, so MATLAB's last point is the first one here.
     trace = trace_paths(scene, data["rx_pos"], access_point, options)
-    seconds = time.perf_counter() - start
     paths = trace.paths
     row = np.repeat(np.arange(len(data["rx_pos"])), np.diff(data["path_offsets"]))
     length = wavelength / (4 * np.pi * np.abs(data["path_gain"]))
@@ -84,8 +80,6 @@ def image_method_agreement(room: str | Path, rays: Any = "auto") -> dict[str, An
         "receivers_matlab_lacks_paths": len(incomplete),
         "cea_db": summary(cea) if len(cea) else None,
         "cea_db_where_matlab_lacks_none": summary(complete) if len(complete) else None,
-        "seconds": seconds,
-        "memory_mb": psutil.Process().memory_info().rss / 1e6,
     }
 
 
@@ -127,7 +121,7 @@ def assign(ours: IntArray, theirs: IntArray, distances: Distances) -> tuple[IntA
 def confirm_paths(paths: Paths, tx_pos_m: FloatArray, rx_pos_m: FloatArray, triangles: FloatArray) -> NDArray[np.bool_]:
     """Which paths are mirror reflections or lines of sight without obstruction, by brute force in float64.
 
-    Transmitters [n_tx, 3], a receiver [3] and corners of the mesh's triangles [f, 3, 3] are in metres.
+    Transmitters [n_tx, 3], receivers [n_rx, 3], or one [3], and corners of the mesh's triangles [f, 3, 3] in metres.
     """
     corner, first, second = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     normal = np.cross(first, second)
@@ -156,9 +150,9 @@ def confirm_paths(paths: Paths, tx_pos_m: FloatArray, rx_pos_m: FloatArray, tria
         half = sum((end - at) / np.linalg.norm(end - at) for end in (before, after))
         return bool((np.abs(normal[which] @ half) > (1 - MIRRORED) * np.linalg.norm(half)).any())
 
-    good = np.ones(len(paths), bool)
+    good, receivers_m = np.ones(len(paths), bool), np.atleast_2d(rx_pos_m)
     for index, bounces in enumerate(paths.bounces):
-        points = [tx_pos_m[paths.tx[index]], *paths.vertices_m[index, :bounces], rx_pos_m]
+        points = [tx_pos_m[paths.tx[index]], *paths.vertices_m[index, :bounces], receivers_m[paths.rx[index]]]
         good[index] = not any(obstructed(*ends) for ends in pairwise(points))
         good[index] &= all(mirrored(*turn) for turn in zip(points, points[1:], points[2:], strict=False))
     return good

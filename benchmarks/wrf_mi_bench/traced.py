@@ -11,7 +11,6 @@ and recovered by subtracting the third, as the blending is linear. The integrato
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -28,11 +27,9 @@ from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.training.step import device_pose
 
-from .comparison import line
-from .timing import Within, interleaved, ratio
+from .stress_fields import BLENDINGS, made, on_device
 
 HEIGHT, WIDTH = 90, 360
-BLENDINGS = ("alpha", "product")
 LOWEST_SSIM, LARGEST_ERROR = 0.99, 0.02
 """Bounds for small Gaussians: SSIM of magnitudes, relative L2 error of complex values."""
 DISTANCE_M = (2.0, 8.0)
@@ -63,20 +60,10 @@ def random_field(
     axes = np.exp(-rng.uniform(0, np.log(ratio), (count, 3)))
     scale = np.tan(np.radians(size_deg)) * distance[:, None] * axes / axes.max(axis=1, keepdims=True)
     delta = rng.uniform(0, 0.95, count) * np.exp(1j * rng.uniform(0, 2 * np.pi, count))
-
-    def columns(values: Any) -> list[Any]:
-        return [to_float(column) for column in np.transpose(values)]
-
-    product = blending == "product"
-    return Gaussians(
-        position=columns(position),
-        scale=columns(scale),
-        rotation=columns(rng.standard_normal((count, 4))),
-        signal=columns(rng.standard_normal((count, 2))),
-        opacity=None if product else columns(rng.uniform(0.05, opacity, (count, 1)))[0],
-        attenuation=columns(np.stack([delta.real, delta.imag], axis=1)) if product else None,
-        batch=1,
-    ), receiver
+    values = {"position_m": position, "scale_m": scale, "rotation": rng.standard_normal((count, 4))}
+    values |= {"signal": rng.standard_normal((count, 2)) @ [1, 1j], "attenuation": delta}
+    drawn = made(count, rng, **values, opacity=rng.uniform(0.05, opacity, count))
+    return on_device(drawn, blending, mi.Float)[0], receiver
 
 
 def scene_of(gaussians: Gaussians, receiver: Receiver, height: int = HEIGHT, width: int = WIDTH, **more: Any) -> Any:
@@ -161,18 +148,6 @@ class StockRenderer:
         self._scene: Any = None
         self._count = -1
 
-    def load(self, data: Floats, opacity: Floats, colour: Floats) -> None:
-        """Load centres, standard deviations (m) and quaternions (x, y, z, w) [n, 10], opacity [n] and colour [n, 3]."""
-        with rgb_variant():
-            if len(opacity) != self._count:
-                self._scene, self._count = self._build(data, opacity, colour), len(opacity)
-                self._params = mi.traverse(self._scene)
-                return
-            for name, values in (("data", data), ("opacities", opacity), ("sh_coeffs", colour)):
-                key = f"gaussians.{name}"
-                self._params[key] = type(self._params[key])(np.ascontiguousarray(values, np.float32).ravel())
-            self._params.update()
-
     def render(self) -> Any:
         """Channels, a tensor [height, width, 3]."""
         with rgb_variant():
@@ -189,7 +164,15 @@ class StockRenderer:
         top = float(np.hypot(*signal.T).max()) or 1.0
         colour = np.concatenate([signal / (2 * top * DEGREE_0), np.zeros((len(signal), 1))], axis=1)
         data = np.stack([column.numpy() for column in columns], axis=1)
-        self.load(data, gaussians.opacity.numpy(), colour.astype(np.float32))
+        values = {"data": data, "opacities": gaussians.opacity.numpy(), "sh_coeffs": colour.astype(np.float32)}
+        with rgb_variant():
+            if len(data) != self._count:
+                self._scene, self._count = self._build(*values.values()), len(data)
+                self._params = mi.traverse(self._scene)
+            for name, array in values.items():
+                key = f"gaussians.{name}"
+                self._params[key] = type(self._params[key])(np.ascontiguousarray(array, np.float32).ravel())
+            self._params.update()
         channels = self.render().numpy()
         field: NDArray[np.complex64] = 2 * top * ((channels[..., :2] - channels[..., 2:]) @ np.array([1, 1j]))
         return field
@@ -229,57 +212,3 @@ class StockRenderer:
                 },
             }
         )
-
-
-def pace(size_deg: float, count: int = 10_000, repeats: int = 7) -> dict[str, float]:
-    """Median times of interleaved renders in ms, by this package and by ``volprim_rf_basic`` in the rgb variant.
-
-    ``traced_ms`` is a render after the geometry changed, ``again_ms`` after the signals changed. Updates of the scene,
-    in which Mitsuba builds its BVH, do not count.
-    """
-    gaussians, receiver = random_field(0, "alpha", count, size_deg, opacity=0.1)
-    opacity: Any = gaussians.opacity
-    scene = scene_of(gaussians, receiver)
-    params = mi.traverse(scene)
-    # Copied, as an update of the scene frees the memory.
-    data, signal = (params[f"gaussians.{name}"].numpy().copy() for name in ("data", "signal"))
-    stock = StockRenderer(receiver, HEIGHT, WIDTH)
-    colour = np.random.default_rng(0).standard_normal((count, 3)).astype(np.float32)
-    stock.load(data.reshape(count, -1), opacity.numpy(), colour)
-
-    @contextmanager
-    def changed(key: str, values: NDArray[np.float32]) -> Iterator[None]:
-        params[f"gaussians.{key}"] = to_float(values)
-        params.update()
-        yield
-
-    calls = {
-        "traced_ms": Within(partial(mi.render, scene), partial(changed, "data", data)),
-        "again_ms": Within(partial(mi.render, scene), partial(changed, "signal", signal)),
-        "stock_ms": Within(stock.render, rgb_variant),
-    }
-    times = interleaved(calls, repeats, 1)
-    return {
-        "size_deg": float(size_deg),
-        "gaussians": float(count),
-        **{name: float(np.median(ms)) for name, ms in times.items()},
-        "stock_over_traced": ratio(times["stock_ms"], times["traced_ms"]).value,
-        "stock_over_again": ratio(times["stock_ms"], times["again_ms"]).value,
-    }
-
-
-def main() -> dict[str, Any]:
-    """All figures, with rows for the table."""
-    small = against_splatted()
-    figures: dict[str, Any] = {
-        "small": {"fields": len(small), **worst(small)},
-        "pace": [pace(size) for size in (1.0, 2.0, 7.0)],
-    }
-    least, most = figures["small"]["lowest_ssim"], 100 * figures["small"]["largest_complex_error"]
-    what = f"traced against splatted, worst of {len(small)} renders of random fields of small Gaussians"
-    asked = f"{LOWEST_SSIM:g}, {100 * LARGEST_ERROR:g} %"
-    rows = [line(what, f"SSIM {least:.4f}, L2 error {most:.2f} %", asked)]
-    for times in figures["pace"]:
-        what = f"10,000 Gaussians of {times['size_deg']:g}°, 360 x 90: `volprim_rf_basic`'s time over ours"
-        rows.append(line(what, f"{times['stock_over_traced']:.1f} ({times['traced_ms']:.0f} ms)", "1"))
-    return {"rows": rows, **figures}

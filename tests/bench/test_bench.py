@@ -20,12 +20,12 @@ from wrf_mi.core.registry import resolve
 
 RESULTS = CHECKOUT / "benchmarks" / "results"
 NEEDS_NO_DATA = {
-    *("traced-and-splatted", "scaling", "operator", "stress", "pareto", "rooms", "phase-error"),
+    *("side-by-side", "scaling", "stress", "pareto", "rooms", "phase-error"),
     *("closed-forms", "elsewhere", "gpu", "sentinels", "new-carriers", "moved", "far-scans", "phone-scans"),
 }
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
-    **dict.fromkeys(("operator", "waits"), "speed.md"),
+    **dict.fromkeys(("side-by-side", "waits"), "speed.md"),
     **dict.fromkeys(("stages", "ablation"), "hybrid.md"),
     **{"rooms": "correction.md", "locate": "locate.md", "moved": "scenes.md"},
     **dict.fromkeys(("fdtd", "far-scans"), "correction.md"),
@@ -35,7 +35,7 @@ ON_PAGE = {
 """Pages that show a check's table; all others but `NOT_LISTED` are in `docs/results.md`."""
 NOT_LISTED = (
     *("scaling", "stress", "sentinels", "new-carriers", "new-receivers"),
-    *("elsewhere", "traced-and-splatted", "flat-plan", "phase-error", "training", "phone-scans"),
+    *("elsewhere", "flat-plan", "phase-error", "phone-scans"),
 )
 """Checks of many rows, or that the prose of a page summarises."""
 OTHER_BLOCKS = ("checks", "questions", *IN_RESULTS)

@@ -1,21 +1,16 @@
 """How calls are timed, split and compared, on calls of known cost; growth; training steps; times of a GPU."""
 
 import itertools
-import json
 import time
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from small_fits import official, settings
-from wrf_mi_bench import timing, training
+from wrf_mi_bench import timing
 from wrf_mi_bench.scaling import Axis, rows, scale, verdict
 from wrf_mi_bench.timing import Interval, bootstrap, exponent, interleaved, larger_half, memory_mb, ratio
 from wrf_mi_scenes.divided import cluttered_room, divided_room
-
-from wrf_mi.training.trainer import Trainer
 
 BUSY_S = 0.02
 ARRAY_MB = 64
@@ -162,37 +157,3 @@ def test_growth_beyond_n_log_n_is_reported(clock):
 
 
 SMALL = ("network.width=16", "network.layers=2", "encoding.tx_octaves=3", "encoding.position_octaves=2", "steps=1000")
-
-
-def test_shares_of_a_step_sum_to_one(one_gateway):
-    trainer = Trainer(one_gateway, official(one_gateway), settings(*SMALL))
-    of_step = training.shares(training.some_steps(trainer, 3))
-    assert trainer.state.step == 6
-    assert sum(of_step.values()) >= 1 - 1e-9
-    assert min(of_step.values()) >= 0
-    assert of_step[training.PRODUCTS] > 0
-    assert of_step[training.WALKS] > 0
-
-
-def test_fit_of_a_subprocess_has_its_time_and_scores(monkeypatch):
-    def run_command(arguments: tuple[str, ...], folder: Path, where: str) -> None:
-        assert arguments == ("train", training.DATA, "--model", "wrf-gs")
-        folder.mkdir()
-        metrics = {"train_seconds": 9.0, "peak_memory_mb": 80.0, "ssim": {"median": 0.9}, "gaussians": 7, "steps": 3}
-        (folder / "metrics.json").write_text(json.dumps(metrics))
-
-    monkeypatch.setattr(training, "run_command", run_command)
-    fit = training.fit("wrf-gs")
-    assert fit["processor_seconds"] >= 0
-    assert (fit["seconds"], fit["peak_memory_mb"], fit["gaussians"]) == (9.0, 80.0, 7)
-
-
-def test_lines_state_fits_and_steps():
-    fit = {"seconds": 90.4, "processor_seconds": 170.0, "peak_memory_mb": 380.2, "ssim": {"median": 0.9731}}
-    step = {"ms": {"value": 10.0, "low": 9.0, "high": 11.0}, "shares": {"products of networks": 0.6}}
-    lines = {line["what"]: line for line in training.rows({"wrf-gs+": fit}, {"WRF-GS+, 1": step})}
-    fitted = lines["WRF-GS+, fit to its final accuracy"]
-    assert fitted["value"] == "90 s, of processors 170 s; 380 MB; median SSIM 0.973"
-    assert fitted["asked"] == "180 s, 2048 MB"
-    assert lines["WRF-GS+, a step of 1 transmitter"]["value"] == "10 (9 to 11) ms"
-    assert lines["WRF-GS+, a step of 1 transmitter: where its time goes"]["value"] == "products of networks 60 %"
