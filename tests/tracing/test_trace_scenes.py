@@ -11,6 +11,7 @@ import trimesh
 from correction_rooms import TRUE_MATERIALS, channels, stated_scene
 from traced_rooms import FREQUENCY_HZ, SHOEBOX, receiver, write_xml
 from wrf_mi_scenes.build_laboratory import box, sheet
+from wrf_mi_scenes.divided import cluttered_room
 from wrf_mi_scenes.mitsuba_xml import ABSORBER
 
 from wrf_mi.apps.commands.main import main
@@ -26,6 +27,7 @@ from wrf_mi.scene.materials import read_materials
 from wrf_mi.scene.mesh.surfaces import Kind, Surface
 from wrf_mi.stages.correct import correct_scene
 from wrf_mi.tracing import RayTracer, TraceOptions, open_scene, trace_paths
+from wrf_mi.tracing.search import surfaces as surfaces_module
 from wrf_mi.tracing.search.devices import before_surfaces, check_devices, clear_m
 from wrf_mi.tracing.search.surfaces import find_planes, scene_surfaces
 
@@ -253,6 +255,27 @@ def test_planes_are_found_once_until_an_object_moves(shoebox_xml):
         after.triangles[own] - before.triangles[own], np.broadcast_to([0, 0, 0.5], (own.sum(), 3, 3)), atol=1e-6
     )
     np.testing.assert_array_equal(after.triangles[~own], before.triangles[~own])
+
+
+def test_planes_near_points_are_those_within_a_margin(monkeypatch):
+    rng, mesh = np.random.default_rng(0), cluttered_room(3000, np.zeros((1, 3)))
+    surfaces = find_planes(
+        ("room",), np.zeros(1, np.uint32), np.array([0, len(mesh.faces)]), np.asarray(mesh.triangles)
+    )
+    points_m = np.concatenate([mesh.triangles_center[::7] + 0.004, rng.uniform(*mesh.bounds, (200, 3))])
+    pairs = [set(zip(*map(np.ndarray.tolist, surfaces.near(points_m, 0.01)), strict=True))]
+    monkeypatch.setattr(surfaces_module, "FEW_PLANES", 10**6)
+    pairs.append(set(zip(*map(np.ndarray.tolist, surfaces.near(points_m, 0.01)), strict=True)))
+    assert pairs[0] == pairs[1]
+    # Those whose own rectangle is near are all among them.
+    away = np.einsum("nc,qc->nq", points_m, surfaces.normal) - surfaces.offset
+    along = np.einsum("nc,qac->nqa", points_m, surfaces.axes)
+    inside = (np.abs(away) < 0.01) & ((along > surfaces.low) & (along < surfaces.high)).all(axis=2)
+    found = np.zeros_like(inside)
+    found[tuple(np.array(sorted(pairs[0])).T)] = True
+    assert inside.any(axis=1).mean() > 0.5
+    assert (found | ~inside).all()
+    assert (np.abs(away[found]) < 0.01).all()
 
 
 BRICK = '<bsdf type="diffuse" id="mat-itu_brick"/>'

@@ -21,7 +21,7 @@ CLEAR = 2.5e-5  # that distance as a share of `Surfaces.scale_m`: twice as far a
 ON_M = 1e-6  # distance from a sheet within which rounding decides an antenna's side; it then takes that of the normal
 ON_SHARE = 0.1  # depth behind a surface, as a share of `clear_m`, up to which an antenna is on it but for rounding
 OUTSIDE_M = 0.02  # distance beyond the scene's box from which an antenna is named: a wall may let no path pass
-PAIRS_PER_CHUNK = 1 << 20  # pairs of a position and a triangle or plane in a chunk: bounds the memory
+PAIRS_PER_CHUNK = 1 << 20  # pairs of a position and a triangle in a chunk: bounds the memory
 
 
 def check_devices(surfaces: Surfaces, positions_m: FloatArray, names: Sequence[str]) -> None:
@@ -55,18 +55,21 @@ def before_surfaces(surfaces: Surfaces, positions_m: FloatArray) -> FloatArray:
     # Errors of a mesh, a millimetre in one from a scan, put antennas behind the wall on which they are mounted, where
     # no path arrives, or inside a cabinet.
     moved, clear = _outside_solids(surfaces, positions_m), clear_m(surfaces)
-    for point, plane in _pairs_near(surfaces, moved):
-        for index in np.unique(plane):
-            normal, offset = surfaces.normal[index], surfaces.offset[index]
-            corner_heights, near = surfaces.triangles @ normal - offset, point[plane == index]
-            inner_side = 1.0 if corner_heights.max() > -corner_heights.min() else -1.0
-            inwards = inner_side * corner_heights
-            height = moved[near] @ normal - offset
-            # An outer wall has the whole scene before it; any other sheet may carry antennas on both sides.
-            outer = inwards.min() >= -BEHIND_M and inwards.max() >= BEHIND_M
-            sides = np.full(len(near), inner_side) if outer else np.where(height < -ON_M, -1.0, 1.0)
-            low = sides * height < clear
-            moved[near[low]] += (sides * clear - height)[low, None] * normal
+    point, plane = surfaces.near(moved, BEHIND_M)
+    along = np.einsum("pac,pc->pa", surfaces.axes[plane], moved[point])
+    within = ((along > surfaces.low[plane] - BEHIND_M) & (along < surfaces.high[plane] + BEHIND_M)).all(axis=1)
+    point, plane = point[within], plane[within]
+    for index in np.unique(plane):
+        normal, offset = surfaces.normal[index], surfaces.offset[index]
+        corner_heights, near = surfaces.triangles @ normal - offset, point[plane == index]
+        inner_side = 1.0 if corner_heights.max() > -corner_heights.min() else -1.0
+        inwards = inner_side * corner_heights
+        height = moved[near] @ normal - offset
+        # An outer wall has the whole scene before it; any other sheet may carry antennas on both sides.
+        outer = inwards.min() >= -BEHIND_M and inwards.max() >= BEHIND_M
+        sides = np.full(len(near), inner_side) if outer else np.where(height < -ON_M, -1.0, 1.0)
+        low = sides * height < clear
+        moved[near[low]] += (sides * clear - height)[low, None] * normal
     return moved
 
 
@@ -137,14 +140,3 @@ def winding_number(triangles: FloatArray, points: FloatArray) -> FloatArray:
         half_angle = np.arctan2((a * np.cross(b, c)).sum(axis=-1), la * lb * lc + ab * lc + bc * la + ca * lb)
         number[part] = np.abs(half_angle.sum(axis=1)) / (2 * np.pi)
     return number
-
-
-def _pairs_near(surfaces: Surfaces, points: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs of points and planes within `BEHIND_M`, inside the bounds of the plane's faces, in chunks."""
-    step = max(1, PAIRS_PER_CHUNK // max(len(surfaces.normal), 1))
-    for start in range(0, len(points), step):
-        part = points[start : start + step]
-        point, plane = np.nonzero(np.abs(part @ surfaces.normal.T - surfaces.offset) < BEHIND_M)
-        along = np.einsum("pac,pc->pa", surfaces.axes[plane], part[point])
-        within = ((along > surfaces.low[plane] - BEHIND_M) & (along < surfaces.high[plane] + BEHIND_M)).all(axis=1)
-        yield start + point[within], plane[within]

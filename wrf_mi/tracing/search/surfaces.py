@@ -38,6 +38,8 @@ by which edges of enlarged faces do not match."""
 SMOOTH_COS = np.cos(np.radians(10))
 """Cosine of the bend of two faces up to which one goes on in the other: facets of curved furniture would otherwise
 overlap, and waves that pass such a body would meet two facets in place of one."""
+POINTS_TOGETHER = 1 << 16  # points whose near planes are looked for together: bounds the memory of the pairs
+FEW_PLANES = 256  # up to which heights above all planes are computed sooner than a tree is asked
 FARTHEST = 25.0  # largest scale by that about the middle of the scene: a room at 10 km from the origin keeps its doors
 MOST_AT_CORNER = 8.0  # farthest that a corner moves, in units of the enlargement: slivers reach to infinity
 
@@ -118,10 +120,36 @@ class Surfaces:
 
     @cached_property
     def boxes(self) -> tuple[shapely.STRtree, FloatArray]:
-        """Boxes around the enlarged faces of each plane [q, 2, 3], and a tree of their extents in x and y."""
-        low, high = plane_bounds(self.plane, self.triangles, len(self.normal))
-        low, high = low - ENLARGED * self.scale_m, high + ENLARGED * self.scale_m
+        """Boxes around the enlarged rectangle of each plane's faces [q, 2, 3], and a tree of their extents in x, y."""
+        ends = np.stack([self.low, self.high])
+        sides = [np.stack([self.axes[:, k] * end[:, k, None] for end in ends]) for k in (0, 1)]
+        corners = self.normal * self.offset[:, None] + sides[0][:, None] + sides[1][None]
+        low, high = (
+            corners.min(axis=(0, 1)) - ENLARGED * self.scale_m,
+            corners.max(axis=(0, 1)) + ENLARGED * self.scale_m,
+        )
         return shapely.STRtree(shapely.box(*low[:, :2].T, *high[:, :2].T)), np.stack([low, high], axis=1)
+
+    def near(self, points_m: FloatArray, margin_m: float) -> tuple[IntArray, IntArray]:
+        """Pairs of points [n, 3] and planes within a margin of each other, where faces are within it, too.
+
+        Some pairs have no face so near: bounds are those of rectangles. Points ascend, and planes of each.
+        """
+        (tree, boxes), parts = self.boxes, [np.zeros((2, 0), np.int64)]
+        for start in range(0, len(points_m), POINTS_TOGETHER):
+            points = points_m[start : start + POINTS_TOGETHER]
+            low, high = points - margin_m, points + margin_m
+            if len(self.normal) > FEW_PLANES:
+                pair = tree.query(shapely.box(*low[:, :2].T, *high[:, :2].T))
+                point, plane = pair[:, np.lexsort((pair[1], pair[0]))]
+            else:
+                point, plane = np.nonzero(np.abs(points @ self.normal.T - self.offset) < 2 * margin_m)
+            near = ((high[point] >= boxes[plane, 0]) & (low[point] <= boxes[plane, 1])).all(axis=1)
+            height = np.einsum("pc,pc->p", points[point], self.normal[plane]) - self.offset[plane]
+            near &= np.abs(height) < margin_m
+            parts.append(np.stack([start + point[near], plane[near]]))
+        point, plane = np.concatenate(parts, axis=1)
+        return point, plane
 
     @cached_property
     def face_edges(self) -> tuple[FloatArray, FloatArray]:

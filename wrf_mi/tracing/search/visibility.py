@@ -36,7 +36,7 @@ times that within which rays do not count them (`WINDOW`)."""
 SEAM_M, SEAM = 5e-5, 1e-6
 """Distance from a face in metres, and as a share of the scale, within which a point is on it: half the gap that sheets
 leave which were modelled one by one, `wrf_mi.scene.mesh.surfaces.SAME_CORNER_M`."""
-PAIRS_TOGETHER = 1 << 20  # pairs of points and planes, or faces, in a chunk
+PAIRS_TOGETHER = 1 << 20  # pairs of points and faces in a chunk
 UNKNOWN_FACE = (1 << 31) - 1  # face of a reflection that rays cannot distinguish from another one at the same point
 
 
@@ -322,23 +322,9 @@ def _crossed(
 
 
 def _near_planes(surfaces: Surfaces, plane: IntArray, points_m: FloatArray) -> _Near:
-    tree, boxes = surfaces.boxes
-    groups = list(_by_value(plane))
-    mirrors = np.array([mirror for mirror, _ in groups], np.int64)
-    query, touching = tree.query(tree.geometries[mirrors])
-    above = boxes[touching, 0, 2] <= boxes[mirrors[query], 1, 2]
-    above &= boxes[touching, 1, 2] >= boxes[mirrors[query], 0, 2]
-    above &= touching != mirrors[query]
-    query, touching = query[above], touching[above]
-    first = np.searchsorted(query, np.arange(len(mirrors) + 1))
-    parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64))]
-    for number, (_, rows) in enumerate(groups):
-        others = touching[first[number] : first[number + 1]]
-        for part in np.array_split(rows, -(-len(rows) * max(len(others), 1) // PAIRS_TOGETHER)):
-            height = points_m[part] @ surfaces.normal[others].T - surfaces.offset[others]
-            row, other = np.nonzero(np.abs(height) < NEAR * surfaces.scale_m)
-            parts.append((part[row], others[other]))
-    point, other = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    point, other = surfaces.near(points_m, NEAR * surfaces.scale_m)
+    different = other != plane[point]
+    point, other = point[different], other[different]
     return point, other, points_m[point]
 
 
