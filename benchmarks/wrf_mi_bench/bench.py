@@ -104,6 +104,7 @@ _OWN: Mapping[str, Check] = {
     "pareto": _here("run time against error", "table_pages:pareto", resumes=True, table="table_pages:front_table"),
     "scaling": _here("cost against work", "scaling:main"),
     "side-by-side": _here("side by side", "side_by_side:main", resumes=True, table="side_by_side:table"),
+    "skips": _here("what is not evaluated", "skips:main", table="skips:table"),
     "stages": _here("hybrid and its parts alone", "stages:main", RFID, FLAT, resumes=True, table="stages:table"),
     "new-carriers": _here("carriers without measurements", "unmeasured:carriers", table="unmeasured:table", **_STORED),
     "new-receivers": _here(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import sionna.rt
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from threadpoolctl import threadpool_limits
 from wrf_mi_scenes.divided import cluttered_room, divided_room
 
@@ -117,7 +118,8 @@ def _bartlett(elements: int, height: int = HEIGHT, width: int = WIDTH) -> Call:
     return lambda: bartlett_spectrum(signals, array_m, FREQUENCY_HZ, height, width)
 
 
-def _opened(kind: str, triangles: int) -> Any:
+def opened_room(triangles: int, kind: str = "clutter") -> Any:
+    """Scene of a cluttered room, or of one with divided walls, ``kind="walls"``."""
     near = np.concatenate([transmitter_path(1), RECEIVER.position_m[None]])
     mesh = divided_room(triangles) if kind == "walls" else cluttered_room(triangles, near)
     return opened(mesh, FREQUENCY_HZ, "concrete")
@@ -125,12 +127,12 @@ def _opened(kind: str, triangles: int) -> Any:
 
 def _trace(kind: str, triangles: int) -> Call:
     """One transmitter in an opened mesh whose planes are known: rays, paths and gains."""
-    scene, tx = _opened(kind, triangles), transmitter_path(1)
+    scene, tx = opened_room(triangles, kind), transmitter_path(1)
     return lambda: len(trace_paths(scene, tx, RECEIVER, OPTIONS).paths)
 
 
 def _planes(kind: str, triangles: int) -> Call:
-    known = scene_surfaces(_opened(kind, triangles))
+    known = scene_surfaces(opened_room(triangles, kind))
     return lambda: len(find_planes(known.names, known.shape_ids, known.first_face, known.triangles).normal)
 
 
@@ -259,7 +261,8 @@ def growth_figure(results: Sequence[dict[str, Any]]) -> Figure:
         panel.loglog(sizes, np.maximum(result["memory_mb"], 1), "s:", color="C1", label="memory (MB)")
         panel.set_title(result["title"], fontsize=9)
         panel.set_xlabel(result["work"], fontsize=8)
-        panel.tick_params(labelsize=7)
+        panel.tick_params(which="both", labelsize=7)
+        panel.xaxis.set_minor_formatter(NullFormatter())
         panel.grid(alpha=0.3)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure

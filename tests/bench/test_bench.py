@@ -20,12 +20,12 @@ from wrf_mi.core.registry import resolve
 
 RESULTS = CHECKOUT / "benchmarks" / "results"
 NEEDS_NO_DATA = {
-    *("side-by-side", "scaling", "stress", "pareto", "rooms", "phase-error"),
+    *("side-by-side", "skips", "scaling", "stress", "pareto", "rooms", "phase-error"),
     *("closed-forms", "elsewhere", "gpu", "sentinels", "new-carriers", "moved", "far-scans", "phone-scans"),
 }
 """Checks on what is made here, and on stored figures."""
 ON_PAGE = {
-    **dict.fromkeys(("side-by-side", "waits"), "speed.md"),
+    **dict.fromkeys(("side-by-side", "skips", "waits"), "speed.md"),
     **dict.fromkeys(("stages", "ablation"), "hybrid.md"),
     **{"rooms": "correction.md", "locate": "locate.md", "moved": "scenes.md"},
     **dict.fromkeys(("fdtd", "far-scans"), "correction.md"),

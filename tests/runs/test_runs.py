@@ -25,6 +25,7 @@ from wrf_mi.tasks.spectrum import Spectrum
 from wrf_mi.training.adam import NumericsError
 from wrf_mi.training.checkpoint import read_checkpoint
 from wrf_mi.training.config import TrainConfig
+from wrf_mi.training.events import EVENTS
 from wrf_mi.training.loop import Progress
 from wrf_mi.training.trainer import Trainer
 
@@ -177,7 +178,7 @@ def test_run_folder_is_complete(folder: Path, tmp_path: Path, one_gateway: Recor
     known: dict[str, Any] = {"settings": settings("steps=10", "seed=3"), "split": "random", "n_train": 0.5}
     run = train(folder, "wrf-gs+", out=tmp_path / "run", **known)
     files = {"config.yaml", "log.jsonl", "metrics.json", "model.npz", "predictions.npz", "split.npz"}
-    assert contents(run.folder) == files
+    assert contents(run.folder) - {EVENTS} == files
     config = yaml.safe_load((run.folder / "config.yaml").read_text())
     assert (config["dataset"], config["split"], config["n_train"], config["seed"]) == (str(folder), "random", 0.5, 3)
     assert config["settings"]["initial"]["gaussians"] == 8

@@ -16,6 +16,7 @@ from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.array_files import write_arrays
 from ..core.carriers import FREQUENCY
+from ..core.counts import Counts, added, counted
 from ..core.files import write_atomically
 from ..core.memory import peak_memory_mb
 from ..core.task import IDW, NEIGHBOURS
@@ -44,6 +45,7 @@ NOT_SCORED = "n_not_scored"
 """Key of the number of observations in test rows that are not finite, though the receiver received something."""
 FEW = "receivers_with_few_rows"
 """Key of the receivers with fewer than `FEW_ROWS` training rows, each with its number of them."""
+COUNTS = "evaluated"  # key of the counts of what predictions of test rows evaluated, and of what they left out
 PLACES = "receiver_places"  # key of positions that were estimated, with their standard deviations, metres
 N_TRAIN_OF_FOLDS = "n_train_of_folds"  # key of the numbers of training rows of the folds that the scores are of
 LEFT_OUT = "receivers_left_out"
@@ -227,6 +229,7 @@ def pool(parts: Sequence[Scores]) -> Scores:
         **({FEW: few} if few else {}),
         "n_train": round(float(np.mean([m["n_train"] for m in blocks]))),
         N_TRAIN_OF_FOLDS: [m["n_train"] for m in blocks],
+        **({COUNTS: counts} if (counts := added([m.get(COUNTS, {}) for m in blocks])) else {}),
         "ms_per_sample": float(np.median([m["ms_per_sample"] for m in blocks])),
     }
     return metrics, arrays
@@ -282,10 +285,15 @@ def _evaluate_part(problem: Problem, part: FittedPart) -> Scores:
     def single(rows: IntArray, receiver: int) -> Prediction:
         return fitted.predict(inputs_of(record, rows), receiver)
 
+    of_calls = list[Counts]()
+
     def predict(rows: IntArray, receiver: int) -> Prediction:
-        return fitted.predict_rows(rows, receiver) or single(rows, receiver)
+        with counted() as counts:
+            of_calls.append(counts)
+            return fitted.predict_rows(rows, receiver) or single(rows, receiver)
 
     metrics, arrays = evaluate(record, part.split, predict, single)
+    metrics |= {COUNTS: counts} if (counts := added(of_calls)) else {}
     return metrics | _stage_scores(record, part, metrics, arrays), arrays
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..core import InputError, Prediction, Record, Split
 from ..core.angles import FloatArray
 from ..core.array_files import keyed, under
+from ..core.counts import count
 from ..core.stored import NOT_STORED, from_arrays, to_arrays
 from ..core.types import IntArray
 from ..estimators.held_out import HoldOut, predicted_rows
@@ -235,19 +236,20 @@ class FittedMixture(Fitted):
         std: bool,
     ) -> Decomposition:
         """Weighted mean of the parts and the residuals, of the deviations that parts state, and both sides of it."""
-        observed, count = self.problem.record.observation, len(tx_pos_m)
+        observed, m = self.problem.record.observation, len(tx_pos_m)
         shape, kind = observed.shape[2:], np.result_type(observed, np.float64)
         weights = self.weights(distance_m)
-        residual_weight = weights[:, len(self.parts)] if self.residuals is not None else np.zeros(count)
+        residual_weight = weights[:, len(self.parts)] if self.residuals is not None else np.zeros(m)
         of_parts = weights[:, : len(self.parts)]
         # A part may state the deviations of a mixture in which it has no weight.
         of_std = deviation_weights(of_parts, self._states) * std
-        sides, totals = np.zeros((2, count, *shape), kind), np.zeros((2, count))
-        paths, (size, size_of_mean) = None, np.zeros((2, count, *shape))
+        sides, totals = np.zeros((2, m, *shape), kind), np.zeros((2, m))
+        paths, (size, size_of_mean) = None, np.zeros((2, m, *shape))
         for (name, part), weight, std_weight in zip(self.parts.items(), of_parts.T, of_std.T, strict=True):
             # Residuals are about the scene's side, which is therefore a part of what they predict.
             share = weight + residual_weight if name == PATHS else weight
             rows = np.flatnonzero(share + std_weight)
+            count("rows of parts", len(rows), len(share) - len(rows))
             if not len(rows):
                 continue
             by_part = predict(part, rows, bool(std_weight.any()))
@@ -259,7 +261,7 @@ class FittedMixture(Fitted):
                 # NaN of a part that does not state it.
                 of_mean = by_part.prediction.std_mean
                 size_of_mean[rows] += _spread(std_weight[rows], shape) * (np.nan if of_mean is None else of_mean)
-            paths = paths or (by_part.paths and by_part.paths.placed(rows, count))
+            paths = paths or (by_part.paths and by_part.paths.placed(rows, m))
         mean = sides.sum(axis=0)
         rows = np.flatnonzero(residual_weight)
         if len(rows) and self.residuals is not None:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ..core import InputError
 from ..core.array_files import stored_arrays, under, write_arrays
 from ..core.files import append_line, readable, write_atomically
+from .events import append_event, restart
 
 if TYPE_CHECKING:
     from .loop import Progress, TrainingLoop
@@ -85,6 +86,7 @@ def append_log(folder: Path, progress: Progress) -> None:
     if progress.validation_score is not None and math.isnan(progress.validation_score):
         entry["validation_score"] = None  # there are no validation rows, and JSON has no NaN
     append_line(folder / LOG, json.dumps(entry))
+    append_event(folder, entry)
 
 
 def cut_log(folder: Path, step: int) -> None:
@@ -92,6 +94,7 @@ def cut_log(folder: Path, step: int) -> None:
     path = folder / LOG
     if not path.is_file():
         return
+    restart(folder, step)
     written = [line for line in path.read_bytes().splitlines() if line]
     steps = [_step_of(line) for line in written]
     if damaged := steps.count(None):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -16,16 +17,21 @@ from ..backend.device import to_tensor
 from ..core import InputError, Receiver, Record
 from ..core.angles import FloatArray
 from ..core.carriers import carriers_text, rows_by_carrier
+from ..core.counts import count, counting
 from ..core.receivers import receiver_index
 from ..core.types import IntArray
+from ..gaussians.footprint import depth_order, project
 from ..gaussians.parameters import Gaussians
+from ..gaussians.tiles import build_lists, perception_plane
 from ..graph.graph import Alone, Graph
+from ..receivers.registry import PIXEL
 from ..receivers.spreads import PathStatistics, joined
 from ..tasks.conditions import known_headings, normalised_uplink
 from ..tracing.paths.traced_field import TracedField
 from .adam import Params
 from .by_distance import Reach
 from .evaluator import OperatorReports, Request, evaluator_of
+from .step import device_pose
 
 SEARCHED = 512  # transmitters of a carrier whose paths are searched together: a search has a fixed cost
 
@@ -129,6 +135,8 @@ class Predictor:
         carriers = None if form.carriers_hz is None else np.asarray(carriers_hz, float)
         if not len(positions):
             return self._reported(positions, index * self.graph.carriers)
+        if counting() and self.graph.form.receiver == PIXEL and self.graph.field is not None:
+            self._count_gaussians(positions, index)
         groups = [
             (rows, predictor._reported(positions[rows], port, side))
             for rows, predictor, port, side in self._sides(positions, index, headings, carriers)
@@ -136,6 +144,15 @@ class Predictor:
         # Groups come in the order of the search, which brings equal positions together.
         order, reports = (np.concatenate(parts) for parts in zip(*groups, strict=True))
         return reports[np.argsort(order)]
+
+    def _count_gaussians(self, tx_pos_m: FloatArray, receiver: int) -> None:
+        """Count the pairs of a tile of an image and a Gaussian that reaches it, by the first of transmitters [m, 3]."""
+        height, width = self.graph.form.size
+        plane, gaussians = perception_plane(height, width, mi.Float), self.gaussians(tx_pos_m[:1])
+        footprints = project(gaussians, device_pose(self.receivers[receiver]))
+        order = depth_order(footprints.depth, gaussians.position)
+        reached = len(tx_pos_m) * int(dr.sum(build_lists(footprints, order, plane, 1).length)[0])
+        count("tiles of Gaussians", reached, len(tx_pos_m) * plane.tiles * gaussians.count - reached)
 
     def _from_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:
         # Antennas of an uplink are independent inputs, without positions and paths.

@@ -82,6 +82,9 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool, mo
             f"scores are cross-validated: each row is predicted by a fit to the other {folds['folds'] - 1} of "
             f"{of_folds or str(folds['folds']) + ' folds'}; the model is fitted to all rows"
         )
+    if "evaluated" in metrics:
+        parts = [(what, of["evaluated"], of["evaluated"] + of["skipped"]) for what, of in metrics["evaluated"].items()]
+        print("evaluated: " + ", ".join(f"{done:,} of {every:,} {what}" for what, done, every in parts if every))
     for line in (*verdicts(metrics), *more, *warnings_of(metrics)):
         print(line)
     if folder is not None:

@@ -29,6 +29,7 @@ from ...tracing.paths.edited_scene import parameters_in
 from ...training.by_distance import Reach
 from ...training.checkpoint import CHECKPOINT, LOG, append_log, cut_log, read_checkpoint, write_checkpoint
 from ...training.config import PRESETS, TrainConfig, unused_of_loop, validates
+from ...training.events import EVENTS
 from ...training.fields import check_params, field_of
 from ...training.fit_plan import FitPlan
 from ...training.initial import initial_gaussians, starting_values
@@ -342,8 +343,9 @@ class GaussianField(Model):
     def _finished(self, trainer: Trainer, problem: Problem, split: Split, session: Session) -> FittedField:
         """The field after the last step of the chosen training, whose log is that of the fit."""
         folder = _folder(session, trainer.plan)
-        if folder != session.folder and (folder / LOG).exists():  # a resumed fit may have moved it before it ended
-            (folder / LOG).replace(session.folder / LOG)
+        for name in (LOG, EVENTS):
+            if folder != session.folder and (folder / name).exists():  # a resumed fit may have moved it before it ended
+                (folder / name).replace(session.folder / name)
         session.discarded.extend(session.folder / name for name in trainer.plan.curriculum[:-1])
         return self._fitted(trainer, problem, split, session.folder)
 

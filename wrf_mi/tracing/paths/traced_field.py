@@ -28,6 +28,7 @@ from ...backend.vectors import Float64, times
 from ...core import Antenna, InputError, Receiver
 from ...core.antenna import ANTENNA
 from ...core.carriers import rows_by_carrier
+from ...core.counts import count
 from ...core.types import FloatArray, IntArray
 from ...receivers.device_paths import TracedPaths
 from ...receivers.spreads import PathStatistics
@@ -259,7 +260,10 @@ class TracedField:
         amplitude = self._amplitudes(chains)
         strong = paths_with_gain(amplitude)
         strong = strong[without_faint(tx[strong], amplitude[strong], self.options.faint)]
+        count("paths", len(strong), len(types) - len(strong))
         tx, types, face, vertices_m = tx[strong], types[strong], face[strong], traced.paths.vertices_m[strong]
+        met_planes = np.unique(surfaces.plane[face[types != 0]]) if len(surfaces.plane) else face[:0, 0]
+        count("planes", len(met_planes), len(surfaces.normal) - len(met_planes))
         # A rectangle of transmitters by paths, filled up with place holders: sums are then reductions of equal blocks.
         each = max(1, int(np.bincount(tx, minlength=1).max(initial=0)))
         if len(self) == 1:

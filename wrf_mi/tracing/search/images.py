@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.counts import count
 from ...core.types import FloatArray, IntArray
 from ..options import TraceOptions
 from .chains import SPECULAR, PathInteractions, ReflectionChains, join, possible
@@ -80,6 +81,8 @@ def specular_paths(
     columns = [(np.full(np.count_nonzero(apart), -1), source[apart], target[apart])]
     columns += [(chain, chains.source[chain], target) for chain, target in possible(surfaces, chains, targets_m)]
     candidates = [np.concatenate(column) for column in zip(*columns, strict=True)]
+    pairs = len(direct) + len(chains) * len(targets_m)
+    count("candidates of paths", len(candidates[0]), pairs - len(candidates[0]))
     clear = [before_surfaces(surfaces, ends) - surfaces.centre_m for ends in (sources_m, targets_m)]
     parts = []
     for start in range(0, max(1, len(candidates[0])), CANDIDATES_PER_CHUNK):
