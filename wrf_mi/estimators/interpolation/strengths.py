@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 HEADINGS = 8  # headings over which the prediction is averaged where the heading is unknown
 CHUNK = 1024  # transmitters predicted together, which bounds the memory of their covariances with the rows
 MOST_COVARIANCES = 1e8
-"""Covariances between stops, of all receivers: factors of 0.8 GB, half a minute at four. With more, stops are thinned."""
+"""Covariances between stops, of all receivers: factors of 0.8 GB, 30 s at four; with more, stops are thinned."""
 ROBUST_ROUNDS = 2  # rounds of weights for Student-t noise, by the residuals of the one before
 LEAST_HEARD = 4  # receivers with more than a few rows that tell how well the others are predicted from them
 NO_SHADOW_DB = 1e-3  # standard deviation of shadowing where there is none: it has to be above zero
