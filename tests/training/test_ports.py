@@ -155,7 +155,8 @@ def assert_restored(run, record):
 
 
 def test_a_field_of_several_carriers_is_trained_beside_paths_and_restored(xml, tmp_path):
-    record, settings = spectra(xml), (*QUICK, "steps=16", "traced.rays=4096", "traced.depth=2")
+    record, small = spectra(xml), ("network.width=16", "network.layers=2", "traced.rays=4096", "traced.depth=2")
+    settings = (*QUICK, *small, "steps=16")
     how: dict[str, Any] = {"scene": str(xml), "split": "frequency-known:1", "settings": settings}
     assert_restored(wrf_mi.train(record, "wrf-gs+", out=tmp_path / "run", **how), record)
 
