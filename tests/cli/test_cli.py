@@ -346,7 +346,7 @@ def test_demo_compares_models_in_a_held_out_region_and_in_a_measured_flat(flat_f
     """With fewer rows and points and without the hybrid, which other tests fit; the flat is synthetic."""
     room, rows = synthetic.load_record("laboratory"), np.arange(20)
     scan = arrays_in(Path(room.source) / stored.SCAN)
-    np.savez(tmp_path / "scan.npz", **scan | {"points": scan["points"][::4]})
+    np.savez(tmp_path / "scan.npz", points=scan["points"][::4])
     monkeypatch.setattr(stored, "SCAN", tmp_path / "scan.npz")
     few = replace(
         room, tx_pos_m=room.tx_pos_m[rows], observation=room.observation[:, rows], official=(rows[6:], rows[:6])
