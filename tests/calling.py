@@ -13,7 +13,8 @@ from wrf_mi.apps.commands.main import main
 from wrf_mi.core.array_files import CHECKSUM
 from wrf_mi.runs.folder import FORMAT
 
-SMALL = ["initial.gaussians=8", "optimiser.warm_up=5", "density.every=0", "log_every=2", "validate_every=4", "steps=4"]
+SMALL = ["network.width=16", "network.layers=2", "initial.gaussians=8", "optimiser.warm_up=5", "density.every=0"]
+SMALL += ["log_every=2", "validate_every=4", "steps=4"]
 SET = [part for setting in SMALL for part in ("--set", setting)]
 """Settings of a very short training."""
 

@@ -252,13 +252,13 @@ steps = stages_of_others:STAGE
 roughness = roughness_of_others:ROUGHNESS
 """
 CALLS = """
-import contextlib, io, json, sys
+import contextlib, io, json, os, sys
 from wrf_mi.apps.commands.main import main
 
 for words in json.loads(sys.argv[1]):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        status = main(words)
+        status = os.remove(words[1]) if words[0] == "remove" else main(words)
     print(json.dumps([status, out.getvalue(), err.getvalue()]))
 """
 
@@ -276,7 +276,10 @@ def installed(site: Path) -> dict[str, str]:
 
 
 def commands(environment: dict[str, str], calls: dict[str, list[Any]]) -> dict[str, tuple[int, str, str]]:
-    """Status, standard output and standard error of commands, one after the other in a process of their own."""
+    """Status, standard output and standard error of commands, one after the other in a process of their own.
+
+    ``remove FILE`` among them removes a file.
+    """
     words = json.dumps([[str(word) for word in call] for call in calls.values()])
     process = [sys.executable, "-c", CALLS, words]
     done = subprocess.run(process, env=environment, capture_output=True, text=True, timeout=300, check=False)

@@ -11,13 +11,15 @@ from wrf_mi.training.config import TrainConfig
 QUICK = (
     "initial.gaussians=8",
     "initial.size_deg=15",
+    "network.width=16",
+    "network.layers=2",
     "optimiser.warm_up=5",
     "optimiser.ema_decay=0.9",
     "density.every=0",
     "log_every=5",
     "validate_every=20",
 )
-"""Eight Gaussians in all tests, so that most find their kernels compiled."""
+"""Eight Gaussians and one network in all tests, so that most find their kernels compiled."""
 
 
 def settings(*own: str, model: str = "wrf-gs+") -> TrainConfig:

@@ -30,6 +30,7 @@ from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.runs import api as runs
 from wrf_mi.runs.api import open_run
+from wrf_mi.synthetic import stored
 from wrf_mi.training.checkpoint import read_checkpoint
 from wrf_mi.training.loop import Progress
 from wrf_mi.training.session import quiet
@@ -340,9 +341,13 @@ def test_demo_finds_or_fetches_real_data(folder, monkeypatch, capsys):
     assert capsys.readouterr().err == "no rfid-lab (no network)\n"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_demo_compares_models_in_a_held_out_region_and_in_a_measured_flat(flat_folder, tmp_path, monkeypatch, command):
-    """With fewer rows and without the hybrid, which other tests fit; the flat is synthetic, of the same layout."""
+    """With fewer rows and points and without the hybrid, which other tests fit; the flat is synthetic."""
     room, rows = synthetic.load_record("laboratory"), np.arange(20)
+    scan = arrays_in(Path(room.source) / stored.SCAN)
+    np.savez(tmp_path / "scan.npz", points=scan["points"][::4])
+    monkeypatch.setattr(stored, "SCAN", tmp_path / "scan.npz")
     few = replace(
         room, tx_pos_m=room.tx_pos_m[rows], observation=room.observation[:, rows], official=(rows[6:], rows[:6])
     )

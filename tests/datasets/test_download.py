@@ -207,10 +207,16 @@ def test_a_room_is_found_in_its_own_folder_or_beside_others(home: Path, monkeypa
     place = home / "data" / folder
     place.mkdir(parents=True)
     refusal(load, "newrf-office", "run `wrf-mi data fetch newrf-office`")
-    write_arrays(place / "office.npz", convert_newrf(PICKLES / "newrf_protocol5.pkl"))
+    write_arrays(place / "office.npz", converted())
     assert load("newrf-office").source == str(place / "office.npz")
     refusal(load, "newrf-conference", "newrf-conference: not on this machine")
     assert {s.dataset.name for s in datasets() if s.location} == {"newrf-office"}
+
+
+@functools.cache
+def converted() -> dict[str, np.ndarray]:
+    """Arrays of the pickle that is served."""
+    return convert_newrf(PICKLES / "newrf_protocol5.pkl")
 
 
 def room(root: Path) -> list[RemoteFile]:
@@ -218,10 +224,9 @@ def room(root: Path) -> list[RemoteFile]:
     (root / "abc123").mkdir()
     (root / "abc123" / "hall.stl").write_bytes(b"mesh")
     shutil.copyfile(PICKLES / "newrf_protocol5.pkl", root / "abc123" / "data.pkl")
-    arrays = convert_newrf(root / "abc123" / "data.pkl")
     return [
         remote(root / "abc123" / "hall.stl", "hall.stl"),
-        RemoteFile("hall.npz", arrays_sha256(arrays), "abc123/data.pkl", True),
+        RemoteFile("hall.npz", arrays_sha256(converted()), "abc123/data.pkl", True),
     ]
 
 

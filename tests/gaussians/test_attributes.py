@@ -1,23 +1,16 @@
-"""Attributes of Gaussians that installed packages add."""
+"""Attributes of Gaussians that other packages add; `test_registries` trains one by commands."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
-from outside_packages import ROUGHNESS, commands, installed
+from outside_packages import ROUGHNESS
 
 from wrf_mi.core import InputError, Receiver
 from wrf_mi.gaussians import ATTRIBUTES, FIELDS, Encoding, WithAttributes, random_gaussians
 from wrf_mi.gaussians.attributes import grown_attributes, with_attributes
 
-SETTINGS = (
-    *("steps=60", "batch=8", "initial.gaussians=6", "density.every=20", "density.stop=0.7", "view.height=4"),
-    *("network.layers=2", "network.width=8", "view.columns=8", "attributes=roughness"),
-)
 RECEIVER = Receiver("r", np.zeros(3), np.array([0.0, 0, 0, 1]))
 
 
@@ -27,33 +20,6 @@ def roughness() -> Any:
     module: dict[str, Any] = {}
     exec(ROUGHNESS, module)
     return module["ROUGHNESS"]
-
-
-def test_commands_train_an_attribute_of_an_installed_package(flat_folder: Path, tmp_path: Path) -> None:
-    environment, run = installed(tmp_path / "site"), tmp_path / "run"
-    words = [word for setting in SETTINGS for word in ("--set", setting)]
-    (tmp_path / "tx.csv").write_text("x,y,z\n1,2,1\n")
-    train = ["train", flat_folder, "--model", "wrf-gs+", *words, "--json", "--out", run]
-    results = commands(environment, {"trained": train})
-    for name in ("model.npz", "metrics.json", "predictions.npz"):
-        (run / name).unlink(missing_ok=True)  # as of a run that was stopped
-    calls = {
-        "resumed": ["train", "--resume", run, "--json"],
-        "scored": ["evaluate", run, "--json"],
-        "predicted": ["predict", run, "--tx", tmp_path / "tx.csv", "--out", tmp_path / "p.npz"],
-        "compared": ["compare", run, "--out", tmp_path / "page"],
-        "exported": ["export", run, "--format", "3dgs", "--tx", "1,2,1", "--out", tmp_path / "splat.ply"],
-    }
-    results |= commands(environment, calls)
-    assert [status for status, _, _ in results.values()] == [0] * 6, results
-    errors = [json.loads(results[name][1])["abs_error_db"]["mean"] for name in ("trained", "resumed", "scored")]
-    assert errors[0] == pytest.approx(errors[1]) == pytest.approx(errors[2])
-    with np.load(run / "model.npz") as arrays:
-        stored = arrays["params/roughness"]
-    assert stored.shape[0] == 1
-    assert not np.isin(stored, np.array([0.1, 0.05], np.float32)).any()  # all have been trained
-    exported = trimesh.load(tmp_path / "splat.ply").metadata["_ply_raw"]["vertex"]["data"]["roughness"]
-    np.testing.assert_array_equal(np.ravel(exported), stored[0])
 
 
 @pytest.mark.parametrize("name", list(FIELDS))

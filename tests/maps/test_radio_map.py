@@ -257,7 +257,7 @@ def test_sides_of_a_hybrid_add_up_by_their_weights(room: tuple[Path, Record], tm
 
 def test_sides_of_a_joint_model_add_up_as_amplitudes(room: tuple[Path, Record], tmp_path: Path) -> None:
     scene, record = room
-    settings = [*SMALL, "traced.depth=1", "traced.reflections=1", "traced.rays=1024"]
+    settings = [*SMALL, "traced.depth=1", "traced.reflections=1", "traced.rays=1024", "patience=0"]
     run = wrf_mi.train(record, "wrf-gs+", out=tmp_path / "run", scene=scene, settings=settings)
     run.field.predictor.reach = None  # Gaussians everywhere, whatever these few steps gained
     positions = record.tx_pos_m[:5]

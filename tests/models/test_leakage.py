@@ -16,7 +16,7 @@ from wrf_mi.estimators.model import Arrays, default_settings, inputs_of
 from wrf_mi.models import MODELS, Problem, Session
 
 STEPS = ("steps=3", "log_every=100", "validate_every=3")
-SMALL = ("initial.gaussians=8", "network.width=8", "density.every=0", *STEPS)
+SMALL = ("initial.gaussians=8", "network.width=8", "network.layers=2", "density.every=0", *STEPS)
 SETTINGS = {
     "wrf-gs": SMALL,
     "wrf-gs+": SMALL,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from outside_packages import ATTENUATORS, CABLE_DB, NEAREST, STEPS, commands, installed
 from small_fits import stop_after
 from wrf_mi_bench import bench
@@ -199,24 +200,23 @@ def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[
     table[:, 3] = FIELD_DB - 20 * np.log10(np.linalg.norm(places - [0, 0, 2], axis=1))
     np.savetxt(fields / "fields.csv", table, "%.4f", ",", header="x,y,z,field_db", comments="")
     words = [word for setting in SETTINGS for word in ("--set", setting)]
-    asked = ["--model", "wrf-gs+", "--receiver-model", "attenuated", "--json", *words, "--out", folder / "attenuated"]
+    of_others = ["--set", "loss.name=huber", "--set", "attributes=roughness", "--set", "density.every=20"]
+    field = ["--model", "wrf-gs+", "--json", *words, *of_others, "--set", "density.stop=0.7", "--out", folder / "field"]
+    asked = ["--receiver-model", "attenuated", "--json", *words, "--out", folder / "attenuated"]
     nearest = ["--model", "nearest", "--set", "neighbours=1", "--json", "--out", folder / "nearest"]
-    by_loss = ["--set", "loss.name=huber", "--json", *words, "--out", folder / "huber"]
-    models = ("idw", "kriging", "hybrid", *SERVED)
-    results = commands(
-        environment,
-        {model: ["train", data, "--model", model, "--out", folder / model] for model in models}
-        | {
-            "nearest": ["train", flat_folder, *nearest],
-            "receiver": ["train", flat_folder, "--model", "wrf-gs+", *asked],
-            "loss": ["train", flat_folder, "--model", "wrf-gs+", *by_loss],
-            "field": ["train", fields, "--model", "wrf-gs+", "--json", *words, "--out", folder / "field"],
-            "stage": ["train", write_ble_folder(folder / "steps", in_steps()), "--out", folder / "stage", "--json"],
-        },
-    )
+    calls = {
+        model: ["train", data, "--model", model, "--out", folder / model]
+        for model in ("idw", "kriging", "hybrid", *SERVED)
+    }
+    calls |= {
+        "nearest": ["train", flat_folder, *nearest],
+        "receiver": ["train", flat_folder, "--model", "wrf-gs+", *asked],
+        "field": ["train", fields, *field],
+        "stage": ["train", write_ble_folder(folder / "steps", in_steps()), "--out", folder / "stage", "--json"],
+        "benchmark": ["bench", "attenuator", "--out", folder / "results", "--runs", folder / "benchmarks"],
+    }
     for name in ("idw/metrics.json", "field/model.npz", "field/metrics.json"):
-        (folder / name).unlink()  # as of runs that were stopped
-    calls = {"benchmark": ["bench", "attenuator", "--out", folder / "results", "--runs", folder / "benchmarks"]}
+        calls[name] = ["remove", folder / name]  # as of runs that were stopped
     # Models and stages are resumed, scored and compared within this process above.
     for run in ("idw", "field"):
         calls |= {
@@ -227,7 +227,17 @@ def outcome(flat_folder: Path, tmp_path_factory) -> tuple[Path, dict[str, tuple[
     for run in ("nearest", "kriging", "stage", "field"):
         out = folder / f"{run}.npz"
         calls[f"{run} predicted"] = ["predict", folder / run, "--tx", folder / "tx.csv", "--out", out]
-    return folder, results | commands(environment, calls)
+    calls["field exported"] = [
+        "export",
+        folder / "field",
+        "--format",
+        "3dgs",
+        "--tx",
+        "1,2,1",
+        "--out",
+        folder / "splat.ply",
+    ]
+    return folder, commands(environment, calls)
 
 
 def test_commands_find_the_model_of_an_installed_package(outcome: Any) -> None:
@@ -246,12 +256,6 @@ def test_commands_find_the_receiver_and_the_benchmark_of_an_installed_package(ou
     assert "attenuation" in (folder / "results" / "README.md").read_text()
 
 
-def test_commands_find_the_loss_of_an_installed_package(outcome: Any) -> None:
-    folder, results = outcome
-    assert results["loss"][0] == 0, results["loss"]
-    assert "name: huber" in (folder / "huber" / "config.yaml").read_text()
-
-
 def test_commands_find_the_stage_of_an_installed_package(outcome: Any) -> None:
     folder, results = outcome
     assert [results[name][0] for name in ("stage", "stage predicted")] == [0] * 2, results
@@ -259,15 +263,22 @@ def test_commands_find_the_stage_of_an_installed_package(outcome: Any) -> None:
         np.testing.assert_array_equal(predicted["prediction"] % 4, 0)
 
 
-def test_commands_train_gaussians_on_the_task_and_receiver_of_an_installed_package(outcome: Any) -> None:
+def test_commands_train_gaussians_on_task_receiver_loss_and_attribute_of_an_installed_package(outcome: Any) -> None:
     folder, results = outcome
-    asked = [f"field{how}" for how in ("", " resumed", " scored", " predicted", " compared")]
-    assert [results[name][0] for name in asked] == [0] * 5, results
+    asked = [f"field{how}" for how in ("", " resumed", " scored", " predicted", " compared", " exported")]
+    assert [results[name][0] for name in asked] == [0] * 6, results
     errors = [json.loads(results[name][1])["abs_error_db"] for name in asked[:3]]
     assert errors[0] == errors[1] == errors[2]
     with np.load(folder / "field.npz") as predicted:
         # Of the power of the Gaussians, which is far below, and the meter's factor.
         assert predicted["prediction"] == pytest.approx(FIELD_DB, abs=30)
+    assert "name: huber" in (folder / "field" / "config.yaml").read_text()
+    with np.load(folder / "field" / "model.npz") as arrays:
+        stored = arrays["params/roughness"]
+    assert stored.shape[0] == 1
+    assert not np.isin(stored, np.array([0.1, 0.05], np.float32)).any()  # all have been trained
+    exported = trimesh.load(folder / "splat.ply").metadata["_ply_raw"]["vertex"]["data"]["roughness"]
+    np.testing.assert_array_equal(np.ravel(exported), stored[0])
 
 
 def test_commands_find_the_task_and_the_layout_of_an_installed_package(outcome: Any) -> None:

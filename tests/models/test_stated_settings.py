@@ -72,6 +72,9 @@ RECORDS: dict[str, Callable[[], Record]] = {
 }
 TRAINED = ("strengths", "spectra of an unknown array", "channels", "channels with an uplink")
 """Records of models that train step by step, which take seconds each."""
+SAME = {("wrf-gs", "strengths"), ("wrf-gs", "channels with an uplink")}
+SAME |= {("factorised", "spectra of an unknown array"), ("factorised", "channels with an uplink")}
+"""Models and records whose settings are those of this model's other records and of WRF-GS+ on this record."""
 LOOP = ("steps=4", "batch=4", "validate_every=2", "patience=2")
 ROUNDS = ("density.every=1", "density.start=0", "density.stop=1")
 SMALL = ("initial.gaussians=4", "network.width=8", "network.layers=2", "view.height=3", "view.columns=6")
@@ -188,6 +191,7 @@ def cases(models: Any, records: Any) -> list[Any]:
         for model in models
         for name in records
         if MODELS[model].serves(tasks[name]) and MODELS[model].scene != "required"
+        if (model, name) not in SAME
         if MODELS[model].uplink != "required" or name == "channels with an uplink"
         if MODELS[model].uplink != "none" or name != "channels with an uplink"
     ]

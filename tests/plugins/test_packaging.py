@@ -33,7 +33,8 @@ receiver = Receiver("gateway1", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 spectra = rng.random((1, 6, 8, 16)).astype(np.float32)
 record = Record("noise", "spectrum", rng.normal(size=(6, 3)), (receiver,), spectra)
 split = Split("own", 0, np.arange(3), np.arange(3, 4), np.arange(4, 6))
-run = train(record, "wrf-gs+", out="run", settings=["steps=2", "initial.gaussians=5"], split=split)
+SMALL = ["steps=2", "initial.gaussians=5", "network.layers=2", "network.width=8"]
+run = train(record, "wrf-gs+", out="run", settings=SMALL, split=split)
 print(json.dumps({
     "folders": folders,
     "command": [command.name, command.load().__name__],

@@ -195,7 +195,7 @@ def test_gaussians_are_seen_from_the_pose_of_a_new_receiver(law: Record, tmp_pat
     receivers = (*law.receivers, replace(law.receivers[1], name="copy"))
     record = replace(law, receivers=receivers, observation=np.concatenate([law.observation, law.observation[1:2]]))
     split = replace(make_splits(law, "official")[0], held_receivers=(4,))
-    settings = ["steps=20", "validate_every=10", "initial.gaussians=40"]
+    settings = ["steps=20", "validate_every=10", "initial.gaussians=40", "network.layers=2", "network.width=16"]
     run = train(record, "wrf-gs+", out=tmp_path / "run", split=split, settings=settings)
     level = arrays_in(run.folder / "model.npz")["params/level"][0]
     assert level[4] == pytest.approx(level[:4].mean(), rel=1e-6)

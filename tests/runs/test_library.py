@@ -56,8 +56,10 @@ def test_a_plan_becomes_a_scene_that_measurements_correct(flat_folder, tmp_path)
 
 def test_settings_by_name_and_presets(flat_folder):
     """Names, nested or dotted, are those of texts; presets are refused where a model has none or all is stated."""
-    nested = wrf_mi.train(flat_folder, "wrf-gs+", settings={"steps": 3, "initial": {"gaussians": 5}})
-    texts = wrf_mi.train(flat_folder, "wrf-gs+", settings=["steps=3", "initial.gaussians=5"])
+    small = {"steps": 3, "initial": {"gaussians": 5}, "network": {"layers": 2, "width": 16}}
+    nested = wrf_mi.train(flat_folder, "wrf-gs+", settings=small)
+    asked = ["steps=3", "initial.gaussians=5", "network.layers=2", "network.width=16"]
+    texts = wrf_mi.train(flat_folder, "wrf-gs+", settings=asked)
     assert nested.config.settings == texts.config.settings
     _, fast, _ = plan_run(flat_folder, RunRequest(preset="fast"))
     assert "field" not in fast.settings.stages

@@ -186,7 +186,7 @@ UPRIGHT_ARRAY = Receiver("rx", np.array([5.2, 2.4, 1.1]), np.asarray(UPRIGHT), a
 TX = np.random.default_rng(3).uniform([0.3, 0.3, 0.8], [1.8, 4.5, 2.2], (24, 3))
 QUICK: dict[str, tuple[str, ...]] = {
     "ray-tracing": (),
-    "wrf-gs+": ("steps=6", "initial.gaussians=8", "optimiser.warm_up=2", "traced.depth=1", "traced.rays=4096"),
+    "wrf-gs+": (*FIELD_ALONE[-2:], "steps=6", "initial.gaussians=8", "optimiser.warm_up=2", *SETTINGS[-2:]),
     "hybrid": ("steps=6", "stages=mean,surfaces"),
 }
 

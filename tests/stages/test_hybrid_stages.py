@@ -33,7 +33,7 @@ from wrf_mi.training.validation import HeldOutReports
 HZ = 920e6
 SHAPES = {"spectrum": (24, 48), "rssi": (), "csi": (6,)}
 TRACE = TraceOptions(depth=2, rays=1 << 12)
-QUICK = ("steps=30",)
+QUICK = ("steps=20",)
 STOPPED_IN = (
     ("paths: choices", "(calibrated)"),
     ("paths: least squares", "(calibrated)"),
@@ -98,11 +98,19 @@ def assert_restored(run: wrf_mi.Run, record: Record) -> wrf_mi.Run:
     return again
 
 
+def written(folder: Path, write: Any, scenes: dict[str, Path], task: str, rows: int = 30) -> str:
+    """A data set with the split as the official one."""
+    record, split = measured(scenes, task, rows)
+    return str(write(folder, replace(record, official=(split.train, split.test))))
+
+
 @pytest.fixture(scope="module")
 def spectra(scenes: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[wrf_mi.Run, Record]:
-    record, split = measured(scenes, "spectrum")
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    return wrf_mi.train(record, out=folder, scene=scenes["thought"], split=split, settings=QUICK), record
+    """A deterministic fit to a data set in a folder."""
+    folder = tmp_path_factory.mktemp("runs")
+    data = written(folder / "room", write_spectrum_folder, scenes, "spectrum", 16)
+    run = wrf_mi.train(data, out=folder / "run", scene=scenes["thought"], settings=QUICK, deterministic=True)
+    return run, run.record
 
 
 def test_stages_are_reported_in_their_order_and_kept_where_they_gain(spectra: tuple[wrf_mi.Run, Record]) -> None:
@@ -140,30 +148,20 @@ def test_fit_in_a_scene_is_restored_with_its_sides(spectra: tuple[wrf_mi.Run, Re
     assert all(parts_of(opened)["paths"].problem.scene == str(scene) for opened in (run, again))
 
 
-@pytest.mark.parametrize(
-    ("task", "write", "settings", "stopped_in"),
-    [
-        ("spectrum", write_spectrum_folder, ("steps=20",), STOPPED_IN),
-        ("rssi", write_ble_folder, (), STRENGTHS_STOPPED_IN),
-    ],
-)
-def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(
-    task: str,
-    write: Any,
-    settings: tuple[str, ...],
-    stopped_in: Any,
-    scenes: dict[str, Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.mark.parametrize("task", ["spectrum", "rssi"])
+def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(task, spectra, scenes, tmp_path, monkeypatch) -> None:
     """Stopped in each option of the scene and of what follows, with all rows, and while it interpolates, in turn."""
     config_of = paths.config_of
     monkeypatch.setattr(paths, "config_of", lambda *given: replace(config_of(*given), log_every=1))
-    record, split = measured(scenes, task, 16 if task == "spectrum" else 48)
-    record = replace(record, official=(split.train, split.test))
-    data, out = str(write(tmp_path / "room", record)), tmp_path / "stopped"
-    how: dict[str, Any] = {"scene": scenes["thought"], "settings": settings, "deterministic": True}
-    uninterrupted = wrf_mi.train(data, out=tmp_path / "whole", **how)
+    how: dict[str, Any] = {"scene": scenes["thought"], "deterministic": True}
+    stopped_in: Any = STOPPED_IN if task == "spectrum" else STRENGTHS_STOPPED_IN
+    if task == "spectrum":
+        uninterrupted, how["settings"] = spectra[0], QUICK
+        data = uninterrupted.record.source
+    else:
+        data = written(tmp_path / "room", write_ble_folder, scenes, task, 48)
+        uninterrupted = wrf_mi.train(data, out=tmp_path / "whole", **how)
+    out = tmp_path / "stopped"
     sitting = partial(wrf_mi.train, data, out=out, **how)
     for begin, end in stopped_in:
         stages = [""]
@@ -175,7 +173,7 @@ def test_stopped_fit_goes_on_bit_for_bit_at_every_stage(
             sitting(on_progress=lambda stage, *_, stages=stages: stages.append(stage), stop=stop)
         assert stages[-1].startswith(begin)
         sitting = partial(wrf_mi.resume, out)
-    position = record.tx_pos_m[:6]
+    position = uninterrupted.record.tx_pos_m[:6]
     np.testing.assert_array_equal(sitting().predict(position).mean, uninterrupted.predict(position).mean)
 
 
@@ -193,14 +191,14 @@ def test_first_stage_of_a_training_that_went_further_is_continued_with_all_rows(
         return judged(engine, fold, plan, stage) + 10.0 * (plan[-1] == "calibrated") + 9.0 * (plan[-1] == "surfaces")
 
     monkeypatch.setattr(Engine, "_scores", favouring)
-    record, split = measured(scenes, "spectrum", 16)
-    record = replace(record, official=(split.train, split.test))
-    data, out = str(write_spectrum_folder(tmp_path / "room", record)), tmp_path / "stopped"
-    how = {"scene": scenes["thought"], "settings": ("steps=20",), "deterministic": True}
+    data = written(tmp_path / "room", write_spectrum_folder, scenes, "spectrum", 16)
+    settings, out = ("stages=mean,calibration,surfaces", "steps=20"), tmp_path / "stopped"
+    how: dict[str, Any] = {"scene": scenes["thought"], "settings": settings, "deterministic": True}
     whole = wrf_mi.train(data, out=tmp_path / "whole", **how)
     assert taken(whole)[-1] == ("paths", "paths", "calibrated")
+    assert "correction" not in [report["stage"] for report in whole.metrics["stages"]], "it is not wanted"
     log = (whole.folder / "parts" / "paths" / "log.jsonl").read_text().splitlines()
-    assert json.loads(log[-1])["step"] == 4  # 15 % of 20 steps without the held-out rows, and one with all rows
+    assert json.loads(log[-1])["step"] == 6  # a quarter of 20 steps without the held-out rows, and one with all rows
     reports = [""]
     with pytest.raises(Interrupted):
         wrf_mi.train(
@@ -210,7 +208,7 @@ def test_first_stage_of_a_training_that_went_further_is_continued_with_all_rows(
             stop=lambda: reports[-1].startswith("paths: least squares") and reports[-1].endswith("parameters"),
             **how,
         )
-    position = record.tx_pos_m[:6]
+    position = whole.record.tx_pos_m[:6]
     with monkeypatch.context() as ended:
         ended.setattr("wrf_mi.runs.api.write_fitted", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
@@ -235,7 +233,8 @@ def test_reports_of_held_out_rows_are_those_of_a_fit_without_them() -> None:
 @pytest.mark.parametrize("task", ["rssi", "csi"])
 def test_strengths_and_channels_are_fitted_in_stages(task: str, scenes: dict[str, Path], tmp_path: Path) -> None:
     record, split = measured(scenes, task)
-    settings = QUICK if task == "csi" else ()  # nothing is trained for powers of uncertain positions
+    # Nothing is trained for powers of uncertain positions. Corrections by channels are those of `test_correct`.
+    settings = (*QUICK, "stages=mean,calibration,surfaces,residual") if task == "csi" else ()
     run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=settings)
     names = [report["stage"] for report in run.metrics["stages"]]
     assert (names[0], names[-1]) == ("mean", "residual")
@@ -334,14 +333,6 @@ def test_scene_as_stated_is_kept_where_a_training_in_it_is_better(scenes, tmp_pa
     assert list(reports) == ["mean", "calibration", "correction", "surfaces"]
     assert reports["calibration"]["kept"]
     assert not reports["correction"]["kept"]
-    assert list(run.metrics["held_out"]) == ["paths", "hybrid"]
-
-
-def test_correction_that_is_not_wanted_is_not_fitted(scenes: dict[str, Path], tmp_path: Path) -> None:
-    record, split = measured(scenes, "spectrum", 16)
-    settings = ("stages=mean,calibration", "steps=20")
-    run = wrf_mi.train(record, out=tmp_path / "run", scene=scenes["thought"], split=split, settings=settings)
-    assert [report["stage"] for report in run.metrics["stages"]] == ["mean", "calibration"]
     assert list(run.metrics["held_out"]) == ["paths", "hybrid"]
 
 

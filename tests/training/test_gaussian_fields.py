@@ -150,7 +150,7 @@ def test_components_span_the_channels():
 
 
 @pytest.mark.all_threads
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", ["wrf-gs+", "factorised"])
 def test_strengths_are_learned_and_kept(model, tmp_path):
     record = strengths()
     split = halves(record)
@@ -164,7 +164,7 @@ def test_strengths_are_learned_and_kept(model, tmp_path):
         np.testing.assert_array_equal(scored[r], found)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", ["wrf-gs", "factorised"])
 def test_channels_are_learned_from_the_uplink_and_kept(model, tmp_path):
     record = channels()
     split, changed = halves(record), ("steps=200", "view.components=3", "batch=32", "optimiser.network=3e-3")
@@ -201,9 +201,8 @@ def two_stations(rows=60, antennas=1):
     return Record("made", "csi", tx, receivers(2), h.astype(np.complex64))
 
 
-@pytest.mark.parametrize("antennas", [1, 2])
-def test_a_second_receiver_with_other_components_is_learned(antennas):
-    record = two_stations(antennas=antennas)
+def test_a_second_receiver_with_other_components_is_learned():
+    record = two_stations(antennas=2)
     split = halves(record)
     predict = fitted(record, split, "view.components=2", "steps=700", "batch=16", "optimiser.network=3e-3")
     for r in range(2):

@@ -61,7 +61,7 @@ def check(record: Record, model: str, out: Path) -> None:
 
 def cases(kinds: Mapping[str, Any]) -> list[Any]:
     """Pairs of a model and a kind, all but one slow."""
-    fast = ("wrf-gs+", "weak")
+    fast = ("factorised", "weak")
     pairs = product((*FIELDS, "nerf2"), kinds)
     return [pytest.param(*pair, marks=[] if pair == fast else pytest.mark.slow) for pair in pairs]
 

@@ -143,12 +143,8 @@ def test_strengths_at_ports_are_those_of_the_tracer(xml):
     np.testing.assert_allclose(found, expected, atol=STRENGTH_DB)
 
 
-@pytest.mark.parametrize("scene", [False, True])
-def test_a_field_of_several_carriers_is_trained_and_restored(scene, xml, tmp_path):
-    """With and without paths; a carrier without training rows is predicted, and predictions depend on the carrier."""
-    record, settings = spectra(xml), (*QUICK, "steps=16", *("traced.rays=4096", "traced.depth=2") * scene)
-    how: dict[str, Any] = {"scene": str(xml) if scene else None, "split": "frequency-known:1", "settings": settings}
-    run = wrf_mi.train(record, "wrf-gs+", out=tmp_path / "run", **how)
+def assert_restored(run, record):
+    """Predictions of a stored field depend on the carrier, which need not have training rows."""
     again, positions = wrf_mi.open_run(run.folder, record), np.tile(record.tx_pos_m[:2], (2, 1))
     at = np.repeat([CARRIERS_HZ[0], CARRIERS_HZ[1]], 2)
     found = again.predict(positions, 0, carriers_hz=at).mean
@@ -158,7 +154,14 @@ def test_a_field_of_several_carriers_is_trained_and_restored(scene, xml, tmp_pat
         again.predict(positions, 0)
 
 
-def test_networks_learn_from_the_carrier(tmp_path):
+def test_a_field_of_several_carriers_is_trained_beside_paths_and_restored(xml, tmp_path):
+    record, small = spectra(xml), ("network.width=16", "network.layers=2", "traced.rays=4096", "traced.depth=2")
+    settings = (*QUICK, *small, "steps=16")
+    how: dict[str, Any] = {"scene": str(xml), "split": "frequency-known:1", "settings": settings}
+    assert_restored(wrf_mi.train(record, "wrf-gs+", out=tmp_path / "run", **how), record)
+
+
+def test_networks_learn_from_the_carrier_and_are_restored(tmp_path):
     """Strengths at one place that fall with the frequency: one field of all carriers follows them."""
     positions, carriers = np.tile(transmitters(10), (3, 1)), np.repeat(CARRIERS_HZ, 10)
     observed = (-40 - 20 * np.log10(carriers / CARRIERS_HZ[0]))[None].astype(np.float32)
@@ -168,6 +171,7 @@ def test_networks_learn_from_the_carrier(tmp_path):
     settings = (*QUICK, *octaves, "steps=200", "optimiser.network=0.002")
     run = wrf_mi.train(record, "wrf-gs+", out=tmp_path / "run", split="random", settings=settings)
     assert run.metrics["abs_error_db"]["median"] < 2  # 6 dB for the middle carrier's strength, the median
+    assert_restored(run, record)
 
 
 def test_paths_are_calibrated_at_several_carriers(xml, tmp_path):
