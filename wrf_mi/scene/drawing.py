@@ -88,7 +88,7 @@ def add_legend(figure: Figure, loc: str = "outside lower center", columns: int =
     parts = (zip(*axes.get_legend_handles_labels(), strict=True) for axes in figure.axes)
     entries: dict[str, Any] = {label: handle for part in parts for handle, label in part}
     if entries:
-        how: dict[str, Any] = {"fontsize": LABEL_SIZE, "loc": loc, "ncols": columns}
+        how: dict[str, Any] = {"fontsize": LABEL_SIZE, "loc": loc, "ncols": columns, "facecolor": "0.92"}
         figure.legend(list(entries.values()), list(entries), **how)
 
 

@@ -96,7 +96,9 @@ def mesh_command(a: Arguments) -> int:
     check = check_scene(scene.folder)
     if check.of_level("fault") or check.of_level("warning"):
         lines += check.lines()
-    facts |= {"floor_m2": float(floor_m2), "origin_m": scene.origin_m, "check": check.as_dict()}
+    next_command = f"wrf-mi train DATASET --scene {scene.folder} --out RUN"
+    lines.append(f"next: {next_command}")
+    facts |= {"floor_m2": float(floor_m2), "origin_m": scene.origin_m, "check": check.as_dict(), "next": next_command}
     return show(a.json, facts, "\n".join(lines))
 
 

@@ -285,7 +285,10 @@ def _draw_row(
     grid = located.candidates.grid
     drawn = arrays["probability"][row]
     colours = drawing.shades(0, float(drawn.max()))
-    drawing.draw_layer(axes, grid.x_m, grid.y_m, np.where(drawn > 0, drawn, np.nan), colours)
+    # Cells of probability zero are searched, others are not.
+    searched = np.full(drawn.size, np.nan)
+    searched[located.candidates.inside] = drawn.ravel()[located.candidates.inside]
+    drawing.draw_layer(axes, grid.x_m, grid.y_m, searched.reshape(drawn.shape), colours)
     inside = np.zeros(drawn.size)
     inside[located.candidates.inside] = located.region[row]
     if min(drawn.shape) > 1:
