@@ -17,12 +17,17 @@ import psutil
 from .errors import InputError
 
 SMALL_BYTES = 1 << 26  # allocations up to 64 MiB are not compared: an estimate of what is free is no better
+_STATUS = Path("/proc/self/status")
 _CGROUP = Path("/sys/fs/cgroup")
 _UNLIMITED = 1 << 60  # control groups of version 1 state about 2^63 where there is no limit
 
 
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, MB."""
+    # A new program's ru_maxrss begins at the peak of the process that started it (getrusage(2) on Linux).
+    if _STATUS.exists():
+        line = next(entry for entry in _STATUS.read_text().splitlines() if entry.startswith("VmHWM:"))
+        return 1.024e-3 * int(line.split()[1])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1e6 if sys.platform == "darwin" else 1e3)
 
