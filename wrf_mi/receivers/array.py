@@ -31,7 +31,7 @@ from ..core.types import IntArray
 ComplexArray = NDArray[np.complex128]
 
 TABLE_BYTES = 1 << 25  # largest table of responses; `KEPT_TABLES` are kept, of 8 MB for 4 x 4 and 360 x 90 directions
-KEPT_TABLES = 4
+KEPT_TABLES = 12  # two of each block of directions: 200 MB for images of 700,000 pixels and more
 CHUNK_SIZE = 16  # signals whose spectra are computed together
 LINES_FROM = 64  # number of elements from which a planar grid is summed line by line
 MIRRORED, ALIGNED = 1e-6, 1e-9  # distances of opposite, or aligned, positions as shares of the array's extent

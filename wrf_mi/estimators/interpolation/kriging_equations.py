@@ -190,6 +190,8 @@ class KrigingSystem:
             system = KrigingSystem(half[np.ix_(rows, rows)])
             error, gap = system.solve(solved[rows]), system.solve(trend[rows])
             lost = trend[rows].T @ gap, trend[rows].T @ error
+            if len(rows) == len(half):  # the same, and without rounding nothing is left of both
+                lost = self.information, self.trend.T @ solved
             found.append(Block(error, gap, system.inverse_diagonal, *lost))
         return found
 

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
@@ -58,6 +58,78 @@ class ReceiverObservations:
     basis: Basis
     value: FloatArray
     variance: FloatArray
+
+
+class Coefficients:
+    """Normal distribution of the coefficients beta, given information of receivers that are independent given it.
+
+    Its precision is that of the prior, and for each receiver a block of what its observations tell. Coefficients of one
+    receiver alone are coupled with the common ones and with no other's, so that each has an inverse of its own.
+
+    Args:
+        prior_sd: prior standard deviations [k].
+        bases: columns of each receiver, and the numbers of their coefficients [p].
+        information: block of each receiver [p, p].
+        projected: right-hand side of each receiver [p].
+    """
+
+    def __init__(
+        self,
+        prior_sd: FloatArray,
+        bases: Sequence[Basis],
+        information: Sequence[FloatArray],
+        projected: Sequence[FloatArray],
+    ) -> None:
+        used = [basis.used for basis in bases]
+        count = np.bincount(np.concatenate([*used, np.zeros(0, np.int64)]), minlength=len(prior_sd))
+        prior, common = 1 / np.square(prior_sd), np.flatnonzero(count != 1)
+        place = np.searchsorted(common, np.arange(len(prior_sd)))
+        precision, right = np.diag(prior[common]), np.zeros(len(common))
+        self._parts = list[tuple[Any, ...]]()
+        self.log_determinant = 0.0
+        for basis, block, value in zip(bases, information, projected, strict=True):
+            own = count[basis.used] == 1
+            shared, own_prior = place[basis.used[~own]], np.diag(prior[basis.used[own]])
+            inverse = np.linalg.inv(block[np.ix_(own, own)] + own_prior)
+            twins = _twins(basis.columns, own)
+            # Schur complement: what is left of the common coefficients' precision, A - A (A + L)^-1 A.
+            if twins is None:
+                coupling = block[np.ix_(~own, own)] @ inverse
+                precision[np.ix_(shared, shared)] += block[np.ix_(~own, ~own)] - coupling @ block[np.ix_(own, ~own)]
+                right[shared] += value[~own] - coupling @ value[own]
+            else:
+                # Without noise A is 1e14 times L, and the difference rounding: it is L - L (A + L)^-1 L.
+                chosen = own_prior[:, twins]
+                coupling = (np.eye(len(own_prior))[:, twins] - inverse @ chosen).T
+                precision[np.ix_(shared, shared)] += chosen[twins] - chosen.T @ inverse @ chosen
+                right[shared] += chosen.T @ inverse @ value[own]
+            self.log_determinant -= float(np.linalg.slogdet(inverse)[1])
+            self._parts.append((own, shared, inverse, coupling))
+        self.log_determinant += float(np.linalg.slogdet(precision)[1])
+        self._common = np.linalg.inv(precision)
+        self.mean = np.zeros(len(prior_sd))
+        self.mean[common] = self._common @ right
+        for number, value, (own, shared, inverse, coupling) in zip(used, projected, self._parts, strict=True):
+            self.mean[number[own]] = inverse @ value[own] - coupling.T @ self.mean[common[shared]]
+
+    def covariance(self, receiver: int) -> FloatArray:
+        """Covariance [p, p] of the coefficients of a receiver."""
+        own, shared, inverse, coupling = self._parts[receiver]
+        common = self._common[np.ix_(shared, shared)]
+        result = np.empty((len(own), len(own)))
+        result[np.ix_(~own, ~own)], across = common, -common @ coupling
+        result[np.ix_(~own, own)], result[np.ix_(own, ~own)] = across, across.T
+        result[np.ix_(own, own)] = inverse - coupling.T @ across
+        return result
+
+
+def _twins(columns: FloatArray, own: NDArray[np.bool_]) -> list[int] | None:
+    """For each common column of a receiver the place of an equal one among its own; None where one has none."""
+    places = [
+        next((j for j, other in enumerate(columns.T[own]) if np.array_equal(column, other)), None)
+        for column in columns.T[~own]
+    ]
+    return None if None in places else [place for place in places if place is not None]
 
 
 class LeftOut(NamedTuple):
@@ -108,18 +180,12 @@ class PooledProcess:
         self._systems = of_each(system, parts, sum(len(p.value) for p in parts))
         triples = [(system, part.basis.used, part.value) for system, part in zip(self._systems, parts, strict=True)]
         # Receivers are independent given beta: their information adds up to the prior's (equation 2.41).
-        self._information, self._projected = np.diag(1 / np.square(self._prior_sd)), np.zeros(len(self._prior_sd))
-        for each, used, value in triples:
-            self._information[np.ix_(used, used)] += each.information
-            self._projected[used] += each.projected(value)
-        vars(self).pop("covariance", None)
-        self.beta = np.linalg.solve(self._information, self._projected)
+        self._bases = [part.basis for part in parts]
+        self._information = [each.information for each in self._systems]
+        self._projected = [each.projected(value) for each, _, value in triples]
+        self._coefficients = Coefficients(self._prior_sd, self._bases, self._information, self._projected)
+        self.beta = self._coefficients.mean
         self._weights = [each.weights(value, self.beta[used]) for each, used, value in triples]
-
-    @cached_property
-    def covariance(self) -> FloatArray:
-        """Posterior covariance of the shared coefficients [k, k], which serves all predictions."""
-        return np.asarray(np.linalg.inv(self._information))
 
     @property
     def cost(self) -> float:
@@ -127,15 +193,15 @@ class PooledProcess:
         # y ~ N(0, K + B S B^T), by the lemmas of inversion and determinants: rows of receivers share beta alone.
         pairs = list(zip(self._systems, self._parts, strict=True))
         square = sum(float(part.value @ system.solve(part.value)) for system, part in pairs)
-        square -= float(self.beta @ self._information @ self.beta)
-        volume = float(np.linalg.slogdet(self._information)[1] + 2 * np.log(self._prior_sd).sum())
+        square -= sum(float(self.beta[p.basis.used] @ of) for p, of in zip(self._parts, self._projected, strict=True))
+        volume = self._coefficients.log_determinant + float(2 * np.log(self._prior_sd).sum())
         return square + volume + sum(system.log_determinant for system in self._systems)
 
     def predict(self, receiver: int, inputs: Any, basis: Basis) -> tuple[FloatArray, FloatArray]:
         """Mean and variance [m] of phi . beta + f, without noise, at m inputs with phi ``basis``."""
         cross = self._kernel(inputs, self._inputs.take(self._parts[receiver].rows))
         mean = self.trend(basis) + cross @ self._weights[receiver]
-        covariance = self.covariance[np.ix_(basis.used, basis.used)]
+        covariance = self._coefficients.covariance(receiver)
         return mean, self._systems[receiver].variance(self._point_variance, cross, basis.columns, covariance)
 
     def without(self, folds: Sequence[Sequence[IntArray]]) -> list[LeftOut]:
@@ -152,19 +218,17 @@ class PooledProcess:
         of_receivers = of_each(blocks, numbers, sum(len(part.value) for part in self._parts))
         found = []
         for fold, of_fold in zip(folds, zip(*of_receivers, strict=True), strict=True):
-            information, projected = self._information.copy(), self._projected.copy()
-            for part, block in zip(self._parts, of_fold, strict=True):
-                information[np.ix_(part.basis.used, part.basis.used)] -= block.information
-                projected[part.basis.used] -= block.projected
-            covariance = np.linalg.inv(information)
-            beta, means, variances = covariance @ projected, list[FloatArray](), list[FloatArray]()
-            for part, rows, block in zip(self._parts, fold, of_fold, strict=True):
-                used = part.basis.used
-                means.append(part.value[rows] - block.error + block.gap @ beta[used])
-                field = np.maximum(block.variance - part.variance[rows], 0)  # rounding may take it below zero
-                trend = np.einsum("mp,mp->m", block.gap @ covariance[np.ix_(used, used)], block.gap)
-                variances.append(field + trend)
-            found.append(LeftOut(beta, means, variances))
+            information = [every - block.information for every, block in zip(self._information, of_fold, strict=True)]
+            projected = [every - block.projected for every, block in zip(self._projected, of_fold, strict=True)]
+            left = Coefficients(self._prior_sd, self._bases, information, projected)
+            means, variances = list[FloatArray](), list[FloatArray]()
+            for receiver, (part, rows, block) in enumerate(zip(self._parts, fold, of_fold, strict=True)):
+                means.append(part.value[rows] - block.error + block.gap @ left.mean[part.basis.used])
+                # Rounding may take both below zero where there is next to no noise.
+                field = np.maximum(block.variance - part.variance[rows], 0)
+                trend = np.einsum("mp,mp->m", block.gap @ left.covariance(receiver), block.gap)
+                variances.append(field + np.maximum(trend, 0))
+            found.append(LeftOut(left.mean, means, variances))
         return found
 
     def trend(self, basis: Basis) -> FloatArray:

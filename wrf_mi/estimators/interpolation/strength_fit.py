@@ -159,8 +159,7 @@ class StrengthPosterior:
                 mean, variance = mean + more[0], variance + more[1]
             return terms[k][0] + mean, variance
 
-        spread = self._spread_process
-        _ = spread.covariance  # computed here, not on threads
+        spread = self._spread_process  # made here, not on threads
         return of_each(posterior, range(len(poses)), sum(map(len, poses)))
 
     def without(self, left: Sequence[NDArray[np.bool_]], trees: int = 0) -> list[tuple[FloatArray, FloatArray]]:
