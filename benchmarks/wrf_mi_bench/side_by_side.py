@@ -264,6 +264,7 @@ def picture(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 shown[program.strip("`")] = axes.plot(*at, " " if of_field else "-", marker="o", color=f"C{number}")[0]
         error = "largest error, relative" if of_field else "mean error (dB)"
         axes.set(xscale="log", yscale="log", title=case, xlabel="time (ms)", ylabel=error)
+        axes.tick_params(axis="x", which="minor", labelsize=6, labelrotation=30)
         axes.grid(alpha=0.3)
     figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown), fontsize=9)
     return figure

@@ -23,7 +23,8 @@ def test_paths_are_the_same_without_an_omission(other):
 
 
 def test_gaussians_that_reach_no_tile_add_nothing():
-    splat = splatting(*field(100), 30, 120)
+    gaussians, receiver = field(100)
+    splat = splatting(gaussians, receiver, 30, 120)
     short = np.asarray(splat()[0].numpy())
     with skips.replaced((tiles, "_boxes", skips.whole_plane)):
         np.testing.assert_array_equal(np.asarray(splat()[0].numpy()), short)

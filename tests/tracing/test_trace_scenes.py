@@ -262,7 +262,9 @@ def test_planes_near_points_are_those_within_a_margin(monkeypatch):
     surfaces = find_planes(
         ("room",), np.zeros(1, np.uint32), np.array([0, len(mesh.faces)]), np.asarray(mesh.triangles)
     )
-    points_m = np.concatenate([mesh.triangles_center[::7] + 0.004, rng.uniform(*mesh.bounds, (200, 3))])
+    points_m = np.concatenate(
+        [mesh.triangles_center[::7] + 0.004, rng.uniform(mesh.bounds[0], mesh.bounds[1], (200, 3))]
+    )
     pairs = [set(zip(*map(np.ndarray.tolist, surfaces.near(points_m, 0.01)), strict=True))]
     monkeypatch.setattr(surfaces_module, "FEW_PLANES", 10**6)
     pairs.append(set(zip(*map(np.ndarray.tolist, surfaces.near(points_m, 0.01)), strict=True)))
