@@ -112,13 +112,16 @@ def test_train_prints_a_table_and_progress_elsewhere(folder: Path, tmp_path: Pat
     out_folder = tmp_path / "run"
     status, out, err = command(training(folder, out_folder, "--seed", 3, model="wrf-gs"))
     assert status == 0
-    head, own, blend, facts, verdict, worse, where = out.splitlines()
+    head, own, blend, facts, counts, verdict, worse, where = out.splitlines()
     assert head.split() == ["SSIM", "on", "5", "test", "rows", "median", "mean", "p10", "p90"]
     metrics = json.loads((out_folder / "metrics.json").read_text())
     for line, block in ((own, metrics["ssim"]), (blend, metrics["reference"]["idw"])):
         assert line.split()[-4:] == [f"{block[k]:.3f}" for k in ("median", "mean", "p10", "p90")]
     assert own.startswith("wrf-gs ")
     assert facts.startswith("split official, 19 training rows,")
+    tiles = metrics["evaluated"]["tiles of Gaussians"]
+    assert tiles["skipped"] > 0
+    assert counts == f"evaluated: {tiles['evaluated']:,} of {sum(tiles.values()):,} tiles of Gaussians"
     assert verdict.startswith(
         f"median SSIM {metrics['ssim']['median']:.3f}: no better than the best constant, the mean"
     )

@@ -12,12 +12,13 @@ from commands import Command
 def test_a_plan_becomes_a_scene_that_can_be_traced(flat_folder: Path, tmp_path: Path, command: Command) -> None:
     scene, run = tmp_path / "scene", tmp_path / "run"
     words = ["mesh", flat_folder / "layout.csv", "--wall-height", "2.5", "--out", scene]
-    head, floor, *files = command.done(words).splitlines()
+    head, floor, *files, following = command.done(words).splitlines()
     assert head == f"1 floor, 1 ceiling, 4 wall, 0 other: {scene}"
     assert floor == "floor: 20.0 m2"
     for line, name in zip(files, ("materials.yml", "preview.png"), strict=True):
         assert line.endswith(str(scene / name))
         assert (scene / name).is_file()
+    assert following == f"next: wrf-mi train DATASET --scene {scene} --out RUN"
     command.done(["trace", flat_folder, "--scene", scene, "--out", run, "--depth", "1", "--rays", "1000"])
     assert json.loads((run / "metrics.json").read_text())["scene"] == str(scene)
 

@@ -278,6 +278,7 @@ def calibrated(
     # Rows of a run that is held out have an offset that nobody knows.
     known = measured if new_runs else _without_offsets(measured, record, strengths.offsets)
     values, variance = known.value_dbm, strengths.offsets.sd_db**2 if new_runs and strengths.offsets else 0.0
+    on_progress("strengths: all rows", 0.8)
     spread = _deviations(strengths, stated)
     field = field.with_spread(spread)
     on_progress("strengths: held-out rows", 0.9)
