@@ -272,7 +272,7 @@ PICTURE = Path("docs/images/scaling.png")  # written only in a checkout of the p
 
 
 def main() -> dict[str, Any]:
-    """All axes, some twenty minutes on two cores."""
+    """All axes, five minutes on two cores."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     with threadpool_limits(1, "blas"):
         results = [scale(axis) for axis in AXES]

@@ -92,7 +92,7 @@ def compared(what: str, call: Callable[[], Any], omission: Omission, without: Ca
 
 
 def main() -> dict[str, Any]:
-    """All omissions; two minutes on two cores."""
+    """All omissions; seconds on two cores."""
     room, splat = partial(room_powers, opened_room(TRIANGLES)), splatting(*field(GAUSSIANS))
 
     def image() -> FloatArray:

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wrf_mi.backend import init
 from wrf_mi.core.angles import FloatArray
+from wrf_mi.core.memory import peak_memory_mb
 from wrf_mi.tasks.scores import Interval, bootstrap
 
 init()
@@ -33,7 +34,7 @@ import drjit as dr  # noqa: E402
 Call = Callable[[], Any]
 
 REPEATS, WARM_UP = 15, 2  # timed calls, and calls before them: the first compiles, the second still fills caches
-RESET_PEAK, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
+RESET_PEAK = Path("/proc/self/clear_refs")
 LOOK_EVERY_S = 1e-3
 
 
@@ -156,8 +157,7 @@ def memory_mb(call: Call) -> float:
     if RESET_PEAK.exists():
         RESET_PEAK.write_text("5")  # proc(5): resets the peak resident set size
         settle(call())
-        line = next(entry for entry in STATUS.read_text().splitlines() if entry.startswith("VmHWM:"))
-        peak = 1024 * int(line.split()[1])
+        peak = round(1e6 * peak_memory_mb())
     else:
         peak = _watched(call)
     return float(max(peak - before, 0) / 1e6)

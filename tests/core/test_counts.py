@@ -8,6 +8,8 @@ def test_counts_of_threads_add_up_in_the_innermost_context():
     count("paths", 1, 1)  # nobody counts
     assert not counting()
     with counted() as outer:
+        with counted():  # as empty as the outer one
+            pass
         count("paths", 2, 3)
         with counted() as inner:
             on_threads(lambda k: count("paths", k, 1), range(20))

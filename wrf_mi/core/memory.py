@@ -24,10 +24,12 @@ _UNLIMITED = 1 << 60  # control groups of version 1 state about 2^63 where there
 
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, MB."""
-    # A new program's ru_maxrss begins at the peak of the process that started it (getrusage(2) on Linux).
-    if _STATUS.exists():
-        line = next(entry for entry in _STATUS.read_text().splitlines() if entry.startswith("VmHWM:"))
-        return 1.024e-3 * int(line.split()[1])
+    # On Linux ru_maxrss of a new program begins at the peak of the process that started it. Some containers state no
+    # other figure.
+    lines = _STATUS.read_text().splitlines() if _STATUS.exists() else []
+    for line in lines:
+        if line.startswith("VmHWM:"):
+            return 1.024e-3 * int(line.split()[1])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1e6 if sys.platform == "darwin" else 1e3)
 

@@ -18,8 +18,8 @@ EVENTS = "events.out.tfevents.training"  # TensorBoard finds files by the part o
 
 @cache
 def available() -> bool:
-    """Whether TensorBoard is installed."""
-    return find_spec("tensorboard") is not None
+    """Whether TensorBoard is installed; a folder of that name, which Python also imports, is not it."""
+    return find_spec("tensorboard") is not None and find_spec("tensorboard.compat") is not None
 
 
 def append_event(folder: Path, entry: Mapping[str, Any]) -> None:

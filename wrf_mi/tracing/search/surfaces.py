@@ -249,7 +249,7 @@ def scene_surfaces(scene: Any) -> Surfaces:
     if (
         known is None
         or (known.names, tuple(known.shape_ids), known.files) != stated
-        or (known.triangles != every).any()
+        or not np.array_equal(known.triangles, every)
     ):
         known = replace(find_planes(names, np.asarray(ids, np.uint32), first, every), files=stated[2])
         _FOUND[scene] = known
