@@ -68,6 +68,7 @@ def _of_stage(cell: Cell, figures: Mapping[str, Any]) -> dict[str, Any]:
     facts = {"method": method, "label": f"{name}, knows the scene" if scene else name, "task": BLOCKS[figures["block"]]}
     facts |= {"dataset": cell.dataset, "split": cell.split, "score": figures["score"]}
     facts |= {"share": ALL_ROWS if cell.n_train is None else cell.n_train, "n_train": cell.n_train}
+    facts |= {"seed": cell.seed}
     return facts | {key: figures[key] for key in COPIED if figures.get(key) is not None}
 
 

@@ -42,7 +42,7 @@ SCORES = ("log_loss", "brier", "calibration_error")
 class Cell(Rows):
     """Rows of a data set, as measured or with `MISSING` values."""
 
-    weak_are_missing: bool
+    weak_are_missing: bool = False
 
     @property
     def name(self) -> str:
@@ -69,10 +69,10 @@ class Cell(Rows):
 
 
 CELLS = (
-    Cell(FLAT, "blocked", 400, False),
-    Cell(FLAT, "blocked", 400, True),
-    Cell(FLAT, "official", 400, True),
-    Cell(FLOOR, "blocked", None, True),
+    Cell(FLAT, "blocked", 400),
+    Cell(FLAT, "blocked", 400, weak_are_missing=True),
+    Cell(FLAT, "official", 400, weak_are_missing=True),
+    Cell(FLOOR, "blocked", None, weak_are_missing=True),
 )
 
 

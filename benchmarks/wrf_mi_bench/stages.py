@@ -1,8 +1,8 @@
 """The hybrid beside its parts alone, over data sets, splits and numbers of rows.
 
 Each cell is a run of the hybrid and one of each part on the same rows. Scores are compared row by row; a part is
-*clearly better* where the 95 % bootstrap interval of the mean difference lies above zero. Each cell is stored when it
-is measured (`wrf_mi_bench.comparison.stored_part`).
+*clearly better* where the 95 % bootstrap interval of the mean difference lies above zero. Few rows are drawn three
+times, and judged by their means. Each cell is stored when it is measured (`wrf_mi_bench.comparison.stored_part`).
 """
 
 import shutil
@@ -22,6 +22,7 @@ from wrf_mi.runs.api import resume, train
 from wrf_mi.runs.folder import CONFIG, is_finished
 from wrf_mi.runs.results import Results, read_run
 from wrf_mi.stages.correct import correct_scene
+from wrf_mi.stages.scene import STAGES
 from wrf_mi.synthetic import load_record
 from wrf_mi.tasks import TASKS
 from wrf_mi.tasks.scores import bootstrap
@@ -46,6 +47,7 @@ ROWS: Mapping[tuple[str, str], Sequence[int | None]] = {
     (CHANNELS, "official"): (15, 100, None),
 }
 """Numbers of training rows by data set and split; None: all."""
+FEW, DRAWS = 50, 3  # number of rows below which they are drawn several times, and how often
 LEAST_CORRECTED = 15  # rows of which a correction holds enough out
 LIMITS = {"ssim": 0.01, "abs_error_db": 0.1, "cea_db": 0.5}
 """Largest loss against a part that is allowed, in the unit of the score."""
@@ -82,22 +84,29 @@ strengths, and of calibrated materials."""
 
 @dataclass(frozen=True)
 class Cell:
-    """Data set, split and number of training rows; None: all."""
+    """Data set, split, number of training rows (None: all) and seed of their draw."""
 
     dataset: str
     split: str
     n_train: int | None
+    seed: int = 0
 
     @property
     def name(self) -> str:
-        return f"{self.dataset}-{self.split}-{'all' if self.n_train is None else self.n_train}"
+        rows = "all" if self.n_train is None else self.n_train
+        return f"{self.dataset}-{self.split}-{rows}" + (f"-seed{self.seed}" if self.seed else "")
 
     @property
     def title(self) -> str:
         return f"{self.dataset}, {self.split}, {'all' if self.n_train is None else self.n_train} rows"
 
 
-CELLS = tuple(Cell(*key, count) for key, counts in ROWS.items() for count in counts)
+CELLS = tuple(
+    Cell(*key, count, seed)
+    for key, counts in ROWS.items()
+    for count in counts
+    for seed in range(DRAWS if count is not None and count < FEW else 1)
+)
 
 
 def data_of(cell: Cell, folder: Path) -> tuple[str | Record, str | None]:
@@ -133,10 +142,10 @@ def compared(hybrid: Results, others: Mapping[str, Results]) -> list[dict[str, A
 
 
 def run_of_cell(cell: Cell, data: str | Record, place: Path, model: str, **more: Any) -> Results:
-    """Run of a model in a folder on the rows of a cell, seed 0: finished, continued or new."""
+    """Run of a model in a folder on the rows of a cell: finished, continued or new."""
     if not (place / CONFIG).exists():
         shutil.rmtree(place, ignore_errors=True)  # stopped before its configuration was written
-        train(data, model, out=place, split=cell.split, n_train=cell.n_train, seed=0, **more)
+        train(data, model, out=place, split=cell.split, n_train=cell.n_train, seed=cell.seed, **more)
     elif not is_finished(place):
         resume(place, record=data if isinstance(data, Record) else None)
     return read_run(place)
@@ -153,7 +162,7 @@ def run_in_corrected(cell: Cell, data: str | Record, scene: str, folder: Path) -
     """Run of ray tracing in the scene that the training rows of a cell with one split correct, as `run_of_cell`."""
     record, place = data if isinstance(data, Record) else load_record(data), folder / "corrected"
     if not place.exists():
-        (split,) = make_splits(record, cell.split, 0, cell.n_train)
+        (split,) = make_splits(record, cell.split, cell.seed, cell.n_train)
         write_page(correct_scene(scene, record, split, default_options(record)), place, False)
     return run_of_cell(cell, data, folder / "in-corrected", "ray-tracing", scene=str(place), settings=TRANSMISSION)
 
@@ -173,6 +182,26 @@ def measured(cell: Cell, folder: Path) -> dict[str, Any]:
     if scene is not None and enough and cell.split == "official" and not TASKS[hybrid.task].in_decibel:
         others[CORRECTED] = run_in_corrected(cell, data, scene, folder)
     return {"models": compared(hybrid, others)}
+
+
+def over_draws(draws: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Means of the models' figures over the draws of a cell.
+
+    Limits of intervals are averaged, too: all draws are scored on the same test rows, so they narrow no interval.
+    """
+    models = [each["model"] for each in draws[0]]
+    return [_mean([next(each for each in draw if each["model"] == model) for draw in draws]) for model in models]
+
+
+def _mean(draws: Sequence[Any]) -> Any:
+    """Mean of figures of the same form; what is no number is that of the first draw, stages kept are those of any."""
+    first = draws[0]
+    if isinstance(first, Mapping):
+        return {key: _mean([draw[key] for draw in draws]) for key in first}
+    if isinstance(first, list):  # stages, whose names differ from draw to draw
+        kept = [stage["stage"] for draw in draws for stage in draw if stage["kept"]]
+        return [{"stage": name, "kept": True, "draws": kept.count(name)} for name in STAGES if name in kept]
+    return float(np.mean(draws)) if isinstance(first, (int, float)) else first
 
 
 def rows_of(cell: Cell, figures: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -204,15 +233,17 @@ def main() -> dict[str, Any]:
     ``worse`` is the number of comparisons in which the hybrid is clearly worse, of ``comparisons``; ``inside`` that of
     runs of the hybrid whose intervals cover 85 to 95 %, of ``cells``; ``failed`` is there where a limit is exceeded.
     """
-    place, rows, parts = _place(), list[dict[str, Any]](), list[dict[str, Any]]()
+    place, rows, parts = _place(), list[dict[str, Any]](), dict[Cell, dict[str, Any]]()
     for count, cell in enumerate(CELLS, 1):
-        say("stages", f"{count} of {len(CELLS)}: {cell.title}")
-        parts.append(stored_part("stages", cell.name, partial(measured, cell, place / cell.name)))
-        lines = rows_of(cell, parts[-1]["models"])
-        rows += lines
-        for row in lines:
+        say("stages", f"{count} of {len(CELLS)}: {cell.title}, seed {cell.seed}")
+        parts[cell] = stored_part("stages", cell.name, partial(measured, cell, place / cell.name))
+        for row in rows_of(cell, parts[cell]["models"]):
             say("stages", f"{row['what']}: {row['value']}; {row['asked']}")
-    return {"rows": rows, "measured": measured_on(parts), **_verdict(rows)}
+    for cell in CELLS:
+        if cell.seed == 0:
+            draws = [parts[each]["models"] for each in CELLS if each.title == cell.title]
+            rows += rows_of(cell, over_draws(draws) if len(draws) > 1 else draws[0])
+    return {"rows": rows, "measured": measured_on(parts.values()), **_verdict(rows)}
 
 
 def _verdict(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -235,7 +266,8 @@ SAME = 1e-6  # difference of mean scores below which two models predict the same
 def _with_best_part(row: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     best = min(parts, key=lambda part: part["gain"])
     inside = "" if row["inside_90"] is None else f"{row['inside_90']:.0%}"
-    kept = ", ".join(stage["stage"] for stage in row["stages"] if stage["kept"])
+    draws = [f" ({stage['draws']} of {DRAWS})" if stage.get("draws", DRAWS) < DRAWS else "" for stage in row["stages"]]
+    kept = ", ".join(stage["stage"] + of for stage, of in zip(row["stages"], draws, strict=True) if stage["kept"])
     return {"title": row["what"].rpartition(":")[0], "row": row, "best": best, "inside": inside, "kept": kept}
 
 

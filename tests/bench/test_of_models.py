@@ -60,6 +60,23 @@ def test_table_names_the_kept_stages_and_the_best_part():
     assert len(stages.table([{**row, "gain": 0.0} if "gain" in row else row for row in rows]).splitlines()) == 2
 
 
+def test_few_rows_are_judged_by_the_means_of_their_draws():
+    def draw(gain: float, *names: str) -> list[dict[str, Any]]:
+        kept = [{"stage": name, "kept": name in names, "held_out": None, "seconds": 1.0} for name in ("mean", "field")]
+        hybrid = {"model": "hybrid", "score": {"median": 0.5 + gain}, "inside_90": 0.8 + gain, "stages": kept}
+        part = {"model": "kriging", "score": {"median": 0.5}, "inside_90": None}
+        return [hybrid, part | {"gain": gain, "gain_low": gain - 0.1, "gain_high": gain + 0.1}]
+
+    assert [cell.seed for cell in CELLS if cell.title == "laboratory, official, 15 rows"] == [0, 1, 2]
+    assert [cell.seed for cell in CELLS if cell.title == "laboratory, official, all rows"] == [0]
+    hybrid, part = stages.over_draws([draw(0.0, "mean"), draw(0.3, "mean", "field"), draw(0.0, "mean")])
+    assert (hybrid["score"]["median"], hybrid["inside_90"]) == pytest.approx((0.6, 0.9))
+    assert [(stage["stage"], stage["draws"]) for stage in hybrid["stages"]] == [("mean", 3), ("field", 1)]
+    # As wide as those of one draw: all are scored on the same test rows.
+    assert [part[key] for key in ("gain", "gain_low", "gain_high")] == pytest.approx([0.1, 0.0, 0.2])
+    assert part["inside_90"] is None
+
+
 @pytest.mark.parametrize(
     ("task", "scene", "parts"),
     [
@@ -133,7 +150,7 @@ def test_weakest_values_are_missing_and_reception_is_tabulated(monkeypatch):
     observed = np.arange(12, dtype=np.float32).reshape(2, 6)
     observed[0, 0] = np.nan  # counts among the missing third
     monkeypatch.setattr(reception, "load_record", lambda _: strengths(observed))
-    cell = reception.Cell("flat-ble", "blocked", 400, True)
+    cell = reception.Cell("flat-ble", "blocked", 400, weak_are_missing=True)
     np.testing.assert_array_equal(np.isnan(cell.record().observation), [[True] * 4 + [False] * 2, [False] * 6])
     scores = {"log_loss": 0.25, "brier": 0.1, "calibration_error": 0.01}
     block = {"received": 2 / 3, **scores, "reference": {name: scores for name in reception.REFERENCES}}
