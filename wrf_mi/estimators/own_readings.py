@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import InputError, Prediction, Record
 from ..core.angles import FloatArray
-from ..training.selection import improves
+from ..training.gains import improves
 from .interpolation.pooled_process import DEGREES
 from .interpolation.run_offsets import NEAR_M, RUN_SD_DB
 from .model import Arrays, Decomposition, Fitted, Inputs

@@ -32,7 +32,8 @@ from ..core.angles import FloatArray
 from ..core.stored import NOT_STORED
 from ..core.types import IntArray
 from ..tasks.scores import probability_scores
-from ..training.selection import FOLDS, HeldOut, clusters, improves
+from ..training.gains import improves
+from ..training.selection import FOLDS, HeldOut, clusters
 
 PARTS = ("rate", "strength", "neighbours")  # probabilities that are mixed
 NEIGHBOURS, SOFTENING_M = 16, 0.4  # training rows of the neighbours' share, and addend of their distances, metres

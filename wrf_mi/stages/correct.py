@@ -26,7 +26,7 @@ from ..correction.state import SceneEdit, ScenePosterior
 from ..correction.uncertain_phases import UncertainPhases
 from ..estimators.model import Arrays, Fitted, Problem, Session
 from ..tracing.paths.instrument_parameters import gain_name
-from ..training.selection import last_gain
+from ..training.gains import last_gain
 from .engine import CONFIDENCE, Engine
 from .scene import Change, Edited, SceneStage, in_regions, too_few, with_near
 from .stage import Option, Stage, State

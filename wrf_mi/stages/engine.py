@@ -25,7 +25,8 @@ from ..core.types import FloatArray, IntArray
 from ..estimators.held_out import fold_of, hold_out_once, predicted_held_out, stored_held_out
 from ..estimators.model import HeldOutPrediction, Model, Problem, Session
 from ..training.by_distance import unit_means
-from ..training.selection import HeldOut, improves, last_gain
+from ..training.gains import improves, last_gain
+from ..training.selection import HeldOut
 from .stage import Option, Stage, State
 
 FOLDER, CHOSEN = "options", "chosen"  # folder of the predictions, and name of those of the chosen chain

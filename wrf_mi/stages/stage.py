@@ -34,7 +34,7 @@ class Option(NamedTuple):
     name: str
     fit: Callable[[State, Split, Session], State]  # state with the stage, fitted to the rows of a split
     #: Options of equal freedom compete by their mean score of held-out rows; one of more freedom is taken where its
-    #: gain is clear (`wrf_mi.training.selection.last_gain`).
+    #: gain is clear (`wrf_mi.training.gains.last_gain`).
     freedom: int = 0
     #: option that it goes on from: it is tried where that one is not clearly behind another, and where that one has
     #: itself gained, if it goes on from a third

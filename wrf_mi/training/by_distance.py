@@ -22,7 +22,8 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..tasks import Task
 from ..tasks.scores import COMPLEX_90, LEVEL, REAL_90
-from .selection import RowDistance, improves, last_gain
+from .gains import improves, last_gain
+from .selection import RowDistance
 
 LENGTHS = 7
 """Number of reaches tried beside 0: each twice the one before, the last four times the largest distance held out."""

@@ -1,8 +1,4 @@
-"""Holding out training rows, and choosing by them.
-
-Every choice of a fit (stages, steps, reach, weights, intervals) is made on the same held-out rows (`hold_out`), by the
-same rule: an option with more freedom is taken where its gain over the one before exceeds the gain's standard error
-(`improves`), since the larger of two scores of few rows is larger by chance half of the time.
+"""Holding out training rows: every choice of a fit (stages, steps, reach, weights, intervals) is made by the same ones.
 
 Validation rows are drawn among the training rows and lie near them, where every interpolation is good. Clusters of
 positions are held out with them, so that some held-out rows are as far from the others as rows to be predicted.
@@ -11,22 +7,19 @@ positions are held out with them, so that some held-out rows are as far from the
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.special import stdtrit
 
 from ..core import Record, Split
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 from ..datasets.observations import LEAST_ROWS, fitted_receivers, predicts_new_runs, rows_received, trained_runs
 from ..datasets.splits import rows_left
-
-Option = TypeVar("Option")
 
 GROUPS = 10  # clusters of training positions, some of which are held out together
 ROWS_OF_GROUP = 4  # least average number of rows of a cluster
@@ -41,43 +34,6 @@ MOST_OBSERVATIONS, MOST_VALUES = (200, 600), 20_000
 values, but 200."""
 LEAST_AWAY_M = 1e-3  # distance below which test rows are at places of training rows
 MOST_PAIRS = 3000  # largest number of held-out pairs of a receiver and a row, received or not
-
-
-def improves(score: FloatArray, before: FloatArray, higher_is_better: bool, errors: float = 1.0) -> bool:
-    """Whether the mean gain of paired scores [rows] exceeds ``errors`` of its standard errors; NaN where nothing was
-    received.
-    """
-    gain = (score - before) * (1 if higher_is_better else -1)
-    gain = gain[np.isfinite(gain)]
-    # Paired scores: rows differ among each other by more than options do, which the difference removes.
-    return len(gain) > 1 and float(gain.mean()) > errors * float(gain.std(ddof=1)) / np.sqrt(len(gain))
-
-
-def last_gain(
-    scores: Iterable[tuple[Option, FloatArray]],
-    higher_is_better: bool,
-    doubt: Mapping[Option, float] | None = None,
-    confidence: float | None = None,
-) -> Option:
-    """The last option that improves on the one kept before it (`improves`); the first, if none does.
-
-    Args:
-        scores: options in the order of their freedom, each with its scores of the same rows.
-        higher_is_better: direction of the scores.
-        doubt: standard errors by which a gain has to exceed zero for an option to be left; 1 for options without.
-        confidence: one-sided confidence in a gain by Student's t distribution, in place of standard errors: the
-            rows, such as receivers, may be a handful.
-    """
-    (chosen, best), *others = scores
-    for option, score in others:
-        errors = (doubt or {}).get(chosen, 1.0)
-        if confidence is not None:
-            pairs = np.count_nonzero(np.isfinite(score - best))
-            errors = float(stdtrit(pairs - 1, confidence)) if pairs > 1 else np.inf
-        # Against the one chosen so far, not the one before: a series of unclear gains may add up to a clear one.
-        if improves(score, best, higher_is_better, errors):
-            chosen, best = option, score
-    return chosen
 
 
 def clusters(positions_m: FloatArray, count: int, rng: np.random.Generator) -> IntArray:

@@ -16,9 +16,9 @@ from ..core.types import FloatArray, IntArray
 from .by_distance import Reach, choose_reach
 from .evaluator import Request
 from .fit_plan import FIELD, FitPlan
+from .gains import improves
 from .loop import FitState
 from .predictor import Predictor
-from .selection import improves
 
 PHASE_ERRORS = (0.5, 1.0, 1.5)  # phase errors that are tried, rad: beyond, phases are uniform
 

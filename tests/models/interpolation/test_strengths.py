@@ -13,10 +13,11 @@ from wrf_mi.core.antenna import UPRIGHT
 from wrf_mi.datasets import load, make_splits
 from wrf_mi.estimators.interpolation import strengths
 from wrf_mi.estimators.interpolation.pooled_process import Basis, Coefficients, PooledProcess, ReceiverObservations
-from wrf_mi.estimators.interpolation.strength_fit import folds, held_out, widening
+from wrf_mi.estimators.interpolation.strength_fit import held_out, widening
 from wrf_mi.estimators.interpolation.strength_settings import StrengthSettings
 from wrf_mi.estimators.interpolation.strength_terms import Hyperparameters, Measured, Poses, stops_of
 from wrf_mi.estimators.interpolation.strengths import Strengths, fit_strengths
+from wrf_mi.estimators.interpolation.stretches import folds
 from wrf_mi.estimators.model import Inputs
 from wrf_mi.tracing import TraceOptions, open_scene
 from wrf_mi.tracing.power_map import trace_map

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ...training.fit_plan import FitPlan
-from ...training.selection import last_gain
+from ...training.gains import last_gain
 from ...training.trainer import Trainer
 
 

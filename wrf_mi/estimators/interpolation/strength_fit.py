@@ -1,11 +1,11 @@
-"""Fit of signal strengths: expected power, folds, likely hyperparameters, calibration of predictions.
+"""Fit of signal strengths: expected power, likely hyperparameters, calibration of predictions.
 
 The processes of the receivers are those of `wrf_mi.estimators.interpolation.pooled_process`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.optimize import minimize
-from scipy.spatial import cKDTree
 
 from ...core.angles import FloatArray
 from ...core.stored import NOT_STORED
@@ -25,15 +24,11 @@ from .path_loss import FREE_SPACE, NEAREST_M
 from .pooled_process import Basis, PooledProcess, ReceiverObservations, of_each
 from .strength_terms import PARTS_OF_NOISE, Hyperparameters, Measured, Poses, Stops, basis
 from .strength_trees import Forest
+from .stretches import folds, run_folds, scales
 
 if TYPE_CHECKING:
     from ...tracing.power_map import Traced
 
-FOLDS = 7
-STRETCH = (4, 150)
-"""Bounds of the rows of a held-out stretch, else a fourteenth of all rows, so that each fold holds at least two."""
-PLACE_M = 0.1  # grid whose cells are places: readings at a stop differ by what positions are known to
-BUFFER = 0.25  # share of a stretch that is left out on either side of it, as consecutive rows share noise
 TRUST = 100.0  # number of held-out values that weigh as much as the prior in a quantile of errors
 AREA_SHADOW_DB, AREA_NOISE_DB = 6.0, 2.0  # shadowing of areas a priori, and both parts of the noise
 LIKELIHOOD_STOPS, LIKELIHOOD_RECEIVERS, LIKELIHOOD_STEPS = 400, 12, 50
@@ -318,45 +313,6 @@ def likely_deviations(
     reading adds to the uncertainty of the mean is known. Parameters that are ``stated`` hold.
     """
     return by_likelihood(prior, stops, hyperparameters, {*stated, "shadow_m"}, DEVIATION_STOPS)[1]
-
-
-def scales(position_m: FloatArray) -> tuple[float, float]:
-    """Median distance to the nearest other position, and diagonal of the box around positions [n, 3], metres."""
-    places = np.unique(position_m, axis=0)
-    extent_m = float(np.linalg.norm(np.ptp(places, axis=0)))
-    spacing_m = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) if len(places) > 1 else 0.0
-    return spacing_m, extent_m
-
-
-def folds(position_m: FloatArray, number_of_folds: int = FOLDS) -> Iterator[tuple[IntArray, IntArray]]:
-    """Training rows and held-out rows of each fold, as indices of positions [n, 3] in metres.
-
-    Stretches of the record's order are held out. Where that is the order of time, as along a path, a stretch is
-    predicted like another run: from other visits, not from the preceding row. All readings of a place are in the
-    stretch of the first: lengths that other readings of the same place choose fit those, and no place in between.
-    """
-    count = len(position_m)
-    _, first, place = np.unique(np.round(position_m / PLACE_M), axis=0, return_index=True, return_inverse=True)
-    visit = first[place.reshape(-1)]
-    order = np.argsort(visit, kind="stable")
-    begins = np.searchsorted(visit[order], visit[order])
-    stretch = int(np.clip(count // (2 * number_of_folds), *STRETCH))
-    number = begins // stretch
-    for fold in range(min(number_of_folds, int(number[-1]) + 1)):
-        out = number % number_of_folds == fold
-        near = out.copy()
-        for step in range(1, int(stretch * BUFFER) + 1):
-            near[step:] |= out[:-step]
-            near[:-step] |= out[step:]
-        if out.any() and not near.all():
-            yield np.sort(order[~near]), np.sort(order[out])
-
-
-def run_folds(run: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Training rows and held-out rows of each fold, as indices, that hold out whole runs by their numbers [n]."""
-    number = np.unique(run, return_inverse=True)[1].reshape(-1) % FOLDS
-    for fold in range(int(number.max()) + 1):
-        yield np.flatnonzero(number != fold), np.flatnonzero(number == fold)
 
 
 def held_out(

@@ -216,7 +216,7 @@ def fit_strengths(
 
     Args:
         record: signal strengths with a single, known carrier.
-        rows: numbers of training rows, in the order of time (`wrf_mi.estimators.interpolation.strength_fit.folds`).
+        rows: numbers of training rows, in the order of time (`wrf_mi.estimators.interpolation.stretches.folds`).
         power_map: traced power, a local mean or at positions themselves; None: free space is expected.
         settings: settings; hyperparameters whose origin they leave open are the default ones.
         on_progress: progress callback.
