@@ -13,13 +13,7 @@ from made_building import TRAINED, building, silent_in
 from scipy.stats import truncnorm
 
 from wrf_mi.apps.checking import check_data
-from wrf_mi.apps.checking.rows import (
-    constant_observations,
-    few_rows,
-    named_rows,
-    not_heard,
-    repeated_rows,
-)
+from wrf_mi.apps.checking.rows import constant_observations, few_rows, named_rows, not_heard, repeated_rows
 from wrf_mi.core import Record
 from wrf_mi.datasets import write_ble_folder
 from wrf_mi.datasets.sentinels import suspicious_values

@@ -24,7 +24,7 @@ from wrf_mi.scene.make import make_scene
 from wrf_mi.tracing.sionna.scenes import load_scene
 
 TURNS = 12  # rooms, and ways, in which a fault of each kind is made
-SECONDS = 60.0  # bound of the time that hostile files take on a busy machine
+SECONDS = 60.0  # bound of the time that hostile meshes take on a busy machine
 PLACED_M = 2e-6  # largest difference to corners of Mitsuba, which computes in single precision
 VALUES = '<string name="type" value="concrete"/><float name="thickness" value="0.1"/>'
 CONCRETE = f'<bsdf type="itu-radio-material" id="mat-wall">{VALUES}</bsdf>'
@@ -107,7 +107,7 @@ def test_transforms_are_those_of_mitsuba(steps, tmp_path):
     (part,) = [result for result in scene_parts(scene) if isinstance(result, ShapePart)]
     expected = in_sionna(path)
     np.testing.assert_allclose(part.corners_m, expected, atol=PLACED_M * np.abs(expected).max())
-    assert set(kinds(path)) <= {"moved", "inverted"}
+    assert set(kinds(path)) <= {"moved"}
 
 
 def test_skewed_axes_camel_case_and_unknown_parameters_are_faults(tmp_path):
@@ -193,14 +193,6 @@ def test_sheet_before_a_solid_is_a_fault_and_neighbouring_houses_are_not(tmp_pat
         assert kinds(xml, "fault") == expected
 
 
-def test_integrator_is_noted_but_in_folders_that_mesh_makes(tmp_path):
-    (tmp_path / "plan.csv").write_text("x,y\n0,0\n4,0\n4,3\n0,3\n0,0\n")
-    made = make_scene(tmp_path / "plan.csv", tmp_path / "room", height_m=2.7).folder
-    assert "pictures" not in kinds(made)
-    (made / "scene.yml").unlink()
-    assert "pictures" in kinds(made / "scene.xml")
-
-
 def test_equal_faults_are_printed_once(tmp_path):
     path = scene_file(tmp_path, "ply")
     gone = '<string name="filename" value="gone.ply"/>'
@@ -214,17 +206,8 @@ def test_equal_faults_are_printed_once(tmp_path):
     assert lines[-1] == f"{path}: 1000 faults, no warnings, no notes; 500 shapes, 0 triangles"
 
 
-def test_hostile_files_take_seconds(tmp_path):
+def test_hostile_meshes_take_seconds(tmp_path):
     begun = time.perf_counter()
-    path = scene_file(tmp_path, "ply")
-    entities = "".join(f'<!ENTITY l{k} "{f"&l{k - 1};" * 10}">' for k in range(1, 30))
-    for text in (
-        f'<!DOCTYPE s [<!ENTITY l0 "x">{entities}]><scene version="&l29;"/>',
-        "<scene>" * 100_000,
-        "<scene>" + "<bsdf>" * 100_000 + "</bsdf>" * 100_000 + "</scene>",
-    ):
-        path.write_text(text, encoding="utf-8")
-        assert kinds(path) == ["xml"], text[:30]
     properties = "".join(f"property float {axis}\n" for axis in "xyz")
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {{}}\n{properties}element face {{}}\n"
     head += "property list uchar int vertex_indices\nend_header\n"
@@ -247,7 +230,7 @@ def test_scan_is_judged_by_its_points(tmp_path):
     file, grid, lost = tmp_path / "scan.xyz", np.array([7e5, 4e6, 0]), points.copy()
     lost[7, 1] = np.nan
     for scan, level, expected in (
-        (points, "", ["no-viewpoint"]),
+        (points, "", []),
         (1000 * points, "fault", ["units"]),
         (points * [100, 150, 50] + grid, "fault", ["units"]),
         (np.round(points * 2) / 2 + grid, "fault", ["coarse-steps"]),

@@ -59,7 +59,7 @@ def test_repaired_scene_opens_in_sionna(kind, turn, tmp_path):
     for merged in (True, False):
         assert rt.load_scene(str(repair.folder / "scene.xml"), merge_shapes=merged).objects
     left = {f.kind for f in repair.after.findings} - {"moved", "up-axis", "no-constants", "device-inside"}
-    assert left <= {"inverted", "open-solid", "party-wall"}
+    assert left <= {"party-wall"}
     assert damaged.text == (damaged.folder / "scene.xml").read_text("utf-8")
 
 

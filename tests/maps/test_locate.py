@@ -19,9 +19,9 @@ from sklearn.neighbors import KNeighborsRegressor
 from wrf_mi.apps.maps import locate_calibration
 from wrf_mi.apps.maps.grid import Candidates, candidates_of, grid_over
 from wrf_mi.apps.maps.locate import locate
-from wrf_mi.apps.maps.locate_calibration import FILE, Located, choose, fit_silence, folds_of, widest
+from wrf_mi.apps.maps.locate_calibration import FILE, Located, choose, folds_of, widest
 from wrf_mi.apps.maps.locate_file import read_observations
-from wrf_mi.apps.maps.locate_likelihood import Likelihood, Silence, densest, mass_of, ranks_of, region_of
+from wrf_mi.apps.maps.locate_likelihood import DEGREES, Likelihood, densest, mass_of, ranks_of, region_of
 from wrf_mi.apps.maps.locate_neighbours import Neighbours
 from wrf_mi.core import InputError, Receiver, Record, Split
 from wrf_mi.datasets import write_ble_folder
@@ -75,13 +75,13 @@ def test_three_receivers_of_known_path_loss_recover_the_position(column: int, ro
     assert inside[truth]
 
 
-@pytest.mark.parametrize("form", [Likelihood(None), Likelihood(4.0, 1.3), Likelihood(None, offset_db=4.0)])
+@pytest.mark.parametrize("form", [Likelihood(), Likelihood(1.3), Likelihood(offset_db=4.0)])
 def test_region_covers_as_stated_under_the_noise_of_the_model(form: Likelihood) -> None:
     candidates, rng, inside, near = room(), np.random.default_rng(2), [], []
     predicted = law(candidates, 4.0)
     for truth in rng.integers(len(candidates.positions_m), size=DRAWS):
-        noise = rng.standard_t(form.degrees, 3) if form.degrees else rng.normal(size=3)
-        value = predicted[0, 0, :, truth] + 4 * form.scale * noise + form.offset_db * rng.normal()
+        noise = 4 * form.scale * rng.standard_t(DEGREES, 3) + form.offset_db * rng.normal()
+        value = predicted[0, 0, :, truth] + noise
         best, radius_m, region = region_of(softmax(form.log(value, *predicted)), candidates.distance_m, 0.9)
         inside.append(region[truth])
         near.append(candidates.distance_m[best, truth] <= radius_m)
@@ -94,56 +94,22 @@ def test_likelihood_is_the_density_of_scipy() -> None:
     rng = np.random.default_rng(1)
     mean, std = rng.normal(-60, 5, (2, 3, 7)).astype(np.float32), rng.uniform(2, 5, (2, 3, 7)).astype(np.float32)
     value = np.array([-58.0, np.nan, -64.0])
-    for form, density in ((Likelihood(5.0, 1.2), student_t(5.0)), (Likelihood(None, 1.2), norm())):
-        scale = 1.2 * std[:, [0, 2]]
-        each = density.logpdf((value[[0, 2], None] - mean[:, [0, 2]]) / scale) - np.log(scale)
-        expected = np.logaddexp.reduce(each.sum(axis=1), axis=0) - np.log(2)
-        np.testing.assert_allclose(form.log(value, mean, std), expected, atol=SINGLE)
+    scale = 1.2 * std[:, [0, 2]]
+    each = student_t(DEGREES).logpdf((value[[0, 2], None] - mean[:, [0, 2]]) / scale) - np.log(scale)
+    expected = np.logaddexp.reduce(each.sum(axis=1), axis=0) - np.log(2)
+    np.testing.assert_allclose(Likelihood(1.2).log(value, mean, std), expected, atol=SINGLE)
 
 
-def test_common_offset_is_the_normal_of_correlated_residuals() -> None:
+@pytest.mark.parametrize(("offset_db", "value"), [(2.0, (2.0, -1.0, 3.0)), (30.0, (22.0, 19.0, 23.0))])
+def test_common_offset_is_integrated(offset_db: float, value: tuple[float, ...]) -> None:
     mean, std = np.zeros((1, 3, 1), np.float32), np.full((1, 3, 1), 4.0, np.float32)
-    for offset_db, value in ((2.0, np.array([2.0, -1.0, 3.0])), (30.0, np.array([22.0, 19.0, 23.0]))):
-        covariance = 16 * np.eye(3) + offset_db**2 * np.ones((3, 3))
-        expected = -(value @ np.linalg.solve(covariance, value) + np.log(np.linalg.det(2 * np.pi * covariance))) / 2
-        assert Likelihood(None, offset_db=offset_db).log(value, mean, std)[0] == pytest.approx(expected, abs=SINGLE)
-        heavy = Likelihood(8.0, offset_db=offset_db).log(value, mean, std)[0]
+    heavy = Likelihood(offset_db=offset_db).log(np.array(value), mean, std)[0]
 
-        def density(offset: float, value: np.ndarray = value, offset_db: float = offset_db) -> float:
-            return float(np.prod(student_t(8.0).pdf((value - offset) / 4) / 4) * norm(0, offset_db).pdf(offset))
+    def density(offset: float) -> float:
+        residual = (np.array(value) - offset) / 4
+        return float(np.prod(student_t(DEGREES).pdf(residual) / 4) * norm(0, offset_db).pdf(offset))
 
-        assert heavy == pytest.approx(np.log(quad(density, -150, 150, points=[0, value.mean()])[0]), abs=QUADRATURE)
-
-
-def test_receivers_that_received_nothing_count_where_strength_decides_reception() -> None:
-    candidates, rng = room(), np.random.default_rng(3)
-    predicted = law(candidates, 3.0)
-    truth = rng.integers(len(candidates.positions_m), size=150)
-    value = predicted[0, 0][:, truth] + rng.normal(0, 3, (3, 150))
-    value[value < -54] = np.nan
-    keep = np.isfinite(value).any(axis=0)
-    places = candidates.positions_m[truth[keep]]
-    record = record_of(places, value[:, keep], len(places) - 1)
-    rows = np.array_split(np.arange(len(places)), 3)
-    parts = [Located(predicted, np.arange(3), part, candidates.nearest(places[part]), places[part]) for part in rows]
-    silence = choose(record, parts, candidates, lambda share: None).likelihood.silence
-    assert silence is not None
-    assert abs(silence.middle_dbm + 54) < 3
-    lost = value[:, keep].copy()
-    finite = rng.normal(-50, 5, lost.shape)
-    finite[rng.uniform(size=lost.shape) < 0.2] = np.nan
-    finite[0] = -50.0
-    at_random = choose(record_of(places, finite, len(places) - 1), parts, candidates, lambda share: None)
-    assert at_random.likelihood.silence is None
-
-
-def test_probability_of_silence_is_one_half_in_the_middle() -> None:
-    silence = Silence(-80.0, 0.5)
-    assert np.exp(silence.log_probability(np.array(-80.0), True)) == pytest.approx(0.5)
-    total = sum(np.exp(silence.log_probability(np.array([-90.0, -70]), received)) for received in (True, False))
-    np.testing.assert_allclose(total, 1, atol=ROUNDING)
-    parts = [Located(law(room(), 3.0), np.arange(3), np.arange(2), np.arange(2), np.zeros((2, 3)))]
-    assert fit_silence(record_of(np.ones((2, 3)), np.full((3, 2), -50.0), 1), parts) is None
+    assert heavy == pytest.approx(np.log(quad(density, -150, 150, points=[0, np.mean(value)])[0]), abs=QUADRATURE)
 
 
 @given(st.lists(st.floats(0.01, 1), min_size=1, max_size=30), st.floats(0.05, 0.95))
@@ -158,7 +124,7 @@ def test_densest_candidates_hold_the_level_and_no_fewer_do(weights: list[float],
 
 def test_mass_of_regions_covers_where_stated_deviations_are_too_large() -> None:
     """Deviations of twice the noise: regions of 90 % of the probability hold nearly all positions."""
-    candidates, rng, form = room(), np.random.default_rng(8), Likelihood(None)
+    candidates, rng, form = room(), np.random.default_rng(8), Likelihood()
     predicted, ranks = law(candidates, 4.0), list[tuple[float, float]]()
     for truth in rng.integers(len(candidates.positions_m), size=DRAWS):
         probability = softmax(form.log(predicted[0, 0, :, truth] + rng.normal(0, 2, 3), *predicted))
@@ -275,23 +241,14 @@ def test_offset_of_the_power_widens_regions(fitted: tuple[Path, Record]) -> None
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("anchor0_dbm,anchor1_dbm\n-50,-60\n", "no column of receiver anchor2; name one anchor2_dbm"),
-        ("rssi_0,rssi_1,rssi_2,rssi_9\n-5,-6,-7,-8\n", "rssi_9 names no receiver of the run"),
-        (
-            "rssi_1,rssi_8,rssi_9\n-6,-7,-8\n",
-            "no column of receivers anchor0, anchor2, and columns rssi_8, rssi_9 name no",
-        ),
-        (
-            ",".join(f"rssi_{k}" for k in (0, 1, 2, *range(10, 19))) + "\n" + "-5," * 11 + "-5\n",
-            "columns rssi_10, rssi_11, rssi_12, rssi_13, rssi_14, rssi_15 and 3 more",
-        ),
+        ("anchor0_dbm,anchor1_dbm\n-50,-60\n", "no strengths of receiver anchor2 among anchor0, anchor1"),
+        ("rssi_1,rssi_8,rssi_9\n-6,-7,-8\n", "no strengths of receivers anchor0, anchor2 among 1, 8, 9"),
         ("x,y,BSSID,RSSI\n1,1,8,-50\n1,1,9,-60\n", "no strengths of receivers anchor0, anchor1, anchor2 among 8, 9"),
         ("ap1 rss,ap2 rss,x,y\n-50,-60,1,1\n", "no strengths of receivers anchor0, anchor1, anchor2 among ap1, ap2"),
-        ("rssi_0,rssi_1,rssi_2,anchor2_dbm\n-5,-6,-7,-8\n", "anchor2_dbm and rssi_2 are of one receiver"),
+        ("rssi_0,rssi_1,rssi_2,anchor2_dbm\n-5,-6,-7,-8\n", "two of 0, 1, 2, anchor2 are of one receiver"),
         ("rssi_0,rssi_1,rssi_2\n-5,-6,-7\n,,\n", "row 2: no receiver of the run received anything"),
         ("rssi_0,rssi_1,rssi_2\n-5,loud,-7\n", "row 1: rssi_1 is 'loud'"),
-        ("rssi_0,rssi_1,rssi_2,x\n-5,-6,-7,1\n", "column x alone is no position"),
-        ("rssi_0,rssi_1,rssi_2\n", "no rows below the header"),
+        ("rssi_0,rssi_1,rssi_2\n", "no rows"),
     ],
 )
 def test_bad_observations_are_refused_in_one_line(fitted, tmp_path, text, words, command):
@@ -397,12 +354,11 @@ def test_fold_that_was_stopped_goes_on_from_its_files(tmp_path: Path, monkeypatc
     assert not (run.folder / locate_calibration.FOLDER).exists()
 
 
-def test_widest_form_within_a_standard_error_is_chosen() -> None:
-    rng, forms = np.random.default_rng(6), [Likelihood(None), Likelihood(8.0), Likelihood(8.0, 1.4)]
-    noise = rng.normal(size=(2, 100))
+def test_widest_scale_within_a_standard_error_is_chosen() -> None:
+    scales, noise = (0.7, 1.0, 1.4), np.random.default_rng(6).normal(size=(2, 100))
     alike = [np.zeros(100), -0.01 + 0.5 * noise[0], -1 + 0.5 * noise[1]]
-    assert widest(forms, alike) == forms[1]
-    assert widest(forms, [np.zeros(100), np.full(100, -0.01), np.full(100, -1.0)]) == forms[0]
+    assert widest(scales, alike) == 1.0
+    assert widest(scales, [np.zeros(100), np.full(100, -0.01), np.full(100, -1.0)]) == 0.7
 
 
 def test_candidates_do_not_depend_on_test_rows(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from wrf_mi.apps.maps.api import radio_map
 from wrf_mi.apps.maps.grid import candidates_of
 from wrf_mi.apps.maps.locate import locate
 from wrf_mi.apps.maps.locate_calibration import FILE, FOLDER
-from wrf_mi.core import Prediction, Record
+from wrf_mi.core import Record
 from wrf_mi.datasets import write_ble_folder
 from wrf_mi.models import Inputs
 from wrf_mi.receivers.instruments import Instrument
@@ -27,7 +27,6 @@ from wrf_mi.scene.folder import write_scene
 from wrf_mi.scene.materials import Materials
 from wrf_mi.scene.mesh.surfaces import Surface
 from wrf_mi.stages import strengths as of_strengths
-from wrf_mi.stages.fitted import FittedMixture
 from wrf_mi.stages.stage import Option
 from wrf_mi.tracing import TraceOptions, power_map
 from wrf_mi.tracing.tracer import RayTracer
@@ -203,27 +202,6 @@ def test_progress_begins_before_anything_is_traced(anew: Run, traced: list, monk
         assert len(shares) >= 5
         assert shares == sorted(shares)
         assert shares[-1] == pytest.approx(1)
-
-
-def test_duration_is_stated_before_candidates_are_predicted(anew: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A clock that runs by a predicted position's share, and by a start of each prediction."""
-    start_s, each_s, now = 5.0, 0.25, [0.0]
-    predict = FittedMixture.predict
-
-    def timed(fitted: FittedMixture, inputs: Inputs, receiver: int) -> Prediction:
-        now[0] += start_s + each_s * len(inputs.tx_pos_m)
-        return predict(fitted, inputs, receiver)
-
-    monkeypatch.setattr(FittedMixture, "predict", timed)
-    monkeypatch.setattr(locate_calibration.time, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(locate_calibration, "TOGETHER", 32)
-    reports: list[tuple[str, float, float]] = []
-    locate(anew, observed_of(anew), step_m=STEP_M, on_progress=lambda *what: reports.append((*what[:2], now[0])))
-    predicting = [report for report in reports if report[0].startswith("predicting")]
-    seconds = predicting[-1][2] - predicting[0][2]
-    count = len(candidates_of(anew, STEP_M).positions_m)
-    assert seconds == 3 * (start_s * -(-count // 32) + each_s * count)
-    assert predicting[0][:2] == (f"predicting {count} candidates, about {seconds / 60:.0f} min", 0.0)
 
 
 def test_stopped_search_leaves_nothing(anew: Run) -> None:

@@ -56,11 +56,7 @@ class _Layout:
 
 
 def read_argos(
-    path: str | Path,
-    name: str | None = None,
-    frames: slice | None = None,
-    cell: int | None = None,
-    start: int | None = None,
+    path: str | Path, name: str | None = None, frames: slice | None = None, cell: int | None = None
 ) -> Record:
     """Read and check a capture of a many-antenna base station (see ``docs/data.md``).
 
@@ -70,7 +66,6 @@ def read_argos(
         frames: frames that are read, such as ``slice(0, 4000, 10)``; by default all. A record takes 416 bytes for each
             frame, user and antenna.
         cell: number of the base station, from 0, if the capture holds several.
-        start: first sample of the first pilot symbol in a user's slot; by default that of the layout.
 
     Returns:
         A record with ``task="csi"`` and one receiver, whose position is not known: ``observation``
@@ -88,7 +83,7 @@ def read_argos(
     try:
         with h5py.File(file, "r") as stored:
             pilots, attributes = _pilots(file, stored)
-            layout, samples = _open(file, pilots, attributes, frames, cell, start)
+            layout, samples = _open(file, pilots, attributes, frames, cell)
             channel = np.concatenate([_estimate(part, layout) for part in samples])
     except FileNotFoundError:
         raise DataFault(file, "missing; give a capture in HDF5") from None
@@ -136,16 +131,16 @@ def _pilots(file: Path, stored: Any) -> tuple[Any, dict[str, Any]]:
 
 
 def _open(
-    file: Path, pilots: Any, attributes: dict[str, Any], frames: slice | None, cell: int | None, start: int | None
+    file: Path, pilots: Any, attributes: dict[str, Any], frames: slice | None, cell: int | None
 ) -> tuple[_Layout, Iterator[NDArray[Any]]]:
     shape = _check_samples(file, pilots)
     asked = range(shape[0])[frames or slice(None)]
     if not len(asked) or asked.step < 0:
         raise DataFault(file, f"frames {frames} select none of {shape[0]}; give a slice that ascends")
-    layout = (_sounder if len(shape) == 5 else _argos)(file, shape, attributes, start)
+    layout = (_sounder if len(shape) == 5 else _argos)(file, shape, attributes)
     if layout.starts[0] < 0 or layout.starts[-1] + FFT > layout.slot:
         text = f"pilot symbols at {', '.join(map(str, layout.starts))} do not fit in slots of {layout.slot} samples"
-        raise DataFault(file, f"{text}; give start")
+        raise DataFault(file, f"{text}; correct its attributes")
     needed = RECORD_BYTES * len(asked) * layout.users * layout.antennas
     require_memory(2 * needed, f"{file}: channels of {len(asked)} frames", "give fewer frames")
     return layout, _chunks(pilots, layout, asked, _cell_number(file, shape, cell))
@@ -186,27 +181,23 @@ def _check_samples(file: Path, pilots: Any) -> tuple[int, ...]:
     return shape
 
 
-def _argos(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start: int | None) -> _Layout:
+def _argos(file: Path, shape: tuple[int, ...], attributes: dict[str, Any]) -> _Layout:
     stated = [attempt(_whole, file, attributes, key) for key in ("num_mob_ant", "samples_per_user")]
     users, slot = (number.value for number in stated)
     if shape[3] != 2 or shape[2] < users * slot:
         text = f"{PILOTS} has shape {list(shape)}, but {users} users have {slot} samples each"
         raise DataFault(file, f"{text}; correct num_mob_ant or samples_per_user")
-    first = ARGOS_START if start is None else start
-    starts = tuple(first + k * FFT for k in range(ARGOS_SYMBOLS))
-    return _Layout(users, shape[1], slot, starts)
+    return _Layout(users, shape[1], slot, tuple(ARGOS_START + k * FFT for k in range(ARGOS_SYMBOLS)))
 
 
-def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any], start: int | None) -> _Layout:
+def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any]) -> _Layout:
     if shape[4] % 2:
         raise DataFault(file, f"{PILOTS} has {shape[4]} numbers a slot, which are no pairs of I and Q; correct it")
     slot = shape[4] // 2
     attempt(_check_sequence, file, attributes)
-    keys = ("CP_LEN", "PREFIX_LEN") if start is None else ("CP_LEN",)
-    stated = [attempt(_whole, file, attributes, key) for key in keys]
-    guard, *prefix = (number.value for number in stated)
-    first = guard + prefix[0] if start is None else start
-    room = slot - (first - guard) - int(_number(attributes, "POSTFIX_LEN") or 0)
+    stated = [attempt(_whole, file, attributes, key) for key in ("CP_LEN", "PREFIX_LEN")]
+    guard, prefix = (number.value for number in stated)
+    first, room = guard + prefix, slot - prefix - int(_number(attributes, "POSTFIX_LEN") or 0)
     starts = tuple(first + k * (FFT + guard) for k in range(max(1, room // (FFT + guard))))
     return _Layout(shape[2], shape[3], slot, starts)
 

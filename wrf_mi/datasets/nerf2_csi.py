@@ -30,11 +30,10 @@ CHANNELS, STATION, TRUTH = "csidata.npy", "base-station.yml", "downlink_truth.np
 FEWEST = 2  # least number of samples: one to train on and one to score
 
 
-def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: FloatArray | None = None) -> Record:
+def read_nerf2_csi(path: str | Path, name: str | None = None) -> Record:
     """Read and check a folder in the layout of NeRF2's channel coefficients (see ``docs/data.md``).
 
-    The record has the folder's name unless another is given. ``frequencies_hz`` of all subcarriers, uplink and
-    downlink, replace those of ``base-station.yml``.
+    The record has the folder's name unless another is given.
 
     Returns:
         A record with ``task="csi"`` and one receiver at the middle of the antennas: ``observation``
@@ -55,7 +54,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None, frequencies_hz: Fl
         if count != antennas:
             text = f"{count} positions in base_station, but {CHANNELS} has {antennas} antennas"
             raise DataFault(station, f"{text}; give one for each")
-    frequencies = attempt(_frequencies, station, info, channel, frequencies_hz)
+    frequencies = attempt(_frequencies, station, info, channel)
     positions = folder / files.POSITIONS
     stated = attempt(files.read_positions, positions, ()) if positions.exists() else None
     with recoverable():
@@ -158,12 +157,9 @@ def _count_samples(path: Path, channel: NDArray[np.complex64]) -> int:
     return n
 
 
-def _frequencies(
-    path: Path, info: dict[Any, Any], channel: NDArray[np.complex64], of_call: FloatArray | None
-) -> FloatArray | None:
-    """Frequencies of all subcarriers: those of the call, or else those of ``base-station.yml``, if any."""
-    stated = info.get("frequencies_hz") if of_call is None else of_call
-    if stated is None:
+def _frequencies(path: Path, info: dict[Any, Any], channel: NDArray[np.complex64]) -> FloatArray | None:
+    """Frequencies of all subcarriers, if ``base-station.yml`` states any."""
+    if (stated := info.get("frequencies_hz")) is None:
         return None
     frequencies, subcarriers = files.numbers_of(stated), channel.shape[2]
     positive = (frequencies > 0) & (frequencies <= files.SINGLE_MAX)

@@ -33,11 +33,7 @@ SPLIT_FORMAT = 2  # version of the split file
 
 
 def make_splits(
-    record: Record,
-    name: str,
-    seed: int = 0,
-    n_train: int | float | None = None,
-    validation_fraction: float = 0.1,
+    record: Record, name: str, seed: int = 0, n_train: int | float | None = None, validation_fraction: float = 0.1
 ) -> list[Split]:
     """Split a record's rows by one of nine rules.
 

@@ -133,9 +133,14 @@ def looks_y_up(points_m: FloatArray) -> bool:
     shaft = length <= SHAFT * along_y and along_z >= SHAFT_HEIGHT * length
     if any((corridor, shaft, along_y > most, along_z < TALL * along_y)):
         return False
-    cell = ((points_m - low) / ((high - low).max() / CELLS)).astype(int)
-    seen_along_y, seen_along_z = (len(np.unique(cell[:, axes], axis=0)) for axes in ([0, 2], [0, 1]))
+    seen_along_y, seen_along_z = _seen_cells(points_m, low, high)
     return seen_along_y > BROAD * seen_along_z
+
+
+def _seen_cells(points_m: FloatArray, low: FloatArray, high: FloatArray) -> tuple[int, int]:
+    """Numbers of cells in which points [n, 3] of an extent are seen along y, and along z."""
+    cell = ((points_m - low) / ((high - low).max() / CELLS)).astype(int)
+    return len(np.unique(cell[:, [0, 2]], axis=0)), len(np.unique(cell[:, [0, 1]], axis=0))
 
 
 def warn_of_up(points_m: FloatArray, name: str | Path, stated: Up | None = None) -> None:
@@ -174,8 +179,7 @@ def require_clear_up(points_m: FloatArray, name: str | Path, stated: Up | None) 
         return
     low, high = extent(points_m)
     _, along_y, along_z = high - low
-    cell = ((points_m[:: len(points_m) // MOST_POINTS + 1] - low) / ((high - low).max() / CELLS)).astype(int)
-    seen_along_y, seen_along_z = (len(np.unique(cell[:, axes], axis=0)) for axes in ([0, 2], [0, 1]))
+    seen_along_y, seen_along_z = _seen_cells(points_m[:: len(points_m) // MOST_POINTS + 1], low, high)
     is_clear = along_z >= ROOM_HEIGHT_M[0] and seen_along_z > CLEARLY_MORE * seen_along_y
     if ROOM_HEIGHT_M[0] <= along_y <= ROOM_HEIGHT_M[1] + TILTED_M and not is_clear:
         text = f"{name}: {along_y:.1f} m along y and {along_z:.1f} m along z of a phone's scan may both be the height"

@@ -11,6 +11,7 @@ import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 import yaml
 from defusedxml.common import DefusedXmlException
 from numpy.typing import ArrayLike
-from wrf_mi_scenes.mitsuba_xml import PERFECT, PERFECT_CONSTANTS, scene_xml
+from wrf_mi_scenes.mitsuba_xml import scene_xml
 
 from ..core import InputError
 from ..core.files import atomic_folder, inside, listed, one_line, write_atomically, write_figure
@@ -158,13 +159,14 @@ def read_scene_folder(folder: str | Path) -> SceneFolder:
         which = "no mesh in meshes/" if odd[0] in materials.surfaces else f"not among surfaces in {MATERIALS_FILE}"
         raise InputError(f"{folder}: surface {odd[0]!r} has {which}; write the scene anew")
     full = materials.complete(materials.surfaces)
-    if _materials_in(xml) != _stated(full):
+    text = scene_xml(full.by_surface(), full.constants)
+    if _materials_in(xml) != _materials_in(StringIO(text)):
         logger.info("%s: materials changed in %s, written anew", xml, MATERIALS_FILE)
         try:
-            write_atomically(xml, scene_xml(full.by_surface(), full.constants))
+            write_atomically(xml, text)
         except OSError as error:
-            text = f"{xml}: must follow {MATERIALS_FILE} and cannot be written ({one_line(error.strerror or error)})"
-            raise InputError(f"{text}; copy the folder and open the copy") from None
+            reason = f"{xml}: must follow {MATERIALS_FILE} and cannot be written ({one_line(error.strerror or error)})"
+            raise InputError(f"{reason}; copy the folder and open the copy") from None
     counts = facts.get("counts")
     return SceneFolder(folder, xml, full, counts if isinstance(counts, dict) else {}, _origin(folder, facts))
 
@@ -189,17 +191,7 @@ def scene_file(folder: Path, facts: Mapping[Any, Any]) -> Path:
     return inside(folder, facts["xml"], folder / FACTS_FILE)
 
 
-def _stated(materials: Materials) -> tuple[dict[str, str], dict[str, dict[str, float]]]:
-    """Material of each surface, and constants of those that are used and of the scene's own."""
-    used = materials.by_surface()
-    return used, {
-        name: {key: float(f"{values[key]:.9g}") for key in PERFECT_CONSTANTS}  # as many digits as a scene file has
-        for name, values in materials.constants.items()
-        if name in used.values()
-    }
-
-
-def _materials_in(xml: Path) -> tuple[dict[str, str], dict[str, dict[str, float]]]:
+def _materials_in(xml: Path | StringIO) -> tuple[dict[str, str], dict[str, dict[str, float]]]:
     """Material of each shape of a scene file by the shape's name, and constants of materials of its own."""
     try:
         root = parsed_xml(xml)
@@ -211,6 +203,5 @@ def _materials_in(xml: Path) -> tuple[dict[str, str], dict[str, dict[str, float]
         }
     except (OSError, ElementTree.ParseError, ValueError, DefusedXmlException):
         return {}, {}
-    constants.pop(PERFECT, None)
     references = {shape.get("id", "").removeprefix("mesh-"): shape.find("ref") for shape in root.findall("shape")}
     return {n: r.get("id", "").removeprefix("mat-") for n, r in references.items() if r is not None}, constants

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from io import StringIO
 from pathlib import Path
 from typing import cast
 from xml.etree import ElementTree
@@ -57,12 +58,12 @@ def make_files_absolute(root: Element, path: Path) -> None:
             text.set("value", str((path.parent / text.get("value", "")).absolute()))
 
 
-def parsed_xml(path: Path) -> Element:
+def parsed_xml(source: Path | StringIO) -> Element:
     """The root of an XML file, the values of its ``<default>`` elements in the places of ``$name``, as in Mitsuba.
 
     `DefusedXmlException`: a document type or entities.
     """
-    root = cast(Element, parse(path, forbid_dtd=True).getroot())
+    root = cast(Element, parse(source, forbid_dtd=True).getroot())
     defaults: dict[str, str] = {}
     for element in root.iter():
         for key, value in element.items():

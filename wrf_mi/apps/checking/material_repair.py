@@ -15,7 +15,7 @@ from ...scene.scattering import SCATTERING
 from ...scene.xml_file import overruled
 from ...tracing.sionna.materials import BELOW_1_GHZ, in_itu_range
 from .scene_geometry import ShapePart
-from .scene_xml_faults import BOUNDS, ITU, RADIO, SceneXml, bsdf_findings, is_itu, itu_type, short_name
+from .scene_xml_faults import ITU, LEAST, RADIO, SceneXml, bsdf_findings, is_itu, itu_type, short_name
 from .triangle_repair import label
 
 ODD = r"[^A-Za-z0-9_.-]"  # characters that ids and file names of a repaired scene do not have
@@ -123,7 +123,7 @@ def itu_bsdf(material: str, thickness_m: float, frequency_hz: float | None = Non
         numbers: Mapping[str, float] = {"thickness": thickness_m}
     else:
         bsdf = Element("bsdf", type="radio-material")
-        numbers = dict(zip(BOUNDS, (*constants, thickness_m), strict=False))
+        numbers = dict(zip(LEAST, (*constants, thickness_m), strict=False))
     for name, value in numbers.items():
         SubElement(bsdf, "float", name=name, value=f"{value:.9g}")
     return bsdf

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ...core import InputError
-from ...core.files import one_line
 from ...scene.mesh.surfaces import box_of
 from ...scene.plan.buildings import Buildings
 from ...scene.plan.sources import read_plan
 from ...scene.plan.storey import plan_surfaces
-from .scene_findings import Finding, SceneReport
+from .scene_findings import Finding, SceneReport, refused
 
 HEIGHT_M = 2.5  # of walls while they are counted
 
@@ -32,8 +32,8 @@ def check_plan(path: Path, name: str, units: str) -> SceneReport:
         is_town = isinstance(plan, Buildings)
         surfaces = plan_surfaces(plan, height_m=None if is_town else HEIGHT_M, name=str(path))
     except InputError as error:
-        text, _, remedy = one_line(error).removeprefix(f"{path}").lstrip(":, ").rpartition("; ")
-        return SceneReport(name, (Finding("unclear-plan", path, "", text, f"{remedy}: {command}{height}"),))
+        finding = refused("unclear-plan", path, error)
+        return SceneReport(name, (replace(finding, remedy=f"{finding.remedy}: {command}{height}"),))
     width_m, depth_m, _ = np.ptp(box_of(surfaces), axis=0)
     text = f"a plan of {width_m:.1f} m x {depth_m:.1f} m, {sum(each.kind == 'wall' for each in surfaces)} walls"
     finding = Finding("plan", path, "", text, f"make a scene of it: {command}{'' if is_town else height}")

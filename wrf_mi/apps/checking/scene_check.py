@@ -49,7 +49,7 @@ from ...tracing.sionna.scenes import HIGHEST_M as HIGHEST_SCENE_M
 from ...tracing.sionna.scenes import REFUSALS, quiet_mitsuba, reason
 from .devices import device_findings
 from .plan_check import check_plan
-from .scene_findings import Finding, SceneReport
+from .scene_findings import Finding, SceneReport, refused
 from .scene_geometry import ShapePart, between_parts, mesh_file_parts, part_findings, scene_parts
 from .scene_xml_faults import SceneXml, itu_type, read_xml, xml_findings
 
@@ -57,7 +57,6 @@ LIGHT_M_PER_S = 299_792_458.0
 PHASE_SHARE = 0.01  # share of a wavelength that rounding may move a surface by: 4 degrees of phase
 SLENDER = 4.0  # length or width in heights from which a high scene is a city and not a room in centimetres
 SIONNA_HZ = 3.5e9  # carrier of a scene of Sionna RT until another one is set
-VIEWPOINTS = (".e57", ".pcd", ".ptx")  # formats of scans that state where the scanner stood
 
 
 class Largest(NamedTuple):
@@ -127,24 +126,19 @@ def check_scene(
     Raises:
         InputError: there is no such source or data set, or an unknown unit.
     """
-    return checked(source, data=data, frequency_hz=frequency_hz, units=units, up=up).report
+    return checked(source, Frame(units, up), frequency_hz, data).report
 
 
 def checked(
-    source: str | Path,
-    *,
-    data: str | Path | Record | None = None,
-    frequency_hz: float | None = None,
-    units: str = "m",
-    up: Up | None = None,
+    source: str | Path, frame: Frame, frequency_hz: float | None, data: str | Path | Record | None = None
 ) -> Checked:
     """`check_scene` with the scene file and the triangles that were checked."""
     backend.init()
-    if units not in UNITS_M:
-        raise InputError(f"units {units!r}: not known; give one of {', '.join(UNITS_M)}")
+    if frame.units not in UNITS_M:
+        raise InputError(f"units {frame.units!r}: not known; give one of {', '.join(UNITS_M)}")
     if frequency_hz is not None and not 0 < frequency_hz < 1e15:
         raise InputError(f"frequency {frequency_hz:g} Hz: give a carrier above 0")
-    where, frame = locate(source), Frame(units, up)
+    where = locate(source)
     record = data if isinstance(data, Record) or data is None else load_record(data)
     carriers_hz = [frequency_hz] if frequency_hz is not None else _carriers(record)
     if where.path.suffix.lower() == ".xml":
@@ -154,7 +148,7 @@ def checked(
             text = "a scan or plan; devices and carriers are checked in the scene that wrf-mi mesh makes of it"
             raise InputError(f"{source}: {text}; omit data set and frequency")
         if is_plan(where.path):
-            return Checked(where, check_plan(where.path, str(source), units), None, ())
+            return Checked(where, check_plan(where.path, str(source), frame.units), None, ())
         return Checked(where, _check_scan(where.path, str(source), frame), None, ())
     findings, parts = _placed(mesh_file_parts(where.path), where.path, frame)
     findings += _of_triangles(parts, where.path, frame, record, carriers_hz)
@@ -234,8 +228,7 @@ def _folder(folder: Path) -> Source:
             return Source(xml, materials.complete(materials.surfaces).thickness_m)
         return Source(xml, thicknesses(folder / FACTS_FILE, facts.get("thickness_m") or {}))
     except InputError as error:
-        text, _, remedy = str(error).rpartition("; ")
-        return Source(xml, findings=(Finding("folder", folder, "", text, remedy),))
+        return Source(xml, findings=(refused("folder", folder, error),))
 
 
 def _of_file(scene: SceneXml, where: Source, carriers_hz: Sequence[float]) -> Iterator[Finding]:
@@ -365,16 +358,10 @@ def _check_scan(path: Path, name: str, frame: Frame) -> SceneReport:
     try:
         points = read_points(path, frame.units, frame.up)
     except InputError as error:
-        text, _, remedy = one_line(error).removeprefix(f"{path}").lstrip(":, ").rpartition("; ")
+        text = str(error)
         kind = "not-finite" if "not finite" in text else "empty-mesh" if "no points" in text else "mesh"
-        return SceneReport(name, (Finding(kind, path, "", text, remedy),))
-    findings = list[Finding]()
-    findings += _of_points(points, path, frame)
-    if path.suffix.lower() not in VIEWPOINTS:
-        text = "does not state where the scanner stood"
-        remedy = "nothing to do; E57, PCD and PTX state it"
-        findings.append(Finding("no-viewpoint", path, "", text, remedy))
-    return SceneReport(name, tuple(findings), points=len(points))
+        return SceneReport(name, (refused(kind, path, error),))
+    return SceneReport(name, tuple(_of_points(points, path, frame)), points=len(points))
 
 
 def _of_points(points: FloatArray, path: Path, frame: Frame) -> Iterator[Finding]:
@@ -400,5 +387,4 @@ def _refused(
     try:
         require(points, path)
     except InputError as error:
-        text, _, remedy = one_line(error).removeprefix(f"{path}: ").rpartition("; ")
-        yield Finding(kind, path, "", text, remedy)
+        yield refused(kind, path, error)

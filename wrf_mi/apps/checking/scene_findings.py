@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from ...core.files import listed
+from ...core.files import listed, one_line
 
 Level = Literal["fault", "warning", "note"]
 
@@ -36,7 +36,6 @@ KINDS: Mapping[str, tuple[Level, str]] = {
         "to_world that is not finite, leaves no volume, or turns about an axis that is no unit vector",
     ),
     "moved": ("note", "to_world, which is applied when the scene is opened: the mesh file has other coordinates"),
-    "pictures": ("note", "emitters, sensors or integrators, which are for pictures"),
     "folder": ("fault", "scene folder whose scene.yml or materials.yml is damaged"),
     "mesh": ("fault", "mesh that cannot be read"),
     "empty-mesh": ("fault", "mesh without faces"),
@@ -45,8 +44,6 @@ KINDS: Mapping[str, tuple[Level, str]] = {
     "zero-area": ("warning", "faces without an area"),
     "duplicate-faces": ("warning", "faces in the place of another one, which some tracers count twice"),
     "mixed-winding": ("warning", "solid or flat sheet whose faces are wound both ways, which misleads diffraction"),
-    "inverted": ("note", "solid whose normals point inwards; radio materials act on both sides"),
-    "open-solid": ("note", "solid with a hole"),
     "double-sheet": ("fault", "sheet so near to another face that paths through both are lost"),
     "party-wall": ("note", "solids so near to each other that paths through both are lost"),
     "far": ("fault", "coordinates so far from the origin that single precision moves surfaces"),
@@ -65,7 +62,6 @@ KINDS: Mapping[str, tuple[Level, str]] = {
     "not-opened": ("fault", "scene that Sionna RT refuses for another reason"),
     "plan": ("note", "plan, of which wrf-mi mesh makes a scene"),
     "unclear-plan": ("fault", "plan that is read only with an option, shows no walls, or is damaged"),
-    "no-viewpoint": ("note", "scan that does not state where the scanner stood"),
 }
 """Kinds of findings: level and description. A fault does not open in Sionna RT, or gives wrong results."""
 LEVELS: tuple[Level, ...] = ("fault", "warning", "note")
@@ -100,6 +96,12 @@ class Finding:
         return {**vars(self), "file": str(self.file), "level": self.level}
 
 
+def refused(kind: str, file: Path, error: Exception, shape: str = "") -> Finding:
+    """Finding of an error in one line: what is wrong with a file, and behind the last semicolon what to do."""
+    text, _, remedy = one_line(error).removeprefix(f"{file}").lstrip(":, ").rpartition("; ")
+    return Finding(kind, file, shape, text, remedy)
+
+
 @dataclass(frozen=True)
 class SceneReport:
     """Findings about a scene, mesh or scan, in the order of files and shapes.
@@ -127,15 +129,12 @@ class SceneReport:
         """Findings of a level."""
         return [finding for finding in self.findings if finding.level == level]
 
-    def is_scene_file(self, file: Path) -> bool:
-        """Whether a file is that of the scene and not one of its meshes."""
-        return file.suffix.lower() == ".xml" or self.shapes <= 1
-
     def lines(self) -> list[str]:
         """Findings by file and shape, faults first, equal ones once, and a summary."""
         groups: dict[tuple[str, Path, str], list[Finding]] = {}
         for finding in sorted(self.findings, key=lambda each: LEVELS.index(each.level)):
-            folder = finding.file if self.is_scene_file(finding.file) else finding.file.parent
+            is_mesh_of_scene = finding.file.suffix.lower() != ".xml" and self.shapes > 1
+            folder = finding.file.parent if is_mesh_of_scene else finding.file
             groups.setdefault((finding.kind, folder, finding.remedy), []).append(finding)
         lines, previous = list[str](), ""
         for (kind, _, remedy), group in groups.items():

@@ -19,9 +19,9 @@ from ...core.types import IntArray
 from ...scene.mesh.files import POLYGON_READERS, mesh_parts, triangles_of
 from ...scene.mesh.surfaces import bodies, copies, first_copies, without_area
 from ...tracing.sionna.scenes import REFUSALS, placed_mesh, reason, same_triangles, triangles_by_mitsuba
-from .scene_findings import Finding
+from .scene_findings import Finding, refused
 from .scene_xml_faults import PARAMETERS, SceneXml, similar_file
-from .triangle_faults import double_sheets, open_solids, sheet_numbers, wound_both_ways
+from .triangle_faults import double_sheets, sheet_numbers, wound_both_ways
 
 MEMORY = {".obj": 30}  # bytes of memory for each byte of a mesh file; others take `MEMORY_BINARY`
 MEMORY_BINARY = 12
@@ -174,8 +174,7 @@ def mesh_file_parts(file: Path) -> Iterator[ShapePart | Finding]:
         require_memory(MEMORY_BINARY * file.stat().st_size, str(file), "divide it")
         meshes = mesh_parts(file)
     except InputError as error:
-        text, _, remedy = one_line(error).removeprefix(f"{file}: ").rpartition("; ")
-        yield Finding("not-finite" if "not finite" in text else "mesh", file, "", text, remedy)
+        yield refused("not-finite" if "not finite" in str(error) else "mesh", file, error)
         return
     if not meshes:
         yield Finding("empty-mesh", file, "", "has no faces", "give a mesh with faces, or a scan as PLY")
@@ -201,11 +200,6 @@ def part_findings(part: ShapePart) -> Iterator[Finding]:
     if count := sum(map(wound_both_ways, solids)):
         text = f"{count} of {len(solids)} bodies have faces wound both ways"
         yield Finding("mixed-winding", part.file, part.name, text, "recalculate the normals (--repair does)")
-    if count := sum(body.closed and body.volume_m3 < 0 for body in solids):
-        text = f"normals of {count} of {len(solids)} bodies point inwards"
-        yield Finding("inverted", part.file, part.name, text, "nothing to do")
-    if count := open_solids(solids):
-        yield Finding("open-solid", part.file, part.name, f"{count} of {len(solids)} bodies have a hole", "close it")
 
 
 def between_parts(parts: list[ShapePart]) -> Iterator[Finding]:

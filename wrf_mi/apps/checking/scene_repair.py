@@ -22,7 +22,7 @@ from ...scene.make import is_plan
 from ...scene.material_names import ascii_name
 from ...tracing.sionna.scenes import plain_ply
 from .material_repair import ODD, MaterialRepair
-from .scene_check import Checked, check_scene, checked, opened
+from .scene_check import Checked, Frame, check_scene, checked, opened
 from .scene_findings import NAMED, Finding, SceneReport
 from .scene_geometry import ShapePart
 from .scene_xml_faults import ITU, MERGED, short_name
@@ -32,7 +32,6 @@ DONE: Mapping[str, str] = {
     "unknown-parameter": "parameter left out; a transform is taken for to_world",
     "missing-file": "file of the same name elsewhere in the folder taken",
     "outside-folder": "file of the same name in the folder taken",
-    "pictures": "emitters, sensors and integrators left out",
     "empty-mesh": "shape without faces left out",
     "polygons": "polygons cut into triangles",
     "shape-type": "replaced by a mesh",
@@ -125,7 +124,7 @@ def repair_scene(
     """
     default = None if material is None else _known_material(material)
     of_shapes = {shape: _known_material(name) for shape, name in (shape_materials or {}).items()}
-    before = checked(source, frequency_hz=frequency_hz, units=units, up=up)
+    before = checked(source, Frame(units, up), frequency_hz)
     if before.report.points or is_plan(before.source.path):
         raise InputError(f"{source}: a scan or plan; make a scene of it by wrf-mi mesh")
     parts, origin_m, done = repaired_triangles(before.parts)
@@ -179,17 +178,13 @@ def _routine(before: Checked) -> list[str]:
 
 def _unrepaired(before: Checked) -> list[Finding]:
     """Faults that need the user, and shapes whose triangles are not known for another reason."""
-    lost, faults = _without_triangles(before), before.report.of_level("fault")
+    read, faults = {id(part.shape) for part in before.parts}, before.report.of_level("fault")
+    lost = [name for name, shape in (before.scene.shapes if before.scene else ()) if id(shape) not in read]
     unrepaired = [each for each in faults if each.kind in UNREPAIRED or (each.kind in LOST and each.shape in lost)]
     named = {each.shape for each in faults if each.kind in (*UNREPAIRED, *LOST, "empty-mesh")}
     text, remedy = "its triangles are not read", "write it as a PLY mesh"
     form = "unsupported-shape", before.source.path
     return unrepaired + [Finding(*form, name, text, remedy) for name in lost if name not in named]
-
-
-def _without_triangles(before: Checked) -> list[str]:
-    read = {id(part.shape) for part in before.parts}
-    return [] if before.scene is None else [name for name, shape in before.scene.shapes if id(shape) not in read]
 
 
 def _known_material(name: str) -> str:

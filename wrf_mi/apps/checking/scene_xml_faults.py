@@ -15,19 +15,14 @@ from wrf_mi_scenes.mitsuba_xml import THICKNESS_M
 
 from ...core import InputError
 from ...core.files import MOST_NAME, inside, listed
-from ...scene.folder import FACTS_FILE
 from ...scene.scattering import SCATTERING, check_scattering, stated_scattering
 from ...scene.xml_file import FILES, OVERRULED, VALUES, named_shapes, overruled, read_scene_xml
-from .scene_findings import Finding
+from .scene_findings import Finding, refused
 
 ITU = tuple(name.removeprefix("itu_") for name in THICKNESS_M)  # materials of ITU-R P.2040 that Sionna RT knows
 RADIO = ("radio-material", "itu-radio-material", "absorber-radio-material")
-BOUNDS: Mapping[str, tuple[float, float]] = {
-    "relative_permittivity": (1, 1e30),
-    "conductivity": (0, 1e30),
-    "thickness": (0, 1e30),
-}
-"""Least and largest values of the numbers of a radio material in Sionna RT."""
+LEAST: Mapping[str, float] = {"relative_permittivity": 1, "conductivity": 0, "thickness": 0}
+"""Least values of the numbers of a radio material in Sionna RT."""
 PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "ply": ("filename", "flip_tex_coords"),
     "obj": ("filename", "flip_tex_coords"),
@@ -41,7 +36,6 @@ ALL_SHAPES = ("to_world", "flip_normals", "face_normals")
 SMOOTH = ("sphere", "cylinder", "disk")  # shapes that Mitsuba does not hold as triangles
 MERGED = "merged-shapes"
 VERSION = re.compile(r"(\d+)\.\d+\.\d+")
-PICTURES = ("emitter", "sensor", "integrator")
 DASH = "mat-"  # begin of ids of Blender's exporter, which Sionna RT leaves out
 OWN_ID = "give each element an id of its own"
 GIVE = 'give the shape a material: <ref id="mat-itu_concrete" name="bsdf"/>, or --repair with --material NAME'
@@ -107,8 +101,7 @@ def read_xml(path: Path) -> SceneXml | Finding:
     try:
         return SceneXml(path, read_scene_xml(path, check_shapes=False))
     except InputError as error:
-        text, _, remedy = str(error).removeprefix(f"{path}: ").rpartition("; ")
-        return Finding("xml", path, "", text, remedy)
+        return refused("xml", path, error)
 
 
 def xml_findings(scene: SceneXml) -> Iterator[Finding]:
@@ -123,10 +116,6 @@ def xml_findings(scene: SceneXml) -> Iterator[Finding]:
     for name, shape in scene.shapes:
         yield from _shape(scene, name, shape)
         yield from _material(scene, name, shape)
-    # The integrator of a scene folder, of which `wrf-mi mesh` writes one, is for Mitsuba's own pictures.
-    ours = (path.parent / FACTS_FILE).is_file()
-    if count := sum(element.tag in PICTURES and not (ours and element.tag == "integrator") for element in root):
-        yield Finding("pictures", path, "", f"{count} emitters, sensors or integrators", "nothing to do: not traced")
 
 
 def _elements(scene: SceneXml) -> Iterator[Finding]:
@@ -223,8 +212,7 @@ def bsdf_findings(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Findin
     try:
         check_scattering("", stated_scattering(bsdf, scene.root))
     except InputError as error:
-        text, _, remedy = str(error).removeprefix(": ").rpartition("; ")
-        yield Finding("material-values", scene.path, where, text, remedy)
+        yield refused("material-values", scene.path, error, where)
 
 
 def stated_itu(bsdf: Element) -> str:
@@ -264,14 +252,10 @@ def _values(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Finding]:
         remedy = "state relative_permittivity and conductivity (S/m)"
         yield Finding("no-constants", scene.path, where, "no relative permittivity: that of air is taken", remedy)
     for name, text in stated.items():
-        value, (low, high) = number(text), BOUNDS.get(name, (np.inf, np.inf))
-        if value is None or not low <= value <= high:
-            remedy = f"Sionna RT takes {_bounds_text()}"
+        value = number(text)
+        if value is None or value < LEAST.get(name, np.inf):
+            remedy = f"Sionna RT takes {', '.join(f'{known} {least:g}..' for known, least in LEAST.items())}"
             yield Finding("material-values", scene.path, where, f"{name} is {text[:40]!r}", remedy)
-
-
-def _bounds_text() -> str:
-    return ", ".join(f"{name} {low:g}..{'' if high > 1 else f'{high:g}'}" for name, (low, high) in BOUNDS.items())
 
 
 def number(text: str) -> float | None:

@@ -1,8 +1,6 @@
-"""Faults of triangles: without area, doubled, wound both ways, open solids, and parallel sheets almost in one plane."""
+"""Faults of triangles: faces that are wound both ways, and parallel sheets almost in one plane."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -10,7 +8,7 @@ import trimesh
 
 from ...core.angles import FloatArray
 from ...core.types import IntArray
-from ...scene.mesh.surfaces import Body, bodies, shared_edges, welded, without_area
+from ...scene.mesh.surfaces import Body, bodies, welded, without_area
 
 NEAREST_M, FARTHEST_M = 3e-6, 3e-3
 """Distances of parallel sheets between which a path that passes both is lost.
@@ -21,7 +19,6 @@ SHRUNK = 0.98  # size of triangles that are compared, so that neighbours in a pl
 NORMAL_STEP = 2e-3  # step to which normals are rounded: parallel sheets agree to single precision
 SIDE = np.array([0.9, 0.41, 0.17])
 """Direction by which one of both normals of a plane is chosen; hardly a wall is parallel to it."""
-MOST_OPEN = 0.1  # largest share of open edges of a body that counts as a solid with a hole
 FLAT = 1e-3  # largest ratio of the extents across and along a sheet
 
 
@@ -59,17 +56,6 @@ def sheet_numbers(corners_m: FloatArray) -> IntArray:
         if is_flat(body):
             numbers[body.faces] = number
     return numbers
-
-
-def open_solids(parts: Sequence[Body]) -> int:
-    """Number of bodies that are solids but for a hole: few of their edges have one face alone."""
-    count = 0
-    for body in parts:
-        if body.closed or len(body.corners_m) <= 4:
-            continue
-        uses = np.bincount(shared_edges(body.corners_m)[0])
-        count += bool(np.count_nonzero(uses == 1) <= MOST_OPEN * len(uses))
-    return count
 
 
 def double_sheets(corners_m: FloatArray, owner: IntArray) -> IntArray:

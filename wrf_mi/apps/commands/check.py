@@ -27,9 +27,7 @@ def add_parser(commands: Any) -> None:
     add("--units", default="m", help="unit of the coordinates: m (default), dm, cm, mm, ft or in")
     add("--up", choices=("y", "z"), help="axis that is up (default: y in GLB, else z)")
     add("--repair", metavar="OUT", help="scene folder to make, which plain Sionna RT opens; the source is not changed")
-    text = (
-        "for --repair: material of shapes whose names mean none, e.g. concrete, or SHAPE=NAME of one shape; repeatable"
-    )
+    text = "for --repair: material of shapes whose names mean none, or SHAPE=NAME of one shape; repeatable"
     add("--material", action="append", default=[], metavar="NAME", help=text)
     add("--replace", action="store_true", help="for --repair: replace an existing folder")
     add("--strict", action="store_true", help="exit status 1 if there are warnings")

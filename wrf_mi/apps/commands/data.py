@@ -66,9 +66,8 @@ def _add_import(data: Any) -> None:
     add("--average", choices=AVERAGES, help="mean of the readings of a place (default: db)")
     add("--place", dest="place_m", **metres, help="average in squares of this side (default: at equal positions)")
     add("--units", metavar="UNIT", help="unit of positions: m, mm, cm, km, ft, deg, px (default: by names, or m)")
-    add(
-        "--plan", metavar="PICTURE", help="plan in whose pixels positions are (--units px), y down; or a ROS map's YAML"
-    )
+    text = "plan in whose pixels positions are (--units px), y down; or a ROS map's YAML"
+    add("--plan", metavar="PICTURE", help=text)
     add("--resolution", dest="resolution_m", **metres, help="side of a pixel of the plan")
     text = "point of the plan, from its lower left corner, metres, that becomes the origin, as of mesh"
     add("--origin", dest="origin_m", type=comma_numbers(3, "X,Y,Z"), metavar="X,Y,Z", help=text)

@@ -16,19 +16,8 @@ from ...core.files import os_failure
 from ...version import __version__
 from .options import Parser
 
-MODULES = (
-    "doctor",
-    "check",
-    "data",
-    "scenes",
-    "train",
-    "runs",
-    "maps",
-    "export",
-    "table",
-    "bench",
-    "demo",
-)  # in the order of the help
+MODULES = ("doctor", "check", "data", "scenes", "train", "runs", "maps", "export", "table", "bench", "demo")
+"""Modules of the commands, in the order of the help."""
 INTERRUPTED = 130  # exit status of a command that was stopped
 
 

@@ -168,10 +168,7 @@ def locate_command(a: Arguments) -> int:
 
 def _summary(figures: dict[str, Any]) -> str:
     form, held_out = figures["likelihood"], figures.get("held_out")
-    shape = "normal" if form["degrees"] is None else f"Student-t of {form['degrees']:g} degrees of freedom"
-    text = f"likelihood: {shape}, {form['scale']:g} of the stated standard deviations"
-    text += f", common offset of {form['offset_db']:g} dB" if form["offset_db"] else ""
-    text += ", receivers that received nothing count" if form["silence"] else ""
+    text = f"likelihood: {form['scale']:g} of the stated standard deviations"
     if figures["neighbours_spread_m"] is not None:
         text += f", times a density of {figures['neighbours_spread_m']:.2g} m around the nearest neighbours' estimate"
     if held_out is None:

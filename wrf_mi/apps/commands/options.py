@@ -53,12 +53,8 @@ def add_training(parser: argparse.ArgumentParser) -> None:
     """Add data set, model, split and settings."""
     add = parser.add_argument
     add("dataset", nargs="?", metavar="DATASET", help=DATASET)
-    add(
-        "--model",
-        type=_model_name,
-        choices=list(MODELS),
-        help="model to fit (default: hybrid); baselines: docs/models.md",
-    )
+    text = "model to fit (default: hybrid); baselines: docs/models.md"
+    add("--model", type=_model_name, choices=list(MODELS), help=text)
     text = "stages of the hybrid that may be used, from mean,calibration,correction,surfaces,field,residual"
     add("--stages", metavar="LIST", help=f"{text} (default: all that the data allow)")
     text = "scene to trace: for hybrid, beside wrf-gs, wrf-gs+, factorised and r2f2, or alone for ray-tracing"

@@ -35,10 +35,8 @@ def _add_evaluate(commands: Any) -> None:
     text = "score on the test rows of another split that the run was not trained on; nothing is written"
     parser.add_argument("--split", help=f"{text}. With --predictions: the split (default: official)")
     other = parser.add_argument_group("predictions of another model")
-    text = (
-        "row or tx_pos, prediction, and optionally std, as predictions.npz; signal strengths also as .csv; or what the"
-    )
-    text += " test scripts of NeRF2 and WRF-GS+ write: folder pred_spectrum, result.txt, result.mat"
+    text = "row or tx_pos, prediction and optionally std, as predictions.npz; signal strengths also as .csv; or what "
+    text += "the test scripts of NeRF2 and WRF-GS+ write: folder pred_spectrum, result.txt, result.mat"
     other.add_argument("--predictions", metavar="FILE", help=text)
     other.add_argument("--dataset", metavar="DATASET", help="data set that they are of: a name or a folder")
     other.add_argument("--name", metavar="NAME", help="name of the model, for tables")

@@ -30,10 +30,8 @@ def _add_mesh(commands: Any) -> None:
     text += "GeoJSON, OSM, DXF) or a mesh (OBJ, STL, GLB, PLY, COLLADA, USD, IFC)"
     add("points", nargs="+", metavar="POINTS", help=text)
     add("--out", required=True, metavar="DIR", help="scene folder to make")
-    add(
-        "--units",
-        help="unit of the coordinates: m, dm, cm, mm, ft or in (default: that of COLLADA, USD and DXF, else m)",
-    )
+    text = "unit of the coordinates: m, dm, cm, mm, ft or in (default: that of COLLADA, USD and DXF, else m)"
+    add("--units", help=text)
     text = "axis that is up in a scan or mesh (default: that of COLLADA and USD, y in GLB, else z)"
     add("--up", choices=("y", "z"), help=text)
     text = "point of the source (of a picture, from its lower left corner), metres, z up, that becomes the origin, "
@@ -44,9 +42,7 @@ def _add_mesh(commands: Any) -> None:
     add("--resolution", type=float, metavar="M", help="side of a plan's cell where the file has none")
     text = "side of the plan at which the first row of an NPZ grid lies, where the file does not state row_0"
     add("--row-0", choices=("top", "bottom"), help=text)
-    text = (
-        "width and height of a plan in longitude and latitude, metres, from its lower left corner, such as 236.7,219.7"
-    )
+    text = "width and height of a plan in longitude and latitude, metres, from its lower left corner"
     add("--extent", type=comma_numbers(2, "WIDTH,HEIGHT"), metavar="WIDTH,HEIGHT", help=text)
     text = "layers of walls in a DXF whose names do not say so; * and ? are wildcards"
     add("--layers", type=_names, default=(), metavar="NAME,...", help=text)
@@ -81,12 +77,8 @@ def mesh_command(a: Arguments) -> int:
     # Seen from above; a slab has an upper and a lower side.
     level_m2 = [float(np.abs(part.face_normals[:, 2]) @ part.area_faces) for part in parts]
     floor_m2 = sum(area / (1 + part.is_watertight) for area, part in zip(level_m2, parts, strict=True))
-    facts: dict[str, Any] = {
-        "scene": str(scene.folder),
-        "xml": str(scene.xml),
-        "surfaces": counts,
-        "counts": scene.counts,
-    }
+    facts: dict[str, Any] = {"scene": str(scene.folder), "xml": str(scene.xml)}
+    facts |= {"surfaces": counts, "counts": scene.counts}
     lines = [", ".join(f"{count} {kind}" for kind, count in counts.items()) + f": {scene.folder}"]
     lines.append(f"floor: {floor_m2:.1f} m2")
     if scene.origin_m is not None:

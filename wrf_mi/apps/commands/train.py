@@ -49,9 +49,7 @@ def _add_train(commands: Any) -> None:
     add_training(parser)
     parser.add_argument("--out", metavar="RUN", help="run folder to make")
     add_replace(parser)
-    text = (
-        "CSV of positions (x,y,z in metres) where predictions are wanted: training rows as far from the others choose"
-    )
+    text = "CSV of positions (x,y,z, metres) where predictions are wanted: training rows as far from the others choose"
     parser.add_argument("--for", dest="wanted", metavar="FILE", help=f"{text} (of rssi; default: as the test rows)")
     parser.add_argument("--help-settings", action="store_true", help="list all settings with their defaults, and exit")
     parser.add_argument("--resume", metavar="RUN", help="run folder of a stopped run to go on with")

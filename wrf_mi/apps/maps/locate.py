@@ -25,10 +25,8 @@ from ...runs.run import Run, open_run
 from ...tasks.scores import LEVEL
 from ...training.session import Interrupted, OnProgress, quiet
 from .grid import Candidates, candidates_of
-from .locate_calibration import Calibration, calibration_of, headings_of, predict_candidates, seconds_to_predict
+from .locate_calibration import Calibration, calibration_of, headings_of, predict_candidates
 from .locate_likelihood import region_of
-
-MINUTES_FROM_S = 100.0  # duration from which it is stated in minutes
 
 
 @dataclass(frozen=True)
@@ -169,12 +167,8 @@ def locate(
     session = Session(run.folder, run.folder, on_progress, stop)
     try:
         fitted = run.fitted.tracing_once()
-        asked = fitted, np.arange(len(observed)), headings_of(run), candidates
-        session.report("timing predictions", 0.0)
-        seconds = seconds_to_predict(*asked)
-        lasts = f"{seconds / 60:.0f} min" if seconds > MINUTES_FROM_S else f"{seconds:.0f} s"
-        stage = f"predicting {len(candidates.positions_m)} candidates, about {lasts}"
-        predicted = predict_candidates(*asked, partial(session.report, stage))
+        report = partial(session.report, f"predicting {len(candidates.positions_m)} candidates")
+        predicted = predict_candidates(fitted, np.arange(len(observed)), headings_of(run), candidates, report)
         calibration = calibration_of(run, fitted, candidates, session)
     except InputError as error:
         raise InputError(f"{run.folder}: {error}") from None

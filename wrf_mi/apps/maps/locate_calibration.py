@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,8 +19,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
-from scipy.stats import t as student_t
-from sklearn.linear_model import LogisticRegression
 from threadpoolctl import threadpool_limits
 
 from ...core import InputError, Record, Split
@@ -32,25 +29,23 @@ from ...core.settings import settings_from
 from ...core.types import IntArray
 from ...datasets.observations import fitted_receivers, predicts_new_runs
 from ...estimators.held_out import fit_fold
-from ...estimators.interpolation.strength_fit import folds as stretches_of
+from ...estimators.interpolation.stretches import folds as stretches_of
 from ...estimators.model import Inputs, slices
 from ...models import Fitted, Session
 from ...runs.folder import load_rows
 from ...runs.run import Run
 from ...tasks.scores import LEVEL
-from ...training.selection import hold_out, last_gain
+from ...training.gains import last_gain
+from ...training.selection import hold_out
 from .grid import HEADINGS, Candidates
-from .locate_likelihood import Likelihood, Silence, mass_of, ranks_of, region_of
+from .locate_likelihood import Likelihood, mass_of, ranks_of, region_of
 from .locate_neighbours import SPREADS, Neighbours, choose_neighbours, log_near
 
 logger = logging.getLogger(__name__)
 
-DEGREES, SCALES, OFFSETS_DB = (4.0, 8.0, None), (0.35, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0), (0.0, 3.0, 6.0)
-"""Forms of the likelihood to choose from."""
-WIDE = 0.95  # probability of the quantile by which the widths of distributions are compared
+SCALES = (0.35, 0.5, 0.7, 0.85, 1.0, 1.2, 1.4, 2.0)  # of the likelihood, to choose from
 MOST_ROWS = 300  # most held-out rows that are located
 TOGETHER = 512  # candidates that are predicted together
-TIMED = 64  # most candidates whose predictions are timed at once, before all are predicted
 FOLDS = 3  # hold-outs of other rows: one alone has few positions, near each other
 FOLDER, FILE = "locate", "locate.json"  # folder of finished folds in the run folder, and file of the choice
 
@@ -112,26 +107,6 @@ def predict_candidates(
     return predicted
 
 
-def seconds_to_predict(fitted: Fitted, receivers: IntArray, headings: int, candidates: Candidates) -> float:
-    """Estimated duration of `predict_candidates` in seconds, from predictions at a few of the candidates."""
-    count = len(candidates.positions_m)
-    many = min(max(count // 4, 1), TIMED, TOGETHER)
-    few = max(many // 8, 1)
-    timed_m = candidates.positions_m[np.linspace(0, count - 1, 2 * many + few).astype(int)]
-
-    def seconds(places_m: FloatArray) -> float:
-        begun, turned = time.perf_counter(), np.zeros(len(places_m)) if headings > 1 else None
-        for receiver in receivers:
-            fitted.predict(Inputs(places_m, turned), int(receiver))
-        return time.perf_counter() - begun
-
-    seconds(timed_m[:many])  # the first prediction opens the scene and compiles kernels, which later ones do not
-    # A call takes a time of its own and one for each position: two calls of different sizes determine both.
-    short, long = seconds(timed_m[many:-many]), seconds(timed_m[-many:])
-    each = max(long - short, 0.0) / max(many - few, 1)
-    return headings * (len(slices(count, TOGETHER)) * max(short - few * each, 0.0) + count * each)
-
-
 def headings_of(run: Run) -> int:
     """Number of headings at which a run's model is evaluated; 1 where it does not use the heading."""
     return HEADINGS if run.takes_heading and run.problem.record.tx_heading_rad is not None else 1
@@ -160,7 +135,7 @@ def calibration_of(run: Run, fitted: Fitted, candidates: Candidates, session: Se
     """
     grid, file = candidates.grid, run.folder / FILE
     key = {"candidates": int(candidates.inside.sum()), "low_m": [float(grid.x_m[0]), float(grid.y_m[0])]}
-    key |= {"high_m": [float(grid.x_m[-1]), float(grid.y_m[-1])], "height_m": grid.height_m}
+    key |= {"high_m": [float(grid.x_m[-1]), float(grid.y_m[-1])], "height_m": grid.height_m, "scales": list(SCALES)}
     if file.exists():
         with readable(file, f"{file}: missing", "remove it"):
             stored = json.loads(file.read_text(encoding="utf-8"))
@@ -253,41 +228,14 @@ def choose(
 ) -> Calibration:
     """The posterior with the best score on held-out rows, and their ranks.
 
-    Degrees of freedom and scale are chosen together (`widest`), then the common offset. That and a probability of
-    receiving nothing (`Silence`), each fold scored by the other folds', are kept where they raise the score by more
-    than the standard error; so is a density around the nearest neighbours' estimate, the wider the earlier.
+    The scale is chosen first (`widest`), then a density around the nearest neighbours' estimate, the wider the earlier.
     """
-    forms = [Likelihood(degrees, scale) for degrees in DEGREES for scale in SCALES]
-    steps = len(forms) + len(OFFSETS_DB) + 1
-    scores: dict[str, float] = {}
-
-    def score(likelihoods: Sequence[Likelihood]) -> FloatArray:
-        of_parts = [_scores(record, part, form, candidates) for part, form in zip(parts, likelihoods, strict=True)]
-        report((len(scores) + 1) / steps)
-        return np.concatenate(of_parts)
-
-    def scored(tried: Sequence[Likelihood]) -> list[FloatArray]:
-        of_forms = []
-        for form in tried:
-            of_forms.append(score([form] * len(parts)))
-            scores[_words(form)] = float(of_forms[-1].mean())
-        return of_forms
-
-    best = widest(forms, scored(forms))
-    shared = [replace(best, offset_db=offset) for offset in OFFSETS_DB]
-    plain, *others = scored(shared)
-    gains = [0.0, *(_clear_gain(other - plain) for other in others)]
-    best = shared[int(np.argmax(gains))]
-    silences = _silences_of_others(record, parts)
-    if (silence := fit_silence(record, parts)) is not None:
-        # Each fold is scored by the probability of the other folds, so that it cannot describe itself.
-        gain = score([replace(best, silence=others) for others in silences]) - score([best] * len(parts))
-        scores["with receivers that received nothing"] = scores[_words(best)] + float(gain.mean())
-        if _clear_gain(gain) > 0:
-            best = replace(best, silence=silence)
-    chosen = _with_neighbours(record, parts, candidates, best, scores)
-    report(1.0)
-    return chosen
+    tried = []
+    for number, scale in enumerate(SCALES):
+        tried.append(np.concatenate([_scores(record, part, Likelihood(scale), candidates) for part in parts]))
+        report((number + 1) / len(SCALES))
+    scores = {f"{scale:g} standard deviations": float(each.mean()) for scale, each in zip(SCALES, tried, strict=True)}
+    return _with_neighbours(record, parts, candidates, Likelihood(widest(SCALES, tried)), scores)
 
 
 def _with_neighbours(
@@ -340,38 +288,21 @@ def _log_density(probability: FloatArray, candidates: Candidates) -> FloatArray:
     return np.asarray(np.log(np.maximum(probability, np.finfo(float).tiny)) - np.log(candidates.cell_m2 or 1.0))
 
 
-def _silences_of_others(record: Record, parts: Sequence[Located]) -> list[Silence | None]:
-    """Probability of receiving nothing for each fold, fitted to the others; to the only one where there are none."""
-    return [fit_silence(record, [other for other in parts if other is not part] or parts) for part in parts]
+def widest(scales: Sequence[float], scores: Sequence[FloatArray]) -> float:
+    """The largest scale among those whose scores [m] are within a standard error of the best.
 
-
-def widest(forms: Sequence[Likelihood], scores: Sequence[FloatArray]) -> Likelihood:
-    """The form with the widest residuals among those whose scores [m] are within a standard error of the best.
-
-    Held-out rows share the conditions of the training rows, and few of them tell forms apart by chance; the rows to be
+    Held-out rows share the conditions of the training rows, and few of them tell scales apart by chance; the rows to be
     located have errors of another day (Breiman et al., "Classification and regression trees" (1984), section 3.4.3: the
     rule of one standard error).
     """
-    best = scores[int(np.argmax([of_form.mean() for of_form in scores]))]
-    able = [form for form, of_form in zip(forms, scores, strict=True) if _clear_gain(best - of_form) <= 0]
-    # Student's t of infinitely many degrees of freedom is normal.
-    return max(able, key=lambda form: form.scale * student_t(form.degrees or np.inf).ppf(WIDE))
-
-
-def _clear_gain(difference: FloatArray) -> float:
-    """Mean of differences [m] where it exceeds its standard error, else 0."""
-    mean = float(difference.mean())
-    return mean if mean > difference.std() / np.sqrt(len(difference)) else 0.0
+    best = scores[int(np.argmax([of_scale.mean() for of_scale in scores]))]
+    losses = [best - of_scale for of_scale in scores]
+    able = [loss.mean() <= loss.std() / np.sqrt(len(loss)) for loss in losses]
+    return max(scale for scale, within in zip(scales, able, strict=True) if within)
 
 
 def _strengths(record: Record, part: Located, row: int) -> FloatArray:
     return np.asarray(record.observation[part.receivers, row], float)
-
-
-def _words(form: Likelihood) -> str:
-    shape = "normal" if form.degrees is None else f"Student-t of {form.degrees:g} degrees"
-    offset = f", common offset of {form.offset_db:g} dB" if form.offset_db else ""
-    return f"{shape}, {form.scale:g} standard deviations{offset}"
 
 
 def _scores(record: Record, part: Located, form: Likelihood, candidates: Candidates) -> FloatArray:
@@ -381,15 +312,3 @@ def _scores(record: Record, part: Located, form: Likelihood, candidates: Candida
         log = form.log(_strengths(record, part, row), *part.predicted)
         densities.append(log[truth] - np.logaddexp.reduce(log))
     return np.asarray(densities) - np.log(candidates.cell_m2 or 1.0)
-
-
-def fit_silence(record: Record, parts: Sequence[Located]) -> Silence | None:
-    """Probability of receiving nothing from held-out rows; None where it does not fall with the predicted strength."""
-    mean = np.concatenate([part.predicted[0][:, :, part.truth].mean(axis=0).ravel() for part in parts])
-    received = np.concatenate([np.isfinite(record.observation[p.receivers][:, p.rows]).ravel() for p in parts])
-    if received.all() or not received.any():
-        return None
-    middle, spread = float(mean.mean()), float(mean.std()) or 1.0
-    fit = LogisticRegression().fit((mean[:, None] - middle) / spread, received)
-    slope, intercept = float(fit.coef_[0, 0]), float(fit.intercept_[0])
-    return Silence(middle - intercept / slope * spread, slope / spread) if slope > 0 else None

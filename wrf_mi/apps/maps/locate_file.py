@@ -16,16 +16,14 @@ from matplotlib.patches import Circle
 from ...core import DataFault, InputError, Receiver
 from ...core.angles import FloatArray
 from ...core.files import listed, one_line, text_lines, write_csv
-from ...core.types import IntArray
 from ...core.yaml_files import read_yaml
-from ...datasets.folder_files import CsvTable, read_csv
 from ...runs.folder import load_rows
 from ...runs.run import Run
 from ...runs.scene_view import scene_cuts
 from ...scene import drawing
 from ...tasks.scores import block_bootstrap, summary
 from ..importing.importing import FACTS
-from ..importing.observed import ObservedTable, read_observed
+from ..importing.observed import read_observed
 from ..importing.readings import id_key
 from .grid import usual_height
 from .locate import LocatedPositions
@@ -33,7 +31,7 @@ from .locate import LocatedPositions
 logger = logging.getLogger(__name__)
 
 DBM, RSSI, ANCHOR = "_dbm", "rssi_", "anchor"
-"""Columns are ``<receiver>_dbm``, or ``rssi_<receiver>``, where the name of ``anchor<number>`` is its number."""
+"""Columns of data sets are ``<receiver>_dbm``, or ``rssi_<receiver>``, where ``anchor<number>`` may be its number."""
 SILENT = "no receiver of the run received anything, so there is no position; remove the row"
 SHOWN, COLUMNS = 6, 3  # number of rows that are drawn, and panels side by side
 STRETCH, STRETCHES = 20, 20
@@ -83,11 +81,10 @@ def read_observations(
 ) -> tuple[FloatArray, FloatArray | None]:
     """Read the signal strengths [n_rx, m] of each receiver, and true positions [m, 2] or None, from a table.
 
-    A column ``<receiver>_dbm``, as ``wrf-mi predict`` writes it, or ``rssi_<receiver>``, as data sets have it, is
-    needed for each receiver; a field is empty where nothing was received (NaN). Columns ``x`` and ``y``, if any, are
-    true positions in metres. Other columns are ignored, also those of receivers that the run left out of its data. A
-    table without such columns, or from which the run's data were imported, is read as `wrf_mi.import_measurements`
-    reads it (`read_observed`).
+    The table is read as `wrf_mi.import_measurements` reads it (`read_observed`). Where it has a row for each
+    transmitter, each receiver needs a column, such as ``<receiver>_dbm``, as ``wrf-mi predict`` writes it, or
+    ``rssi_<receiver>``, as data sets have it; a field is empty where nothing was received (NaN). Columns ``x`` and
+    ``y``, if any, are true positions in metres.
 
     Args:
         path: the table.
@@ -97,25 +94,33 @@ def read_observations(
         silent: whether rows without any strength are kept.
 
     Raises:
-        InputError: missing or unreadable, receivers without a column or with several, columns of unknown receivers, a
-            field that is no number, or a row without any strength.
+        InputError: missing or unreadable, receivers without a column or with several, a field that is no number, or a
+            row without any strength.
     """
     path, names = Path(path), [receiver.name for receiver in receivers]
     facts_file = None if data is None else Path(data) / FACTS
     facts = {} if facts_file is None or not facts_file.is_file() else read_yaml(facts_file)
     # A table that was imported may have columns named as in data sets, and positions in another frame.
     was_imported = path.name in facts.get("files", ()) and path.resolve().parent != Path(data or "").resolve()
-    if was_imported or not _has_layout(path, names):
-        return _imported(read_observed(path, facts), names, left_out, silent)
-    table = read_csv(path, skip_blank=True)
-    columns = _columns(table, names, left_out, imported=bool(facts))
-    values = np.stack([table.numbers(column, may_be_empty=True) for column in columns])
-    if len(rows := _silent(values)) and not silent:
-        raise DataFault(table.path, SILENT, row=int(rows[0]) + 1)
-    stated = [axis for axis in "xy" if axis in table.header]
-    if len(stated) == 1:
-        raise DataFault(table.path, f"column {stated[0]} alone is no position; give x and y, or neither", line=1)
-    return values, np.stack([table.numbers(axis) for axis in "xy"], axis=1) if stated else None
+    observed = read_observed(path, facts if was_imported or not _has_layout(path, names) else {})
+    numbers = {key: number for number, name in enumerate(names) for key in _keys(name)}
+    number_of = np.array([numbers.get(id_key(name), -1) for name in observed.ids])
+    file, heard = observed.table.files[0][0], number_of >= 0
+    lacking = [name for number, name in enumerate(names) if number not in number_of]
+    if not heard.any() or (lacking and not observed.is_long):
+        text = f"no strengths of receiver{'s' if len(lacking) > 1 else ''} {one_line(listed(lacking))}"
+        raise DataFault(file, f"{text} among {one_line(listed(observed.ids))}; name each as in the data of the run")
+    if len(np.unique(number_of[heard])) < heard.sum():
+        raise DataFault(file, f"two of {one_line(listed(observed.ids))} are of one receiver; remove one of them")
+    known = {key for name in left_out for key in _keys(name)} | numbers.keys()
+    if unknown := [name for name in observed.ids if id_key(name) not in known]:
+        logger.warning("%s: %d receivers unknown to the run are not used: %s", file, len(unknown), listed(unknown))
+    values = np.full((len(names), len(observed.first_row)), np.nan)
+    values[number_of[heard]] = observed.dbm[heard]
+    rows = np.flatnonzero(~np.isfinite(values).any(axis=0))
+    if len(rows) and not silent:
+        raise observed.table.fault(SILENT, int(observed.first_row[rows[0]]))
+    return values, observed.xy_m
 
 
 def _has_layout(path: Path, names: Sequence[str]) -> bool:
@@ -124,72 +129,14 @@ def _has_layout(path: Path, names: Sequence[str]) -> bool:
         header = [name.strip() for name in next(iter(text_lines(path)), "").split(",")]
     except InputError:  # no text in UTF-8
         return False
-    return not {column for name in names for column in _able(name)}.isdisjoint(header)
-
-
-def _imported(
-    observed: ObservedTable, names: Sequence[str], left_out: Collection[str], silent: bool
-) -> tuple[FloatArray, FloatArray | None]:
-    """Strengths [n_rx, m] of the receivers of a run from a table, and true positions [m, 2] or None."""
-    numbers = {key: number for number, name in enumerate(names) for key in _keys(name)}
-    number_of = [numbers.get(id_key(name), -1) for name in observed.ids]
-    file, heard = observed.table.files[0][0], np.array(number_of) >= 0
-    lacking = [name for number, name in enumerate(names) if number not in number_of]
-    if not heard.any() or (lacking and not observed.is_long):
-        text = f"no strengths of {_receivers(lacking)} among {one_line(listed(observed.ids))}"
-        raise DataFault(file, f"{text}; name each as in the data of the run")
-    known = {key for name in left_out for key in _keys(name)} | numbers.keys()
-    if unknown := [name for name in observed.ids if id_key(name) not in known]:
-        logger.warning("%s: %d receivers unknown to the run are not used: %s", file, len(unknown), listed(unknown))
-    values = np.full((len(names), len(observed.first_row)), np.nan)
-    values[np.array(number_of)[heard]] = observed.dbm[heard]
-    if len(rows := _silent(values)) and not silent:
-        raise observed.table.fault(SILENT, int(observed.first_row[rows[0]]))
-    return values, observed.xy_m
-
-
-def _silent(values: FloatArray) -> IntArray:
-    """Columns of strengths [n_rx, m] without any."""
-    return np.flatnonzero(~np.isfinite(values).any(axis=0))
+    able = {f"{name}{DBM}" for name in names}
+    able |= {f"{RSSI}{part}" for name in names for part in (name, name.removeprefix(ANCHOR))}
+    return not able.isdisjoint(header)
 
 
 def _keys(name: str) -> set[str]:
     """Ids of a table, as `id_key` compares them, that are a receiver's."""
-    return {id_key(name), id_key(name.removeprefix(ANCHOR))}
-
-
-def _receivers(names: Sequence[str]) -> str:
-    return f"receiver{'s' if len(names) > 1 else ''} {one_line(listed(names))}"
-
-
-def _columns(table: CsvTable, names: Sequence[str], left_out: Collection[str], imported: bool) -> list[str]:
-    """Columns of the receivers; `DataFault` with all receivers that lack one or have two, and all unknown columns.
-
-    Unknown columns of data that were imported are of receivers that the import left out, and ignored.
-    """
-    stated = {name: [column for column in _able(name) if column in table.header] for name in names}
-    faults: dict[str, str] = {}  # what is wrong by its remedy
-    if lacking := [name for name in names if not stated[name]]:
-        able = " or ".join(map(one_line, _able(lacking[0])))
-        remedy = f"name one {able}" + ", and so on" * (len(lacking) > 1)
-        faults[f"{remedy}, and leave it empty where nothing was received"] = f"no column of {_receivers(lacking)}"
-    if doubled := [f"{columns[0]} and {columns[1]}" for columns in stated.values() if len(columns) > 1]:
-        faults["remove one of them"] = f"{one_line(listed(doubled))} are of one receiver"
-    known = {column for name in (*names, *left_out) for column in _able(name)}
-    strengths = [column for column in table.header if column.endswith(DBM) or column.startswith(RSSI)]
-    if (unknown := [column for column in strengths if column not in known]) and not imported:
-        verb = "columns {} name" if len(unknown) > 1 else "column {} names"
-        text = f"{verb.format(one_line(listed(unknown)))} no receiver of the run ({one_line(listed(names))})"
-        faults[f"rename or remove {'them' if len(unknown) > 1 else 'it'}"] = text
-    if faults:
-        raise DataFault(table.path, f"{', and '.join(faults.values())}; {', and '.join(faults)}", line=1)
-    return [columns[0] for columns in stated.values()]
-
-
-def _able(name: str) -> list[str]:
-    """Names that the column of a receiver may have."""
-    number = name.removeprefix(ANCHOR)
-    return [f"{name}{DBM}", f"{RSSI}{name}", *([f"{RSSI}{number}"] if number.isdecimal() else [])]
+    return set(map(id_key, (name, name.removeprefix(ANCHOR))))
 
 
 def test_observations(run: Run) -> tuple[FloatArray, FloatArray]:

@@ -1,10 +1,10 @@
 """Likelihood of received signal strengths at candidate positions of the transmitter, and regions that hold it.
 
 The residual of receiver r, observation minus predicted mean, has the scale a s_r, where s_r is the standard deviation
-that the model states at the candidate position, and a Student-t distribution, whose tails are heavier than those of the
-normal distribution: people, doors and furniture move. An offset that all receivers share, of a transmitter whose power
-differs from that of the training rows, is normal with mean zero and integrated by adaptive quadrature. Given
-position, heading and offset the receivers are independent. The heading is unknown and uniform: the likelihood is
+that the model states at the candidate position, and a Student-t distribution (`DEGREES`), whose tails are heavier than
+those of the normal distribution: people, doors and furniture move. An offset that all receivers share, of a transmitter
+whose power differs from that of the training rows, is normal with mean zero and integrated by adaptive quadrature.
+Given position, heading and offset the receivers are independent. The heading is unknown and uniform: the likelihood is
 averaged over headings jointly for all receivers, as one body shadows them.
 
 Source: Lange, Little and Taylor, "Robust statistical modeling using the t distribution" (1989), JASA 84; Liu
@@ -17,35 +17,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaln, log_expit, logsumexp
+from scipy.special import gammaln, logsumexp
 
 from ...core.angles import FloatArray
 
+DEGREES = 8.0
+"""Degrees of freedom. With 4, or normal residuals, held-out log densities of `flat-ble` differ by 0.04 at most."""
 OFFSET_NODES = 7  # nodes of the quadrature over the common offset
 TRUST = 50  # number of held-out rows that weigh as much as the stated probability: they tell a share of 90 % to 4 %
 
 
 @dataclass(frozen=True)
-class Silence:
-    """Probability that a receiver reports nothing, logistic in the predicted mean."""
-
-    middle_dbm: float  # predicted mean at which half of the rows are received
-    slope_per_db: float  # logit of the reception per decibel, above 0
-
-    def log_probability(self, mean_dbm: NDArray[np.floating], received: bool) -> NDArray[np.floating]:
-        """Logarithm of the probability of reception, or of none, of the shape of the predicted mean."""
-        slope = self.slope_per_db if received else -self.slope_per_db
-        return np.asarray(log_expit(slope * (mean_dbm - self.middle_dbm)))
-
-
-@dataclass(frozen=True)
 class Likelihood:
-    """Form of the likelihood."""
+    """Form of the likelihood; receivers that received nothing are left out."""
 
-    degrees: float | None = 8.0  # degrees of freedom of the Student-t distribution; None: normal
     scale: float = 1.0  # factor of the stated standard deviations
     offset_db: float = 0.0  # standard deviation of the offset that all receivers share
-    silence: Silence | None = None  # probability of receiving nothing; None: receivers without a value are left out
 
     def log(
         self, observed_dbm: NDArray[np.floating], mean_dbm: NDArray[np.floating], std_db: NDArray[np.floating]
@@ -58,9 +45,6 @@ class Likelihood:
         scale = self.scale * std_db[:, known]
         error = observed_dbm[known, None].astype(mean_dbm.dtype) - mean_dbm[:, known]
         log_density = self._with_offset(error, scale) if self.offset_db > 0 else self._density(error, scale)
-        if self.silence is not None:
-            for rows, received in ((known, True), (~known, False)):
-                log_density = log_density + self.silence.log_probability(mean_dbm[:, rows], received).sum(axis=1)
         return np.asarray(logsumexp(log_density, axis=0) - np.log(len(mean_dbm)), float)
 
     def _with_offset(self, error: NDArray[np.floating], scale: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -82,12 +66,9 @@ class Likelihood:
 
     def _density(self, error: NDArray[np.floating], scale: NDArray[np.floating]) -> NDArray[np.floating]:
         """Logarithm of the density [headings, p] of residuals [headings, received, p]."""
-        square = (error / scale) ** 2
-        if self.degrees is None:
-            return np.asarray(-(square / 2 + np.log(scale) + np.log(2 * np.pi) / 2).sum(axis=1))
-        n = self.degrees
+        n = DEGREES
         constant = gammaln((n + 1) / 2) - gammaln(n / 2) - np.log(n * np.pi) / 2
-        return np.asarray((constant - (n + 1) / 2 * np.log1p(square / n) - np.log(scale)).sum(axis=1))
+        return np.asarray((constant - (n + 1) / 2 * np.log1p((error / scale) ** 2 / n) - np.log(scale)).sum(axis=1))
 
 
 def region_of(

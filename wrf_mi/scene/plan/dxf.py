@@ -100,13 +100,9 @@ def _curves(entities: Any, layer: str, sag: float) -> Iterator[tuple[str, FloatA
                 yield own, points
 
 
-def _words(layer: str) -> list[str]:
-    return re.findall(r"[a-z]+", ascii_name(layer).lower())
-
-
 def _role(layer: str) -> str | None:
     """What is drawn on a layer by its name, None if that does not say it."""
-    words = _words(layer)
+    words = re.findall(r"[a-z]+", ascii_name(layer).lower())
     if any(word.startswith(tuple(ANNOTATION.split())) for word in words):
         return None
     found = [

@@ -15,16 +15,7 @@ from ...core import InputError
 from ...core.angles import FloatArray
 from ...core.types import IntArray
 from ..mesh.furnishings import BELOW_CEILING_M, furnishings, reached
-from ..mesh.outline import (
-    Raster,
-    fill_blind,
-    fill_shadows,
-    join,
-    levels_completed,
-    outline,
-    shadows,
-    triangulated,
-)
+from ..mesh.outline import Raster, fill_blind, fill_shadows, join, levels_completed, outline, shadows, triangulated
 from ..mesh.planes import UPRIGHT, WALL_HEIGHT_M, Face, Mask, Plane, kinds, near, over, storey, with_axes
 from ..mesh.surfaces import KINDS, Kind, Surface, number_names
 from .planes import BAND, CORE, NARROW_CORE, NARROW_RADIUS_M, NORMAL_RADIUS_M, Thinned, find_planes, fit, layers, thin
