@@ -13,16 +13,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from wrf_mi.backend.device import to_float
 from wrf_mi.backend.vectors import Complex, Pose
 from wrf_mi.core import InputError
-from wrf_mi.core.angles import FloatArray
 from wrf_mi.gaussians.parameters import Gaussians
 from wrf_mi.gaussians.tiles import TiledPlane
 from wrf_mi.graph.evaluations import Evaluation, facing_down
 from wrf_mi.graph.settings import DEFAULT, TracedConfig
 from wrf_mi.tracing.paths.scene_parameters import MaterialGrouping, slabs_of_faces
-from wrf_mi.tracing.search.surfaces import scene_surfaces
+from wrf_mi.tracing.search.surfaces import scene_surfaces, triangle_mesh
 
 from . import register_all
 from .shape import deinterleave, gaussian_shape, shape_parameters
@@ -63,7 +61,7 @@ class SceneWalls:
         self.names = tuple(self._slabs.names[k] for k in self._used)
         self.frequency_hz = float(scene.frequency[0])
         self.shapes = {
-            f"wall_{i}": _mesh(f"wall_{i}", surfaces.triangles[slab == k], self._material(k))
+            f"wall_{i}": triangle_mesh(f"wall_{i}", surfaces.triangles[slab == k], mesh_bsdf=self._material(k))
             for i, k in enumerate(self._used)
         }
 
@@ -87,18 +85,6 @@ class SceneWalls:
             for i, k in enumerate(self._used)
             for name, table in zip(("eta_r", "sigma"), tables, strict=True)
         }
-
-
-def _mesh(name: str, triangles: FloatArray, bsdf: Any) -> Any:
-    """A mesh of triangles [f, 3, 3], metres, world frame."""
-    props = mi.Properties()
-    props["mesh_bsdf"] = bsdf
-    mesh = mi.Mesh(name, vertex_count=3 * len(triangles), face_count=len(triangles), props=props)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = to_float(triangles.reshape(-1))
-    params["faces"] = dr.arange(mi.UInt32, 3 * len(triangles))
-    params.update()
-    return mesh
 
 
 class _FieldScene:

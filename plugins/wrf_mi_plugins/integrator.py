@@ -18,7 +18,6 @@ from wrf_mi.core import InputError
 from .acceleration import traced_lists
 from .blend_rays import Walls, blend_rays
 from .bundles import RayLists, ray_bundles
-from .hidden import without_hidden
 from .ray_response import ray_footprints
 from .sensor import RIGID_TOLERANCE, PerceptionPlane, pose_of
 from .shape import gaussian_shape_of, interleave, read_gaussians
@@ -86,11 +85,7 @@ class TracedField(ADIntegrator):
     ``frequency_hz``     float   Hz   0       carrier (in ``mi.traverse``); 0: that of the walls' Sionna RT scene
     ``polarization``     vector       z axis  direction of the antenna, receiver's frame; default: the world's z axis
     ``thickness_<name>`` float   m    0.1     slab thickness of a material ``mat-<name>`` known by its BSDF's id alone
-    ``opaque_power``     float        0       largest share of the power that walls pass if Gaussians behind are skipped
     ==================== ======= ==== ======= =======================================================================
-
-    With ``opaque_power`` p no pixel's field changes by more than sqrt(p) M, M the largest abs(signal) (alpha blending)
-    or the sum of all (product blending), nor a derivative by a signal by more than sqrt(p) (`wrf_mi_plugins.hidden`).
 
     The rays' hits are found by Mitsuba's ray tracing (`wrf_mi_plugins.acceleration`) and kept: a render after which
     only signals, opacities or attenuations changed traces nothing. Sensors must be points: `wrf_perception_plane`,
@@ -105,9 +100,6 @@ class TracedField(ADIntegrator):
         super().__init__(props)
         self.with_walls = bool(props.get("walls", True))
         self.frequency_hz = mi.Float(float(props.get("frequency_hz", 0.0)))
-        self.opaque_power = float(props.get("opaque_power", 0.0))
-        if not 0 <= self.opaque_power < 1:
-            raise InputError(f"{props.plugin_name()}: opaque_power {self.opaque_power}; give a share from 0 to below 1")
         stated = props.get("polarization")
         self.polarization = None if stated is None else [float(c) for c in stated]
         self.thickness_m = {n.removeprefix(THICKNESS): float(props[n]) for n in props if n.startswith(THICKNESS)}
@@ -135,8 +127,6 @@ class TracedField(ADIntegrator):
 
         lists = self._lists.find((data.index, *view.key), lists_of_view, data, view.direction)
         walls = self._walls(scene, view) if self.with_walls else None
-        if walls is not None and self.opaque_power:
-            lists = without_hidden(lists, bundles, gaussians, footprints, walls, self.opaque_power)
         parts = blend_rays(footprints, gaussians.signal, lists, bundles, gaussians.blending, walls)
         if view.samples > 1:
             parts = tuple(dr.block_sum(p, view.samples) / view.samples for p in parts)

@@ -11,7 +11,8 @@ import mitsuba as mi
 
 from wrf_mi.backend.vectors import Pose
 from wrf_mi.core import InputError
-from wrf_mi.tracing.sionna.materials import BELOW_1_GHZ, CONSTANTS_FROM_HZ
+from wrf_mi.tracing.search.surfaces import shape_id
+from wrf_mi.tracing.sionna.materials import itu_constants
 from wrf_mi.tracing.slabs import slab
 
 from .blend_rays import Walls
@@ -76,9 +77,9 @@ def find_crossings(
     if polarization is not None:
         field = dr.detach(mi.Vector3f(*to_world(pose, [mi.Float(c) for c in polarization])))
     field -= dr.dot(field, d) * d
-    number = dr.zeros(mi.UInt32, max(_registry(s) for s in shapes) + 1)
+    number = dr.zeros(mi.UInt32, max(shape_id(s) for s in shapes) + 1)
     for i, shape in enumerate(shapes):
-        dr.scatter(number, mi.UInt32(i), mi.UInt32(_registry(shape)))
+        dr.scatter(number, mi.UInt32(i), mi.UInt32(shape_id(shape)))
     origin = mi.Point3f(*(dr.detach(x) for x in pose.position))
     ray, active, distance = mi.Ray3f(origin, d), mi.Bool(True), mi.Float(0)
     dr.eval(ray, field, number)
@@ -169,22 +170,9 @@ def radio_constants(shape: Any, frequency_hz: Any, thickness_m: Mapping[str, flo
     if not name.startswith(ITU_PREFIX):
         what = f"shape {shape.id() or 'without id'}: its BSDF {name or 'without id'} is no radio material"
         raise InputError(f"{what}; name it {ITU_PREFIX}*, use one of Sionna RT, or set the integrator's walls to false")
-    eta_r, sigma = _itu(name.removeprefix(ITU_PREFIX), frequency)
+    known, kind = itu_constants(frequency), name.removeprefix(ITU_PREFIX)
+    if kind not in known:
+        raise InputError(f"{name} at {frequency:g} Hz: no constants of ITU-R P.2040; choose another material")
+    eta_r, sigma, _ = known[kind]
     thickness = thickness_m.get(name.removeprefix("mat-"), DEFAULT_THICKNESS)
     return mi.Float(eta_r), mi.Float(sigma), mi.Float(thickness)
-
-
-def _itu(kind: str, frequency_hz: float) -> tuple[float, float]:
-    from sionna.rt.radio_materials.itu import itu_material
-
-    try:
-        return itu_material(kind, frequency_hz)
-    except ValueError as error:
-        if kind in BELOW_1_GHZ and CONSTANTS_FROM_HZ <= frequency_hz < 1e9:
-            return BELOW_1_GHZ[kind]
-        raise InputError(f"{ITU_PREFIX}{kind} at {frequency_hz:g} Hz: {error}; choose another material") from None
-
-
-def _registry(shape: Any) -> int:
-    number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
-    return int(number[0])

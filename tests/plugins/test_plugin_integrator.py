@@ -174,8 +174,6 @@ def test_invalid_scenes_are_refused(more, text):
 FLOAT32 = 2e-6
 """Unit vectors and metres in float32 after a rotation."""
 
-wrf_mi_plugins.register_all()
-
 
 def rays(sensor: Any, height: int, width: int) -> np.ndarray:
     """Directions of the rays of random places in every pixel, world frame."""

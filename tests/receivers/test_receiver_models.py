@@ -65,7 +65,6 @@ def signals(arrays: dict[str, np.ndarray], elements: np.ndarray, *hz: float) -> 
 def learned(batch: int, count: int, float_type: Any = Float64, seed: int = 3) -> tuple[Any, np.ndarray]:
     values = np.random.default_rng(seed).standard_normal((2, batch, count)) * 0.3
     return tuple(on_device(part, float_type) for part in values), values[0] + 1j * values[1]
-    return tuple(on_device(part, float_type) for part in values), values[0] + 1j * values[1]
 
 
 def whole_sphere(signal: np.ndarray) -> np.ndarray:

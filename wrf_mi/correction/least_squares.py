@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,9 @@ TRIALS = 8  # largest number of damping factors tried in a step, each `HARDER` t
 HARDER = 8.0  # factor of the damping after a step that fails, and its inverse after one that succeeds
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6  # damping of the first step and the smallest, relative to the diagonal
 CONVERGED = 0.1  # least decrease of the cost in a step: a parameter off by a standard deviation costs 0.5
+T = TypeVar("T")
+Linearised = tuple[Callable[[T], float], FloatArray, FloatArray]
+"""A likelihood at a step: cost of what a model has, and its information [k, k] and gradient [k] by the free entries."""
 
 
 @dataclass(frozen=True)
@@ -146,22 +150,39 @@ def minimised(
     number of a step, from 0, before it. ``noise`` is that of all steps; None: of the residuals before each. Returns the
     most probable parameters [p] and their residuals.
     """
-    vector, damping, stated = np.array(start, float), FIRST_DAMPING, noise
-    present = residual(vector)
+
     # Iterated weights: the noise, and by it the weight of each row, is that of the residuals before a step.
+    def linearised(vector: FloatArray, present: FloatArray) -> Linearised[FloatArray]:
+        of_step = noise or Noise.of(present)
+        return of_step.cost, *jacobian(vector).normal(present, of_step)
+
+    return damped_steps(residual, linearised, start, free, prior, steps, on_step)
+
+
+def damped_steps(
+    evaluated: Callable[[FloatArray], T],
+    linearised: Callable[[FloatArray, T], Linearised[T]],
+    start: FloatArray,
+    free: IntArray,
+    prior: Prior,
+    steps: int,
+    on_step: Callable[[int], None],
+) -> tuple[FloatArray, T]:
+    """`minimised` for any model, ``evaluated`` at parameters [p] and ``linearised`` there before each step."""
+    vector, damping = np.array(start, float), FIRST_DAMPING
+    present = evaluated(vector)
     for step in range(steps):
         on_step(step)
-        noise = stated or Noise.of(present)
-        before = noise.cost(present) + prior.cost(vector[free])
-        information, slope = jacobian(vector).normal(present, noise)
+        cost, information, slope = linearised(vector, present)
+        before = cost(present) + prior.cost(vector[free])
         matrix = information + prior.precision
         # Gauss-Newton equations of likelihood and prior, damped by their diagonal (Marquardt).
         downhill = -slope - prior.precision @ (vector[free] - prior.mean)
         for _ in range(TRIALS):
             trial = vector.copy()
             trial[free] += np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), downhill)
-            tried = residual(trial)
-            after = noise.cost(tried) + prior.cost(trial[free])
+            tried = evaluated(trial)
+            after = cost(tried) + prior.cost(trial[free])
             if after < before:
                 break
             damping *= HARDER

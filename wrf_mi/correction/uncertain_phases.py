@@ -30,7 +30,7 @@ from scipy.sparse import csr_array
 
 from ..core.types import FloatArray, IntArray
 from ..tracing.paths.scene_parameters import PREFIX
-from .least_squares import CONVERGED, FIRST_DAMPING, FREEDOM, HARDER, LEAST_DAMPING, TRIALS
+from .least_squares import FREEDOM, Linearised, damped_steps
 from .moves import SWEEPS, SurfaceChoice, material_choices
 from .options import FRAME_SD
 from .path_lengths import lengths_and_slopes
@@ -163,27 +163,17 @@ class UncertainPhases:
         return state.chosen(choice.what, best, choice.places, vectors[best])
 
     def refined(self, state: State) -> State:
-        """Fisher scoring of the materials, damped as in `wrf_mi.correction.least_squares.minimised`."""
-        vector, free, damping = state.vector.copy(), self.free(state), FIRST_DAMPING
-        prior, steps = self.posterior.prior(state.mean, free), self.posterior.options.steps
-        for step in range(steps):
+        """Fisher scoring of the materials, damped as least squares are."""
+        free, steps = self.free(state), self.posterior.options.steps
+
+        def linearised(vector: FloatArray, _: Moments) -> Linearised[Moments]:
+            return self._cost, *self._normal(vector, free)
+
+        def on_step(step: int) -> None:
             self.posterior.on_stage(f"uncertain phases: {len(free)} parameters", step / steps)
-            before = self._cost(self._moments_at(vector)) + prior.cost(vector[free])
-            information, slope = self._normal(vector, free)
-            matrix = information + prior.precision
-            downhill = -slope - prior.precision @ (vector[free] - prior.mean)
-            for _ in range(TRIALS):
-                trial = vector.copy()
-                trial[free] += np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), downhill)
-                after = self._cost(self._moments_at(trial)) + prior.cost(trial[free])
-                if after < before:
-                    break
-                damping *= HARDER
-            else:
-                break
-            vector, damping = trial, max(damping / HARDER, LEAST_DAMPING)
-            if before - after < CONVERGED:
-                break
+
+        prior = self.posterior.prior(state.mean, free)
+        vector, _ = damped_steps(self._moments_at, linearised, state.vector, free, prior, steps, on_step)
         return replace(state, vector=vector)
 
     def free(self, state: State) -> IntArray:

@@ -329,15 +329,26 @@ def screens(triangles: FloatArray, scale_m: float) -> Any:
     """A Mitsuba scene of one mesh for rays, whose primitives are the triangles [f, 3, 3] in their order, enlarged."""
     import mitsuba as mi
 
-    from ...backend.device import on_device
-
-    mesh: Any = mi.Mesh("screens", 3 * len(triangles), len(triangles))
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = on_device(enlarged(triangles, scale_m), mi.Float)
-    parameters["faces"] = on_device(np.arange(3 * len(triangles)), mi.UInt32)
-    parameters.update()
+    mesh = triangle_mesh("screens", enlarged(triangles, scale_m))
     # Embree's robust mode loses fewer rays at edges; OptiX is watertight as it is.
     return mi.load_dict({"type": "scene", "mesh": mesh, "embree_use_robust_intersections": True})
+
+
+def triangle_mesh(name: str, triangles: FloatArray, **properties: Any) -> Any:
+    """A Mitsuba mesh of triangles [f, 3, 3] without common vertices, with properties such as ``mesh_bsdf``."""
+    import mitsuba as mi
+
+    from ...backend.device import on_device
+
+    props = mi.Properties()
+    for key, value in properties.items():
+        props[key] = value
+    mesh: Any = mi.Mesh(name, 3 * len(triangles), len(triangles), props=props)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = on_device(triangles, mi.Float)
+    parameters["faces"] = on_device(np.arange(3 * len(triangles)), mi.UInt32)
+    parameters.update()
+    return mesh
 
 
 def enlarged(triangles: FloatArray, scale_m: float) -> FloatArray:
