@@ -16,8 +16,9 @@ import numpy as np
 from wrf_mi.core.counts import counted
 from wrf_mi.core.types import FloatArray, IntArray
 from wrf_mi.gaussians import blend, footprint, tiles
-from wrf_mi.synthetic.laboratory import RECEIVER, transmitter_path
-from wrf_mi.tracing import TraceOptions, trace_paths
+from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, transmitter_path
+from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions
 from wrf_mi.tracing.search import images, surfaces
 
 from .comparison import Row, line
@@ -29,6 +30,7 @@ from .workloads import field, splatting
 
 REPEATS, MOST_S = 7, 15.0
 TRANSMITTERS, TRIANGLES, GAUSSIANS = 64, 10_000, 3000
+FAINT = 1e-3  # share of the amplitudes of all paths, the default of fits
 FAR = 6.0  # Mahalanobis radius at which a footprint is 1e-8
 OPTIONS = TraceOptions(transmission=False, depth=2, rays=1 << 14)
 Omission = Callable[[], AbstractContextManager[Any]]
@@ -62,6 +64,19 @@ def room_powers(scene: Any, again: bool = False) -> FloatArray:
     return powers(trace_paths(scene, transmitter_path(TRANSMITTERS), RECEIVER, OPTIONS).paths)
 
 
+def field_of_paths(faint: float) -> Callable[[], FloatArray]:
+    """Amplitudes of the traced field of transmitters of the laboratory, without its search."""
+    options = TracedOptions(TraceOptions(depth=3), faint=faint)
+    traced = TracedField(open_scene("laboratory", FREQUENCY_HZ), transmitter_path(TRANSMITTERS), RECEIVER, options)
+
+    def call() -> FloatArray:
+        gain = traced({}).gain
+        summed = [np.asarray(part.numpy(), float).reshape(TRANSMITTERS, -1).sum(axis=1) for part in gain]
+        return np.hypot(*summed)
+
+    return call
+
+
 def compared(what: str, call: Callable[[], Any], omission: Omission, without: Callable[[], Any] | None = None) -> Row:
     """Row of a call with and without an omission, which ``omission`` switches off; ``without``: another call for it."""
     with counted() as counts:
@@ -90,6 +105,7 @@ def main() -> dict[str, Any]:
         ),
         "planes far from a point": (room, partial(replaced, (surfaces, "FEW_PLANES", 1 << 60))),
         "planes of a scene that were found before": (room, nullcontext, partial(room, again=True)),
+        f"paths of {FAINT:g} of the amplitude, in fits": (field_of_paths(FAINT), nullcontext, field_of_paths(0.0)),
         "Gaussians that do not reach a tile of the image": (image, partial(replaced, (tiles, "_boxes", whole_plane))),
         "Gaussians beyond three standard deviations": (
             image,

@@ -35,7 +35,7 @@ def misfit(room):
     prepared, record = room
     observed = record.observation.copy()
     observed[0, 3] = np.nan
-    options = CorrectionOptions(depth=2, rays=8192)
+    options = CorrectionOptions(depth=2, rays=8192, faint=0.0)
     return Misfit(replace(record, observation=observed), np.arange(16), prepared, options)
 
 
@@ -153,7 +153,7 @@ def spectra(request, room):
     carriers_hz = np.where(np.arange(24) % 3, CARRIER_HZ, 1.5 * CARRIER_HZ)
     kinds = {"task": "spectrum", "receivers": (first, second), "frequencies_hz": None, "carriers_hz": carriers_hz}
     parts = (MATERIALS, PLANES) if request.param else (MATERIALS,)
-    options = CorrectionOptions(parts, depth=2, rays=8192)
+    options = CorrectionOptions(parts, depth=2, rays=8192, faint=0.0)
     return Misfit(replace(record, observation=observed, **kinds), np.arange(16), prepared, options)
 
 
@@ -208,7 +208,7 @@ def test_channels_of_an_array_are_scored_by_row(room):
     prepared, single = room
     single = replace(single, observation=single.observation * np.linspace(1.01, 1.2, len(single))[:, None])
     pair = replace(single.with_array(np.zeros((2, 3))), observation=single.observation[:, :, None].repeat(2, axis=2))
-    options = CorrectionOptions(depth=1, rays=4096)
+    options = CorrectionOptions(depth=1, rays=4096, faint=0.0)
     fits = [Misfit(record, np.arange(12), prepared, options) for record in (single, pair)]
     scores = [fit.scores(fit.start) for fit in fits]
     assert np.ptp(scores[0]) > 1

@@ -50,7 +50,7 @@ def shared(one, other):
 def test_paths_are_those_of_the_scene_with_its_planes_moved(scenes):
     stated, copy, moved, planes = scenes
     before = Prepared(stated)
-    found = traced(moved_search(copy, before.surfaces, planes))
+    found = traced(moved_search(copy, before.surfaces, planes).prepared)
     assert shared(traced(Prepared(moved)), found) > 1 - AT_EDGES
     assert shared(traced(before), found) < 0.5
 
@@ -61,7 +61,7 @@ def test_a_surface_that_is_absent_is_not_met(scenes):
     board = surfaces.names.index("board")
     slab = slabs_of_faces(stated, surfaces, "surface")[1][surfaces.first_face[board]]
     for absent, met in (((), True), ((slab,), False)):
-        paths = traced(moved_search(copy, surfaces, planes, absent)).paths
+        paths = traced(moved_search(copy, surfaces, planes, absent).prepared).paths
         assert (paths.objects == board).any() == met
 
 
@@ -69,7 +69,7 @@ def test_a_scene_is_moved_from_where_it_was_stated_and_back(scenes):
     stated, copy, _, planes = scenes
     before = Prepared(stated)
     moved_search(copy, before.surfaces, planes, (0,))
-    assert shared(traced(before), traced(moved_search(copy, before.surfaces, {}))) == 1
+    assert shared(traced(before), traced(moved_search(copy, before.surfaces, {}).prepared)) == 1
 
 
 SHIFT_M = 0.03

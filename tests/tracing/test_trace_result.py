@@ -50,6 +50,13 @@ def test_stored_traces_are_read_back(traced, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"paths.npz"}
 
 
+def test_array_of_an_earlier_version_is_not_read(traced, tmp_path):
+    file = save_trace(tmp_path / "paths.npz", traced)
+    with np.load(file) as stored:
+        np.savez(file, length_rate_mps=traced.paths.length_m, **stored)
+    np.testing.assert_equal(vars(load_trace(file).paths), vars(traced.paths))
+
+
 def test_settings_of_every_model_with_a_scene_state_the_same_search():
     """One name and one meaning of depth, reflections, transmission and rays."""
     for kind, transmission in product((TracedConfig, CorrectionOptions, PathSettings, TracingSettings), (True, False)):

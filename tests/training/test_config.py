@@ -33,7 +33,7 @@ ONES = "holdout_steps_fraction loss.ssim_weight optimiser.cosine_start optimiser
 LARGEST = (
     dict.fromkeys([*ONES.split(), "density.growth_fraction"], 1.0)
     | {"initial.size_deg": 89.0, "initial.opacity": 0.999, "optimiser.ema_decay": 0.9999}
-    | {"traced.alone": 0.4, "traced.depth": 12, "traced.pattern_degree": 8, "traced.rays": 1 << 24}
+    | {"traced.alone": 0.4, "traced.faint": 0.4, "traced.depth": 12, "traced.pattern_degree": 8, "traced.rays": 1 << 24}
 )
 CHOICES = {"receiver": ["auto", "pixel", "array"], "traced.materials": ["named", "surface"]}
 CHOICES |= {"evaluation": ["splatted", "traced"]}

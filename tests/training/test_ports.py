@@ -27,7 +27,7 @@ from wrf_mi.training.trainer import Trainer
 CARRIERS_HZ = (1.2e9, 2.4e9, 5.8e9)
 BETWEEN_HZ = 3.5e9
 OPTIONS = TraceOptions(depth=2, transmission=True, rays=4096)
-CONFIG = TracedConfig(depth=2, reflections=2, rays=4096)
+CONFIG = TracedConfig(depth=2, reflections=2, rays=4096, faint=0.0)
 SIZE = (9, 24)
 SINGLE, SINGLE_DB = 1e-6, 2e-5  # Of greys in 0..1, and of dB: rounding of single precision
 STRENGTH_DB, TRACED = 1e-3, 1e-3  # In dB and of greys: gains of the tracer are in single precision
@@ -103,7 +103,7 @@ def test_gaussians_count_in_each_draw_of_the_paths_phases(xml):
 
 def test_reports_from_one_search_are_those_of_a_search_for_each_carrier(xml):
     """Of rows whose positions are partly the same, some of them repeated, at two trained carriers and another one."""
-    predict = Predictor(graph_of(xml, PORTS), {})
+    predict = Predictor(graph_of(xml, PORTS, faint=0.05), {})
     tx = transmitters(6)[[0, 1, 2, 2, 3, 2, 1, 0, 5, 3, 4, 4]]
     carriers = np.array([CARRIERS_HZ[0], CARRIERS_HZ[2], BETWEEN_HZ]).repeat(4)
     found = predict(tx, 0, carriers_hz=carriers)

@@ -25,6 +25,7 @@ from ..core.types import FloatArray, IntArray
 from ..receivers import minmax_scale
 from ..receivers.registry import RECEIVERS, ObservationSpec
 from ..tasks.conditions import placed_receivers
+from ..tracing.paths.corrected_scene import MovedSearch
 from ..tracing.paths.instrument_parameters import instrument_parameters
 from ..tracing.paths.scene_parameters import PREFIX, QUANTITIES, SHIFT, TILT
 from ..tracing.paths.solve import Prepared
@@ -107,7 +108,7 @@ class Misfit:
         rows: IntArray,
         prepared: Prepared,
         options: CorrectionOptions,
-        searched: Prepared | None = None,
+        searched: MovedSearch | None = None,
         surfaces: tuple[IntArray, IntArray] | None = None,
     ) -> None:
         self.record, self.rows, self._task = record, rows, record.task
@@ -153,7 +154,7 @@ class Misfit:
         """Traced sides of the ports."""
         return [port.side for port in self.ports]
 
-    def _traced_ports(self, numbers: IntArray, prepared: Prepared, searched: Prepared | None) -> list[_Port]:
+    def _traced_ports(self, numbers: IntArray, prepared: Prepared, searched: MovedSearch | None) -> list[_Port]:
         """Ports of the receivers, which have these numbers in the record."""
         record, rows, task = self.record, self.rows, self._task
         height, width = self._size or (1, 1)

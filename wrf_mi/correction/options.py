@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from ..core import InputError
-from ..core.settings import NOT_NEGATIVE, CheckedSettings, Count, Positive
+from ..core.settings import NOT_NEGATIVE, CheckedSettings, Count, Positive, ShareBelow1
 from ..tracing.options import MAX_DEGREE, MAX_DEPTH, SpecularOptions
 from ..tracing.paths.instrument_parameters import TX_PATTERN
 from ..tracing.paths.scene_parameters import EXPONENT, PREFIX, QUANTITIES, SHIFT, TILT
@@ -49,6 +49,7 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
             uncertain phases where no change of planes is kept (`wrf_mi.correction.uncertain_phases`).
         rows: most training rows that are compared, of images over all receivers; of more, a random subset, seeded by
             the split.
+        faint: the weakest paths of a transmitter are dropped while their amplitudes add up to less than this share.
         steps: largest number of least-squares steps.
         pattern_degree: degree of the antennas' patterns, where they are changed.
         shift_sd_m: standard deviation of a plane's position before the correction, metres.
@@ -57,6 +58,7 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
     parts: tuple[str, ...] = (MATERIALS, PLANES, FRAME, HIDDEN)
     depth: Interactions = field(default=3, kw_only=True)
     rows: Count = 600
+    faint: ShareBelow1 = 1e-3
     steps: Annotated[int, NOT_NEGATIVE] = 8
     pattern_degree: Degree = 2
     shift_sd_m: Positive = 0.02
@@ -83,7 +85,9 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
     def traced(self) -> TracedOptions:
         """Options of the traced side: reflections and transmissions, a material of each surface, planes that move."""
         degree = self.pattern_degree if PATTERNS in self.parts else 0
-        return TracedOptions(self.options, degree, materials="surface", planes=True, constants=QUANTITIES)
+        return TracedOptions(
+            self.options, degree, materials="surface", planes=True, faint=self.faint, constants=QUANTITIES
+        )
 
     def changes(self, name: str) -> bool:
         """Whether a parameter of `wrf_mi.tracing.paths.traced_field.TracedField` is changed."""

@@ -194,7 +194,7 @@ class Graph:
         if self.scene is None:
             return [None] * (1 if carriers_hz is None else len(np.unique(carriers_hz)))
         t = self.traced
-        options = TracedOptions(t.options, t.pattern_degree, self.tx_antenna, t.materials, t.moves_planes)
+        options = TracedOptions(t.options, t.pattern_degree, self.tx_antenna, t.materials, t.moves_planes, t.faint)
         at = self.receivers[receiver], options, self._prepared
         sides = traced_fields(tx_pos_m, *at, tx_heading_rad, carriers_hz, parameters=params)
         if self.surface:

@@ -24,6 +24,8 @@ class TracedConfig(SpecularOptions):
     A parameter of rate 0 stays at its stated value and costs nothing.
 
     Attributes:
+        faint: the weakest paths of a transmitter are dropped while their amplitudes add up to less than this share of
+            those of all paths, with the scene's stated materials; 0: none.
         pattern_degree: degree of trainable factors of the antennas' patterns; 0: none.
         materials: ``named``: each named material has a permittivity and a conductivity; ``surface``: each surface has
             its own, the faces of one object in one plane, initialised from the named material.
@@ -40,6 +42,7 @@ class TracedConfig(SpecularOptions):
         surface_spacing: distance of neighbouring Gaussians on a surface, metres.
     """
 
+    faint: ShareBelow1 = 1e-3
     pattern_degree: Annotated[int, Field(ge=0, le=MAX_DEGREE, description=f"0 to {MAX_DEGREE}")] = 0
     materials: Literal["named", "surface"] = "named"
     alone: ShareBelow1 = 0.25

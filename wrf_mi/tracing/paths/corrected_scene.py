@@ -8,7 +8,7 @@ one, so that paths found there are paths of the stated scene with these paramete
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -19,7 +19,7 @@ import trimesh
 from numpy.typing import NDArray
 from wrf_mi_scenes.mitsuba_xml import ABSORBER, PERFECT_CONSTANTS
 
-from ...backend.device import on_device
+from ...backend.device import on_device, to_tensor
 from ...core import InputError
 from ...core.types import FloatArray, IntArray
 from ...scene.folder import plain_name, write_scene
@@ -219,9 +219,17 @@ def _constants(slab: FloatArray) -> dict[str, float]:
     return {name: float(f"{value:.5g}") for name, value in zip(PERFECT_CONSTANTS, slab, strict=True)}
 
 
+@dataclass(frozen=True)
+class MovedSearch:
+    """Where paths are searched for the scene as stated."""
+
+    prepared: Prepared  # shared state of traces in the moved scene
+    parameters: Mapping[str, Any]  # parameters of the traced fields, Dr.Jit tensors by name, used to prune weak paths
+
+
 def moved_search(
     copy: Any, stated: Surfaces, parameters: Mapping[str, NDArray[Any]], absent: Collection[int] = ()
-) -> Prepared:
+) -> MovedSearch:
     """Move the planes of a scene in place, for the search of paths there.
 
     The objects of ``copy``, a ``sionna.rt.Scene`` that nothing else may use, are those of the scene as ``stated``,
@@ -248,4 +256,4 @@ def moved_search(
     surfaces = replace(
         stated, shape_ids=shape_ids, triangles=triangles, normal=normal, offset=offset, face=face, low=low, high=high
     )
-    return Prepared(copy, surfaces)
+    return MovedSearch(Prepared(copy, surfaces), {name: to_tensor(values) for name, values in parameters.items()})

@@ -246,3 +246,16 @@ def load_trace(file: str | Path) -> TraceResult:
         return from_arrays(TraceResult, arrays, paths=paths)
     except ValueError as error:
         raise InputError(f"{file}: holds paths alone, not how they were traced ({error}); trace them anew") from None
+
+
+def without_faint(tx: IntArray, amplitude: FloatArray, share: float) -> NDArray[np.bool_]:
+    """Mask of paths without the weakest of each transmitter, whose amplitudes add up to less than a share of all."""
+    # That bounds the error of a sum of the paths, whatever their phases.
+    # Cumulative sums of ascending amplitudes, transmitter by transmitter.
+    order = np.lexsort((amplitude, tx))
+    ordered, upto = tx[order], np.cumsum(amplitude[order])
+    first = np.searchsorted(ordered, ordered)
+    upto -= (upto - amplitude[order])[first]  # sum of a transmitter's weaker paths and the path itself
+    strong = np.empty(len(tx), bool)
+    strong[order] = upto >= share * np.bincount(tx, amplitude)[ordered]
+    return strong

@@ -35,9 +35,10 @@ from ...receivers.spreads import PathStatistics
 from ..options import FACTOR, TraceOptions
 from ..search.chains import SPECULAR, TRANSMISSION
 from ..search.surfaces import Surfaces
+from .corrected_scene import MovedSearch
 from .field_calculator import Chains, EvaluatedPaths, Level, chains_of, evaluate_paths, pattern_tables
 from .instrument_parameters import gain_name, instrument_parameters, moved_m, receiver_pose, spread_pose, with_antennas
-from .result import TraceResult, paths_with_gain
+from .result import TraceResult, paths_with_gain, without_faint
 from .scene_parameters import TRAINED, MaterialGrouping, SceneTables, renumbered
 from .solve import Prepared, trace_paths
 from .surface_gaussians import Interactions, PathWeights, SurfaceGaussians
@@ -55,6 +56,9 @@ class TracedOptions:
     tx_antenna: Antenna = ANTENNA  # antenna of the transmitters, which turns with their heading
     materials: MaterialGrouping = "named"  # whether named materials have parameters, or surfaces, started from those
     planes: bool = False  # whether shifts and tilts of planes are parameters (`wrf_mi.tracing.paths.scene_parameters`)
+    # The weakest paths of a transmitter are dropped while their amplitudes, with the materials of the search, add up to
+    # less than this share of the amplitudes of all; 0: none.
+    faint: float = 0.0
     constants: tuple[str, ...] = TRAINED  # constants of materials that are parameters, of `QUANTITIES`
 
     def __post_init__(self) -> None:
@@ -78,6 +82,7 @@ class TracedField:
         frequency_hz: carrier of the paths; None: that of the receiver, or else of the scene, at which parameters of
             materials hold.
         searched_at_m: position [3] of the receiver in the search for the paths, metres; None: as stated.
+        present: parameter values used to prune weak paths, Dr.Jit tensors by name; None: as stated.
 
     Raises:
         ValueError: headings of another shape or not finite.
@@ -96,13 +101,14 @@ class TracedField:
         prepared: Prepared | None = None,
         frequency_hz: float | None = None,
         searched_at_m: FloatArray | None = None,
+        present: Mapping[str, Any] | None = None,
     ) -> None:
         self.tx_pos_m: FloatArray = np.atleast_2d(np.asarray(tx_pos_m, float))
         heading = np.zeros(len(self.tx_pos_m)) if tx_heading_rad is None else np.asarray(tx_heading_rad, float)
         if heading.shape != (len(self.tx_pos_m),) or not np.isfinite(heading).all():
             raise ValueError(f"TracedField: tx_heading_rad has shape {heading.shape}; give finite [n]")
         self.scene, self.receiver, self.options, self.heading_rad = scene, receiver, options, heading
-        self._shared, self._checks = prepared or Prepared(scene), prepared is None
+        self._shared, self._checks, self._present = prepared or Prepared(scene), prepared is None, present or {}
         self._gaussians: SurfaceGaussians | None = None
         self._weights: PathWeights | None = None
         antennas = receiver.antenna, options.tx_antenna
@@ -249,10 +255,13 @@ class TracedField:
         if not np.isin(types, (0, SPECULAR, TRANSMISSION)).all():
             raise InputError("paths with diffraction or scattering have no derivative here; trace without them")
         chains = chains_of(surfaces, types, face, self._slab(face), self._source_columns(tx))
-        # A gain that is not a number would make sums over all paths none.
-        known = paths_with_gain(self._amplitudes(chains))
-        count("paths", len(known), len(types) - len(known))
-        tx, types, face, vertices_m = tx[known], types[known], face[known], traced.paths.vertices_m[known]
+        # A gain that is not a number would make sums over all paths none. Weak paths cost as much as strong ones: those
+        # that hardly count are dropped before they are laid out, too.
+        amplitude = self._amplitudes(chains)
+        strong = paths_with_gain(amplitude)
+        strong = strong[without_faint(tx[strong], amplitude[strong], self.options.faint)]
+        count("paths", len(strong), len(types) - len(strong))
+        tx, types, face, vertices_m = tx[strong], types[strong], face[strong], traced.paths.vertices_m[strong]
         met_planes = np.unique(surfaces.plane[face[types != 0]]) if len(surfaces.plane) else face[:0, 0]
         count("planes", len(met_planes), len(surfaces.normal) - len(met_planes))
         # A rectangle of transmitters by paths, filled up with place holders: sums are then reductions of equal blocks.
@@ -261,7 +270,7 @@ class TracedField:
             each = -(-each // SINGLE) * SINGLE
         entry = tx * each + np.arange(len(tx)) - np.searchsorted(tx, tx)  # paths are sorted by transmitter
         place, present = np.zeros(len(self) * each, np.uint32), np.zeros(len(self) * each, bool)
-        place[entry], present[entry] = known, True
+        place[entry], present[entry] = strong, True
         self._each, self.searched_at_m = each, np.array(position_m, float)
         # Points of interaction, which Gaussians on surfaces are near to; in the order of the entries.
         met = types != 0
@@ -277,7 +286,7 @@ class TracedField:
         bounces[entry] = np.sqrt((types == SPECULAR).sum(axis=1))
         self.bounces = on_device(bounces, Float64)
         self.chains = Chains(sources[:3], tuple(sources[3:]), dr.zeros(Float64, len(place)), [])
-        if len(known):
+        if len(strong):
             index, mask = on_device(place, mi.UInt32), on_device(present, mi.Bool)
             self.chains.exists = dr.gather(Float64, chains.exists, index, mask)
             self.chains.levels = [dr.gather(Level, level, index, mask) for level in chains.levels]
@@ -292,7 +301,7 @@ class TracedField:
         if not dr.width(chains.exists):
             return np.zeros(0)
         with dr.suspend_grad():
-            real, imaginary = self._evaluated(chains, {})[0]
+            real, imaginary = self._evaluated(chains, self._present)[0]
             power = real * real + imaginary * imaginary
         return np.asarray(np.sqrt(power.numpy()))
 
@@ -329,7 +338,7 @@ def traced_fields(
     carriers_hz: FloatArray | None = None,
     *,
     parameters: Mapping[str, Any] | None = None,
-    searched: Prepared | None = None,
+    searched: MovedSearch | None = None,
 ) -> list[TracedField]:
     """Traced fields of the transmitters of each carrier at a receiver, in ascending order of the carriers.
 
@@ -337,13 +346,14 @@ def traced_fields(
     those of its carrier. Arguments and errors are those of `TracedField`, and ``carriers_hz``: carrier of each
     transmitter [n], Hz (None: that of the scene); ``parameters``: Dr.Jit tensors by the names of
     `TracedField.parameters`, where they move the receiver further than `TracedField.refresh` allows at a carrier, paths
-    are searched from there (None: the stated pose); ``searched``: scene in which paths are searched (None: as stated).
+    are searched from there (None: the stated pose); ``searched``: where paths are searched (None: in the stated scene).
     """
     positions = np.atleast_2d(np.asarray(tx_pos_m, float))
     heading = None if tx_heading_rad is None else np.asarray(tx_heading_rad, float)
     distinct, number = np.unique(positions, axis=0, return_inverse=True)
     number = number.reshape(-1)
     stated_m, moved_to_m = receiver.position_m, moved_m(receiver, parameters or {})
+    place, present = (searched.prepared, searched.parameters) if searched else (prepared, None)
     traces, fields = dict[bool, TraceResult](), list[TracedField]()
     for carrier_hz, rows in rows_by_carrier(carriers_hz, len(positions)):
         # The stated position serves the carriers for which the receiver has not moved by a quarter of a wavelength.
@@ -352,9 +362,9 @@ def traced_fields(
         position_m = moved_to_m if moved else stated_m
         if moved not in traces:
             at = replace(receiver, position_m=position_m)
-            traces[moved] = _search(distinct, at, options, searched or prepared, check=False)
+            traces[moved] = _search(distinct, at, options, place, check=False)
         traced, yaw = traces[moved].of_transmitters(number[rows]), None if heading is None else heading[rows]
         of_carrier = prepared.scene, positions[rows], receiver, options, yaw
         how: dict[str, Any] = {"traced": traced, "prepared": prepared, "frequency_hz": carrier_hz}
-        fields.append(TracedField(*of_carrier, **how, searched_at_m=position_m))
+        fields.append(TracedField(*of_carrier, **how, searched_at_m=position_m, present=present))
     return fields
