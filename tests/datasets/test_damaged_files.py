@@ -28,7 +28,12 @@ from wrf_mi_scenes.mitsuba_xml import scene_xml
 
 from wrf_mi.apps.exports import export
 from wrf_mi.apps.exports.fields import import_field
+from wrf_mi.apps.exports.format import ExportOptions
+from wrf_mi.apps.exports.paths_table import read_paths
+from wrf_mi.apps.maps.api import radio_map
+from wrf_mi.apps.maps.dataset import write_map
 from wrf_mi.apps.maps.locate_file import read_observations
+from wrf_mi.apps.viewer.map_layer import read_map
 from wrf_mi.core import InputError, Receiver
 from wrf_mi.core.files import inside, one_line
 from wrf_mi.core.yaml_files import read_yaml
@@ -134,13 +139,15 @@ READERS: Mapping[str, Callable[[Path], Iterable[Any]]] = {
     "stopped/checkpoint.npz": of_folder(read_checkpoint),
     "stopped/log.jsonl": of_folder(lambda folder: cut_log(folder, 2)),
     "split.npz": lambda file: [load_split(file).train],
+    "paths.csv": lambda file: [read_paths(file).gain, read_paths(file).length_m],
     "field.npz": imported,
+    "map.nc": lambda file: [read_map(file)[0].x_m],
     "heard.csv": heard,
     "inputs.csv": lambda file: [read_inputs(file, None).tx_pos_m],
     "inputs.npz": lambda file: [read_inputs(None, file).tx_pos_m],
 }
 """Readers of files, which return the numbers that have to be finite."""
-CHILDREN = (".laz", ".mat")
+CHILDREN = (".laz", ".mat", ".nc")
 
 
 @pytest.fixture(scope="module")
@@ -166,14 +173,17 @@ def samples(folder: Path, flat_folder: Path, room: Path, tmp_path_factory: pytes
     (place / "plan.yaml").write_text("image: plan.png\nresolution: 0.1\norigin: [0.0, 0.0, 0.0]\nnegate: 0\n")
     shutil.copy(flat_folder / "layout.csv", place / "plan.csv")
     shutil.copytree(room, place / "room")
-    train(flat_folder, "kriging", out=place / "kriging", settings=("heading=false", "generic=true"))
+    strengths = train(flat_folder, "kriging", out=place / "kriging", settings=("heading=false", "generic=true"))
     shutil.copy(place / "kriging" / "split.npz", place)
+    write_map(radio_map(strengths, height_m=1.0, step_m=0.5), place / "map.nc")
     short = field_settings("steps=4", "network.static_geometry=true", "checkpoint_every=2", "log_every=1")
     run = train(folder, "wrf-gs+", out=place / "field", settings=short)
     run.predict([[2.0, 1.0, 1.0]])
     export(run.folder, "field", place / "field.npz")
     with pytest.raises(Interrupted):
         train(folder, "wrf-gs+", out=place / "stopped", settings=short, stop=stop_after(3))
+    ends: dict[str, Any] = {"tx_pos_m": np.array([[1.0, 2, 1]]), "rx_pos_m": np.array([[3.0, 1, 2]])}
+    export(room, "paths", place / "paths.csv", ExportOptions(frequency_hz=CARRIER_HZ, **ends))
     (place / "heard.csv").write_text("x,y,rssi_one,other_dbm\n1,2,-60.5,-71\n2,2,,-70\n")
     np.savetxt(place / "inputs.csv", positions, delimiter=",", header="x,y,z", comments="")
     np.savez(place / "inputs.npz", tx_pos=positions)
@@ -255,8 +265,7 @@ REFUSED: list[tuple[Callable[..., Any], str, str | bytes, str]] = [  # reader, n
                 "outside its folder",
             ),
             ("<scene/>", 'not with a scene and its version; write <scene version="3.0.0">'),
-            ("<scene>" + "<transform>" * 100_000 + "</transform>" * 100_000 + "</scene>", "more than 64 levels"),
-            ("<scene>" * 100_000, "cannot be opened .no element found"),
+            ("<scene>" + "<transform>" * 80 + "</transform>" * 80 + "</scene>", "more than 64 levels"),
         )
     ),
 ]

@@ -147,12 +147,24 @@ def test_data_sets_are_located_in_order(home: Path, monkeypatch: pytest.MonkeyPa
     assert load(chosen).name == "laboratory"
 
 
-@pytest.mark.parametrize("name", ["rfid-lab", "flat-ble", "newrf-conference", "newrf-office"])
-def test_manifests_state_commits_and_checksums(name: str):
-    for entry in remote_files(known(name)):
+MANIFESTS = {
+    "rfid-lab": {"LICENSE", "gateway_info.yml", "tx_pos.csv", "train_index.txt", "test_index.txt"}
+    | {f"spectrum/{row:05d}.png" for row in range(1, 201)},
+    "flat-ble": {"anchors.csv", "calibration_df.csv", "test_robot_df.csv", "layout.csv"},
+    "newrf-conference": {"LICENSE", "conference.stl", "conference.npz"},
+    "newrf-office": {"LICENSE", "office.stl", "office.npz"},
+}
+
+
+@pytest.mark.parametrize("name", MANIFESTS)
+def test_manifests_are_complete(name: str):
+    entries = remote_files(known(name))
+    assert sorted(entry.path for entry in entries) == sorted(MANIFESTS[name])
+    for entry in entries:
         commit, _, path = entry.remote.partition("/")
         assert (len(bytes.fromhex(entry.sha256)), len(bytes.fromhex(commit))) == (32, 20)
         assert entry.converted == path.endswith(".pkl")
+        assert name != "rfid-lab" or path in (entry.path, f"data_test200/{entry.path}")
 
 
 def fetched_from_copy(name: str, server: Server, **options: bool) -> Path:

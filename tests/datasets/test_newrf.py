@@ -11,6 +11,7 @@ import pytest
 from changed_folders import DATA, needs, refusal
 from scipy.constants import speed_of_light
 
+from wrf_mi.core import InputError
 from wrf_mi.datasets import load, make_splits, read_newrf
 from wrf_mi.datasets.newrf import KEYS, arrays_sha256, convert_newrf, read_pickled_table
 
@@ -165,6 +166,24 @@ def test_other_files_are_refused_in_one_line(tmp_path: Path, read: Any, content:
     """Content that may end the process in a child process."""
     (tmp_path / "bad.pkl").write_bytes(content)
     refusal(read, tmp_path / "bad.pkl", message)
+
+
+def test_a_pickle_that_is_cut_or_changed_is_refused_or_gives_other_arrays(tmp_path: Path):
+    expected = drawn()
+    rng = np.random.default_rng(4)
+    for trial in range(4):
+        content = bytearray(PICKLE)
+        if trial % 2:
+            content[rng.integers(len(content))] ^= int(rng.integers(1, 256))
+        else:
+            del content[rng.integers(len(content)) :]
+        (tmp_path / "bad.pkl").write_bytes(content)
+        try:
+            arrays = convert_newrf(tmp_path / "bad.pkl")
+        except InputError:
+            continue
+        same = all(np.array_equal(arrays[key], expected[key]) for key in KEYS)
+        assert (arrays_sha256(arrays) == arrays_sha256(expected)) == same
 
 
 @needs("newrf")

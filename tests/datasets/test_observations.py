@@ -221,16 +221,25 @@ def strengths_of_many(dbm: float) -> tuple[Record, Split]:
     return Record("many", "rssi", tx_pos_m, MANY, observation, official=(rows[:3], rows[3:])), split
 
 
-def test_messages_about_hundreds_of_receivers_name_six(caplog: pytest.LogCaptureFixture):
+def test_refusal_of_hundreds_of_receivers_names_six():
     record, split = strengths_of_many(np.nan)
     refusal(fitted_receivers, record, [split], rf"by any receiver \({SIX.format('')}\); use another split")
-    record, _ = strengths_of_many(-60)
-    warn_of_left_out(record, {receiver.name: 1 for receiver in MANY})
+
+
+def test_warning_of_hundreds_of_receivers_left_out_names_six(caplog: pytest.LogCaptureFixture):
+    warn_of_left_out(strengths_of_many(-60)[0], {receiver.name: 1 for receiver in MANY})
     assert caplog.messages[0].endswith(f"with their number of rows: {SIX.format(' (1)')}")
-    assert f"received:         {SIX.format(' 12')}\n" in render(summary(record))
+
+
+def test_suspicion_of_hundreds_of_receivers_with_few_rows_names_six():
+    record, _ = strengths_of_many(-60)
     silent = changed(record, (np.s_[:299, 3:], np.nan))
     ((_, text),) = few_rows(replace(silent, official=None))
     assert "received by ap0 (3), ap1 (3), ap2 (3), ap3 (3), ap4 (3), ap5 (3) and 293 more: fits" in text
+
+
+def test_summary_of_hundreds_of_receivers_names_six():
+    assert f"received:         {SIX.format(' 12')}\n" in render(summary(strengths_of_many(-60)[0]))
 
 
 def test_training_rows_at_one_place_are_told(caplog: pytest.LogCaptureFixture):

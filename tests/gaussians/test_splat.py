@@ -8,12 +8,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from double_precision import Tensor64
-from made_fields import SIZE, off_edges, oracle_image
+from made_fields import SIZE, device_gaussians, off_edges, oracle_image
 from made_spectra import OCTAVES, RECEIVERS, spectra
 
 from wrf_mi.backend.device import to_float, to_tensor
 from wrf_mi.backend.vectors import Float64
-from wrf_mi.core import Receiver, unit_vectors
+from wrf_mi.core import Receiver, pixel_directions, unit_vectors
 from wrf_mi.gaussians import FIELDS, Encoding, Factorised, Gaussians, WrfGs, WrfGsPlus, random_gaussians
 from wrf_mi.gaussians.blend import GROUP, group_size, splat
 from wrf_mi.gaussians.tiles import perception_plane
@@ -67,6 +67,26 @@ def test_splat_matches_the_oracle(model, size, single):
         share_off, error = off_edges(image, expected)
         assert share_off < 1e-3
         assert error < (FLOAT32_TOLERANCE if single else FLOAT64_TOLERANCE)
+
+
+def test_seam_and_zenith():
+    """One Gaussian across the azimuth seam and one on the zenith: as round on the sphere as anywhere else."""
+    for azimuth, elevation in ((0.0, 0.3), (1.0, 1.55), (3.1, 0.02)):
+        direction = unit_vectors(azimuth, elevation)
+        position = RECEIVER.position_m + RECEIVER.to_world @ direction * 4.0
+        geometry: dict[str, Any] = {
+            "position": position[:, None],
+            "scale": np.full((3, 1), 0.3),
+            "rotation": np.eye(4)[:, 3:],
+        }
+        gaussian = device_gaussians(Float64, **geometry, signal=np.array([1 + 0.5j]), opacity=np.array([0.7]))
+        re, im = splat(gaussian, device_pose(RECEIVER, Float64), perception_plane(90, 360, Float64))
+        angle = np.arccos(np.clip(pixel_directions(90, 360) @ direction, -1, 1))
+        offset = np.tan(angle) / np.hypot(0.3 / 4.0, np.radians(0.3))
+        footprint = np.where(offset < 3, np.exp(-0.5 * offset**2), 0) * (angle < 1)
+        # Angles come from an arc cosine here, which is good to 1e-8 near zero.
+        for part, strength in ((re, 0.7), (im, 0.35)):
+            np.testing.assert_allclose(part.numpy().reshape(90, 360), strength * footprint, atol=1e-6)
 
 
 def test_splat_is_invariant_to_storage_order():

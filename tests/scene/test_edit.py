@@ -155,18 +155,30 @@ ROOM = [
         (Move(("cabinet",), (-1, 0, 0)), []),  # stands at the wall
         (Move(("cabinet",), (-0.3, 0.5, 0), 90), []),
         (Move(("cabinet",), (0, 0, 0.3)), []),
-        (Move(("cabinet",), (-1.25, 0, 0)), ["0.25 m out of the scene"]),
-        (Move(("cabinet",), (0, 0, -0.2)), ["0.20 m out of the scene"]),
+        (Move(("cabinet",), (-1.25, 0, 0)), ["0.25 m out of the scene", "0.25 m through wall_0"]),
+        (Move(("cabinet",), (0, 0, -0.2)), ["0.20 m out of the scene", "0.20 m through floor"]),
+        (Move(("cabinet",), (0, 1.4, 0)), ["0.40 m out of the scene"]),
+        (Move(("cabinet",), (0, -0.6, 0)), ["0.30 m through table"]),
+        (Move(("cabinet",), (1.2, 0, 0)), ["1.00 m through pole"]),  # cut at the top of each edge
         (Move(("wall_1",), (0.5, 0, 0)), ["0.50 m out of the scene"]),
         (Move(("*",), (9, 9, 9)), []),
     ],
 )
-def test_parts_that_leave_the_room_are_named_with_the_distance(move, distances, room, tmp_path, caplog):
+def test_parts_that_leave_the_room_or_stand_in_others_are_named_with_the_distance(
+    move, distances, room, tmp_path, caplog
+):
     edit_scene(room, tmp_path / "edited", [move])
     with pytest.raises(InputError, match=r"move wall_1: moved out of the scene, 5\.00 m beyond it"):
         edit_scene(room, tmp_path / "far", [Move(("wall_1",), (5, 0, 0))])
     warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert warned == [f"move {move.parts[0]}: reaches {distance}" for distance in distances]
+
+
+def test_parts_that_stood_in_others_before_are_not_named(tmp_path, caplog):
+    scan = [*ROOM, box("shelf", (2, 2.5, -0.3), (3, 3, 2))]  # as scans of uneven floors have them
+    scene = write_scene(tmp_path / "room", scan, frame="the room's", source="test")
+    edit_scene(scene, tmp_path / "edited", [Move(("shelf",), (-0.5, 0, 0))])
+    assert caplog.text == ""
 
 
 EXACT_M = 1e-6

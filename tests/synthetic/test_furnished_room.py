@@ -131,6 +131,13 @@ def test_arrays_face_the_room_and_have_no_grating_lobes() -> None:
     assert furnished.DEFAULT_BANDS.spacing_m < speed_of_light / max(furnished.DEFAULT_BANDS.carriers_hz) / 2
 
 
+def test_bands_are_stored(record: Record) -> None:
+    file = Path(record.source, "tx_pos.csv")
+    before = file.stat().st_mtime_ns
+    assert_same(furnished.traced_room_bands(record.source, SMALL_BANDS), record)
+    assert file.stat().st_mtime_ns == before
+
+
 def test_spectra_of_a_carrier_are_those_made_at_it_alone(record: Record, tmp_path: Path) -> None:
     alone = furnished.traced_room_bands(tmp_path / "alone", replace(SMALL_BANDS, carriers_hz=(5.8e9,)))
     np.testing.assert_array_equal(alone.frequencies_hz, [5.8e9])

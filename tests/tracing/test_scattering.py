@@ -187,6 +187,12 @@ def test_recomputed_gains_have_the_present_coefficient(tmp_path):
 STATED = {"scattering_coefficient": 0.6, "xpd_coefficient": 0.1, "scattering_pattern": "directive", "alpha_r": 3}
 
 
+@pytest.mark.parametrize("kind", ["itu-radio-material", "diffuse"])
+def test_material_named_by_itu_keeps_its_scattering(tmp_path, kind):
+    file = plane(tmp_path, "mat-itu_brick", kind, **STATED, **({"type": "brick"} if kind.startswith("itu") else {}))
+    assert scattering_of(open_scene(file, FREQUENCY_HZ).radio_materials["itu_brick"]) == STATED
+
+
 def test_constants_of_a_material_with_a_name_of_itu_are_refused(tmp_path):
     file = plane(tmp_path, "mat-itu_brick", relative_permittivity=7.0, conductivity=0.1)
     with pytest.raises(InputError, match="<bsdf> 1 has constants and an id of ITU-R P"):

@@ -119,6 +119,14 @@ def test_wave_is_blocked_by_a_seam_and_by_a_free_edge(tmp_path):
         assert passes(board, source + beyond, target + beyond), (at, away)
 
 
+def test_no_path_over_a_floor_leads_under_the_wall_on_it(tmp_path):
+    floor, wall = sheet(2, 0.0, (0.0, 4.0), (0.0, 3.0)), sheet(0, 2.0, (0.0, 3.0), (0.0, 2.5))
+    scene = room(tmp_path, {"floor": ("itu_metal", floor), "wall": ("itu_metal", wall)})
+    places = np.array([*product((0.5, 1.0, 1.5), (0.5, 1.0, 1.7), (0.5, 1.0))])
+    targets = [receiver(p, f"rx{k}") for k, p in enumerate(places * [-1, 1, 1] + [4, 0, 0])]
+    assert not len(trace_paths(scene, places, targets, replace(OPAQUE, depth=2), check=False).paths)
+
+
 PAIRS = (
     *(([1.0, 2, 1], [4.0, 2, 1]), ([1.0, 2.5, 1.5], [5.0, 2.5, 1.5]), ([1.0, 1, 1], [2.0, 2, 1])),
     *(([1.0, 1, 1], [2.0, 2, 2]), ([1.0, 1, 1], [2.0, 1, 2]), ([2.0, 2, 1], [4.0, 3, 1])),

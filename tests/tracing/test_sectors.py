@@ -154,9 +154,10 @@ def test_a_trace_at_another_carrier_compiles_nothing_anew(box_xml):
     assert kernels(LOW_HZ) == kernels(MIDDLE_HZ) == kernels(HIGH_HZ)
 
 
-def test_fields_are_those_of_a_search_for_each_carrier(middle, searches):
-    """Positions, headings and lengths; the search is of each distinct position, once."""
-    options, (tx, heading, carriers) = TracedOptions(FIELD_OPTIONS, pattern_degree=1), rows()
+@pytest.mark.parametrize("faint", [0.0, 0.1])
+def test_fields_are_those_of_a_search_for_each_carrier(faint, middle, searches):
+    """Positions, headings, faint paths left out and lengths; the search is of each distinct position, once."""
+    options, (tx, heading, carriers) = TracedOptions(FIELD_OPTIONS, pattern_degree=1, faint=faint), rows()
     pattern = {"pattern.transmitter": Tensor64(np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.3]]))}
     found = traced_fields(tx, receiver(), options, Prepared(middle), heading, carriers)
     assert searches == [7]
@@ -167,6 +168,14 @@ def test_fields_are_those_of_a_search_for_each_carrier(middle, searches):
         np.testing.assert_array_equal(field.exists, alone.exists)
         close(response(field, pattern), response(alone, pattern))
     assert len(searches) == 4
+
+
+def test_fields_are_those_of_scenes_at_each_carrier(box_xml, middle):
+    """Materials follow the laws of ITU-R P.2040 from the carrier of the search."""
+    tx, heading, carriers = rows()
+    for field in traced_fields(tx, receiver(), FIELD, Prepared(middle), heading, carriers):
+        at, scene = carriers == field.frequency_hz, open_scene(box_xml, field.frequency_hz, THICKNESS_M)
+        close(response(field, {}), response(TracedField(scene, tx[at], receiver(), FIELD, heading[at]), {}))
 
 
 def test_moved_receivers_are_searched_as_by_refresh(middle, searches):
@@ -188,6 +197,12 @@ def test_rows_without_carriers_have_that_of_the_scene(box):
     [field] = traced_fields(tx, receiver(), FIELD, Prepared(box))
     assert field.frequency_hz == pytest.approx(FREQUENCY_HZ)
     np.testing.assert_array_equal(response(field, {}), response(TracedField(box, tx, receiver(), FIELD), {}))
+
+
+def test_wrong_positions_are_refused(box):
+    for wrong in ([[1.0, 2.0]], [[1.0, 2.0, np.nan]]):
+        with pytest.raises(ValueError, match="tx_pos_m has shape"):
+            traced_fields(wrong, receiver(), TracedOptions(FIELD_OPTIONS), Prepared(box))
 
 
 AGREE = 1e-4  # of the strongest path: Sionna RT in single precision, angles of a table among them

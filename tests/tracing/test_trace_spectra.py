@@ -19,7 +19,7 @@ from wrf_mi.receivers import antenna_csi
 from wrf_mi.receivers.instruments import Instrument
 from wrf_mi.synthetic import laboratory_record, load_record, stored
 from wrf_mi.synthetic.laboratory import FREQUENCY_HZ, RECEIVER, SPACING_M, transmitter_path
-from wrf_mi.tracing import open_scene, set_frequency, trace_paths
+from wrf_mi.tracing import TraceOptions, open_scene, set_frequency, trace_paths
 from wrf_mi.tracing.sionna.materials import BELOW_1_GHZ
 from wrf_mi.tracing.sionna.path_solver import sionna_orientation
 
@@ -38,6 +38,13 @@ def upright(turn_deg, position):
     standing = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
     turned = Rotation.from_euler("z", turn_deg, degrees=True) * standing
     return Receiver("gateway1", np.array(position), turned.as_quat())
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory):
+    """A large sheet of metal at z = 0."""
+    parts = {"ground": ("itu_metal", sheet(2, 0.0, (-100.0, 100.0), (-100.0, 100.0)))}
+    return open_scene(write_xml(tmp_path_factory.mktemp("ground"), parts), FREQUENCY_HZ, {"itu_metal": 0.1})
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +83,30 @@ def test_signals_and_spectra_in_free_space(turn_deg):
     for image in spectrum:
         assert (image.min(), image.max()) == (0, 1)
         assert_peak(image, towards, PEAK_DEG)
+
+
+def test_signals_over_a_metal_floor_are_those_of_two_paths(ground):
+    """The reflected wave comes from the image below the floor; a vertical field keeps its sign."""
+    receiver, source = upright(10, (0.0, 0.0, 1.5)), np.array([6.0, 1.0, 1.1])
+    paths = trace_paths(ground, source[None], receiver, TraceOptions(depth=2)).paths
+    assert paths.bounces.tolist() == [0, 1]
+    elements = receiver.position_m + ARRAY_M @ receiver.to_world.T
+    expected = np.zeros(16, complex)
+    for place, length in zip((source, source * [1, 1, -1]), paths.length_m, strict=True):
+        assert length == pytest.approx(np.linalg.norm(place - receiver.position_m), abs=LENGTH_M)
+        expected += spherical(np.linalg.norm(place - elements, axis=-1))
+    signals = antenna_csi(paths, receiver, ARRAY_M, FREQUENCY_HZ)[0, 0, :, 0]
+    np.testing.assert_allclose(signals, expected, atol=10 * SINGLE * np.abs(expected).max())
+
+
+def test_signals_of_a_transmitter_without_a_path_are_zero(ground):
+    paths = trace_paths(
+        ground, [[3.0, 0, -1], [3.0, 0, 1]], upright(0, (0.0, 0, 1)), TraceOptions(transmission=False)
+    ).paths
+    assert set(paths.tx.tolist()) == {1}
+    signals = antenna_csi(paths, upright(0, (0.0, 0, 1)), ARRAY_M, FREQUENCY_HZ)[0, ..., 0]
+    assert (signals[0] == 0).all()
+    assert (signals[1] != 0).all()
 
 
 def test_signals_agree_with_an_array_traced_by_sionna_rt(tmp_path):

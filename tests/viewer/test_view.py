@@ -209,14 +209,20 @@ def test_maps_of_surfaces_and_datasets_are_points(tmp_path):
     assert note == "Maps: every 2th position along each axis (every 4th point of a surface)."
 
 
-def test_maps_in_zarr_are_read(tmp_path):
-    xarray = pytest.importorskip("xarray")
+def test_a_chunk_that_ends_its_decompressor_is_refused_in_one_line(tmp_path):
+    xarray, folder = pytest.importorskip("xarray"), tmp_path / "map.zarr"
     pytest.importorskip("zarr")
-    with xarray.open_dataset(write_map(tmp_path / "map.nc")) as dataset:
-        dataset.drop_vars("spectrum").to_zarr(tmp_path / "map.zarr", zarr_format=2)
-    (stored, _), (zarr, notes) = read_map(tmp_path / "map.nc"), read_map(tmp_path / "map.zarr")
-    np.testing.assert_array_equal(zarr.values["power_dbm"], stored.values["power_dbm"])
-    assert (zarr.name, zarr.receivers, zarr.height_m, notes) == ("map.zarr", ("anchor1", "anchor2"), 1.0, [])
+    power = np.random.default_rng(0).uniform(-90, -40, (2, 7, 8)).astype(np.float32)
+    axes = {"x": np.arange(8.0), "y": np.arange(7.0), "height": 1.0, "receiver": ["a", "b"]}
+    xarray.Dataset({"power_dbm": (("receiver", "y", "x"), power)}, axes).to_zarr(folder, zarr_format=2)
+    layer, _ = read_map(folder)
+    np.testing.assert_array_equal(layer.values["power_dbm"], power)
+    assert (layer.name, layer.receivers, layer.height_m) == ("map.zarr", ("a", "b"), 1.0)
+    chunk = folder / "power_dbm" / "0.0.0"
+    head = chunk.read_bytes()[:14]  # of Blosc, but for the higher bytes of the compressed size
+    chunk.write_bytes(head.ljust(500, b"\1"))
+    with pytest.raises(InputError, match=r"^\S+map\.zarr: its content is damaged; make the map anew$"):
+        read_map(folder)
 
 
 def test_command_writes_one_file(traced, room, tmp_path, capsys):

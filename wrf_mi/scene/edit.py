@@ -19,11 +19,12 @@ from ..core.files import listed
 from .folder import read_scene_folder, write_scene
 from .materials import Materials
 from .mesh.files import mesh_parts
-from .mesh.surfaces import Surface, box_of, moved, named_kind
+from .mesh.surfaces import Surface, bounds, box_of, moved, named_kind
 
 logger = logging.getLogger(__name__)
 
-TOUCH_M = 0.01  # distance up to which parts touch the box of a scene: surfaces of scans are a centimetre apart
+TOUCH_M = 0.01  # depth up to which parts touch: surfaces of scans stand up to a centimetre in each other
+PAIRS_PER_CHUNK = 1 << 18  # pairs of edge and triangle that are tried together: some 50 MB
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ def edit_scene(
 ) -> Path:
     """Write a folder of a scene with parts moved or removed, and return its path; materials stay.
 
-    Parts that are moved partly out of the scene are named in the log with the distance.
+    Parts that are moved partly out of the scene, or into other surfaces, are named in the log with the distance.
 
     Args:
         folder: scene folder.
@@ -108,10 +109,7 @@ def edit_scene(
         surfaces = _after(move, surfaces, names, removed_names)
         moved_names |= names
     remaining = [surface for surface in surfaces if surface.name not in removed_names]
-    if not moved_names.issuperset(surface.name for surface in remaining):  # a scene moved as a whole has no inside
-        for part in remaining:
-            if part.name in moved_names:
-                _check_inside(part, *box_of(unmoved))
+    _check_moves(unmoved, remaining, moved_names)
     entries = {surface.name: materials.surfaces[surface.name] for surface in remaining}
     changes = [f"{','.join(move.parts)} moved by {move.shift_m} m and {move.turn_deg:g} degrees" for move in moves]
     changes += [f"{name} removed" for name in remove]
@@ -149,6 +147,25 @@ def _chosen(folder: str | Path, surfaces: Sequence[Surface], patterns: Sequence[
     return chosen
 
 
+def _check_moves(before: Sequence[Surface], after: Sequence[Surface], names: set[str]) -> None:
+    """Refuse a moved part that is wholly outside of the scene, and warn of one partly out of it, or in others."""
+    parts, others = ([part for part in after if (part.name in names) == chosen] for chosen in (True, False))
+    if not parts or not others:
+        return  # a scene that is moved as a whole has no inside
+    earlier = {part.name: part for part in before}
+    low, high = box_of(before)
+    for part in parts:
+        _check_inside(part, low, high)
+        _warn_of_crossings(part, earlier[part.name], others)
+
+
+def _warn_of_crossings(part: Surface, earlier: Surface, others: Sequence[Surface]) -> None:
+    for other in others:
+        depth_m = _crossing_depth(part, other)
+        if depth_m > TOUCH_M and depth_m > _crossing_depth(earlier, other) + TOUCH_M:
+            logger.warning("move %s: reaches %.2f m through %s", part.name, depth_m, other.name)
+
+
 def _check_inside(part: Surface, low: FloatArray, high: FloatArray) -> None:
     """Refuse a surface outside of the box of a scene, and warn of one that is partly outside."""
     first, last = box_of([part])
@@ -160,3 +177,35 @@ def _check_inside(part: Surface, low: FloatArray, high: FloatArray) -> None:
         raise InputError(f"move {part.name}: {text}")
     if outside_m > TOUCH_M:
         logger.warning("move %s: reaches %.2f m out of the scene", part.name, outside_m)
+
+
+def _crossing_depth(part: Surface, other: Surface) -> float:
+    """How far a surface reaches through another one, metres; 0: it does not, or the two touch."""
+    # Of an edge that is cut, the shorter piece counts; of all such edges of a surface, the longest.
+    triangles, cut = part.vertices_m[part.faces], other.vertices_m[other.faces]
+    low, high = bounds(triangles)
+    # Where surfaces touch, edges lie in faces and rounding decides what is cut: a smaller part touches nothing.
+    smaller = np.clip(triangles, np.minimum(low + TOUCH_M, high), np.maximum(high - TOUCH_M, low))
+    cut = cut[((cut.max(axis=1) >= low) & (cut.min(axis=1) <= high)).all(axis=1)]  # others are out of reach
+    if not any((_depth(smaller, cut), _depth(cut, smaller))):
+        return 0.0
+    # Of edges of the part and of the other, the shorter way back counts.
+    return min((depth for depth in (_depth(triangles, cut), _depth(cut, triangles)) if depth), default=0.0)
+
+
+def _depth(triangles: FloatArray, cut: FloatArray) -> float:
+    """The depth of `_crossing_depth` by the edges of triangles [n, 3, 3] that other triangles [m, 3, 3] are cut by."""
+    starts, ends = triangles.reshape(-1, 3), np.roll(triangles, -1, axis=1).reshape(-1, 3)
+    normal, proper = trimesh.triangles.normals(cut)  # of triangles with an area alone
+    cut = cut[proper]
+    depth, step = 0.0, max(1, PAIRS_PER_CHUNK // max(len(cut), 1))
+    for first in range(0, len(starts), step):
+        start, end = starts[first : first + step, None], ends[first : first + step, None]
+        # Signed distances [edges, triangles] of both ends from the planes.
+        before, after = (((point - cut[:, 0]) * normal).sum(axis=-1) for point in (start, end))
+        edge, triangle = np.nonzero(before * after < 0)  # both ends are on different sides of the plane
+        d = before[edge, triangle], after[edge, triangle]
+        met = start[edge, 0] + (d[0] / (d[0] - d[1]))[:, None] * (end - start)[edge, 0]
+        within = (trimesh.triangles.points_to_barycentric(cut[triangle], met) >= 0).all(axis=1)
+        depth = max(depth, float(np.minimum(np.abs(d[0]), np.abs(d[1]))[within].max(initial=0.0)))
+    return depth

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from calling import call, refused
 from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct, WktCoordinateSystemVlr
-from made_rooms import closed_box, sampled, write_las
+from made_rooms import by_kind, closed_box, sampled, write_las
 
 from wrf_mi.apps.checking import check_scene
 from wrf_mi.core import InputError
@@ -391,3 +391,19 @@ def test_scans_without_planes_are_refused_and_those_of_no_room_warned_of(tmp_pat
     np.savetxt(tmp_path / "slope.xyz", slope)
     make_scene(tmp_path / "slope.xyz", tmp_path / "scene", up="z")
     assert "slope.xyz: no floor, ceiling or wall" in caplog.text
+
+
+ALIKE_M = 2e-3  # corners of planes fitted to points that are equal but for rounding, in another order
+
+
+def test_scans_with_and_without_places_of_scanners_give_the_same_scene(points, tmp_path):
+    """Of equal points in another order, see the test above for the other formats."""
+    write_e57(tmp_path / "scan.e57", points)
+    scan = read_scan([tmp_path / "scan.e57"])
+    placed = surfaces_from_points(scan.points_m, scan.viewpoints_m, scan.viewpoint)
+    bare = surfaces_from_points(points)
+    assert [s.kind for s in placed] == [s.kind for s in bare] == ["floor", "ceiling", *["wall"] * 4]
+    for kind in ("floor", "ceiling", "wall"):
+        corners = [np.concatenate([s.vertices_m for s in by_kind(group)[kind]]) for group in (placed, bare)]
+        nearest = np.linalg.norm(corners[0][:, None] - corners[1], axis=-1)
+        assert max(nearest.min(axis=0).max(), nearest.min(axis=1).max()) < ALIKE_M, kind

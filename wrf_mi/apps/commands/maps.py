@@ -169,6 +169,7 @@ def locate_command(a: Arguments) -> int:
 def _summary(figures: dict[str, Any]) -> str:
     form, held_out = figures["likelihood"], figures.get("held_out")
     text = f"likelihood: {form['scale']:g} of the stated standard deviations"
+    text += f", common offset of {form['offset_db']:g} dB" if form["offset_db"] else ""
     if figures["neighbours_spread_m"] is not None:
         text += f", times a density of {figures['neighbours_spread_m']:.2g} m around the nearest neighbours' estimate"
     if held_out is None:
