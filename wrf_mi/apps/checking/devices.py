@@ -41,18 +41,18 @@ def device_findings(parts: Sequence[ShapePart], path: Path, record: Record) -> I
     places = {"transmitters": record.tx_pos_m, "receivers": np.stack([r.position_m for r in record.receivers])}
     solids = [(part.name, body) for part in parts for body in bodies(part.corners_m) if body.closed]
     for what, positions in places.items():
-        known = np.flatnonzero(np.isfinite(positions).all(axis=1))
-        floorless = without_floor(positions[known], np.concatenate([part.corners_m for part in parts]))
+        placed = np.flatnonzero(np.isfinite(positions).all(axis=1))
+        floorless = without_floor(positions[placed], np.concatenate([part.corners_m for part in parts]))
         # Few: else the scene has no floor, as a model of facades.
-        if TOLERATED_SHARE * len(known) < floorless.sum() < len(known) / 2:
+        if TOLERATED_SHARE * len(placed) < floorless.sum() < len(placed) / 2:
             text = f"{floorless.sum()} of {len(positions)} {what} inside the scene, first number "
-            text += f"{known[floorless.argmax()] + 1}, have no floor below"
+            text += f"{placed[floorless.argmax()] + 1}, have no floor below"
             remedy = "close the outer walls in the plan, or correct the positions; maps and plans leave such places out"
             yield Finding("no-floor", path, "", text, remedy)
         for name, body in solids:
             if np.ptp(body.bounds_m, axis=0).min() > THICKEST_SOLID_M:
                 continue
-            if rows := known[in_solid(positions[known], body.corners_m)].tolist():
+            if rows := placed[in_solid(positions[placed], body.corners_m)].tolist():
                 text = f"{len(rows)} of {len(positions)} {what} inside, first number {rows[0] + 1}"
                 yield Finding("device-inside", path, name, text, "correct the positions, or the scene's frame")
 

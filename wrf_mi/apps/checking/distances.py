@@ -33,14 +33,14 @@ def unlike_units(record: Record) -> NamedTexts:
     rows = np.linspace(0, len(record) - 1, min(len(record), MOST_ROWS)).astype(int)
     levels, places = levels_db(record)[surveyed][:, rows], places[surveyed]
     at_m = record.tx_pos_m[rows]
-    stated, _ = explained(levels, _distances_m(at_m, places))
+    stated_share, _ = explained(levels, _distances_m(at_m, places))
 
     # Factors of the unit of either end. A walk on a grid has its height in metres, anchors in feet have theirs in feet.
     scaled = [(factor, "positions of rows", at_m * [factor, factor, 1], places) for factor in FACTORS]
     scaled += [(factor, "positions of receivers", at_m, places * factor) for factor in FACTORS]
     fits = [(*explained(levels, _distances_m(rows_m, rx_m)), factor, what) for factor, what, rows_m, rx_m in scaled]
     share, exponent, factor, what = max(fits)
-    if max(factor, 1 / factor) < LEAST_FACTOR or 1 - share > UNEXPLAINED * (1 - stated):
+    if max(factor, 1 / factor) < LEAST_FACTOR or 1 - share > UNEXPLAINED * (1 - stated_share):
         return
     if not EXPONENTS[0] <= exponent <= EXPONENTS[1]:
         return
@@ -48,7 +48,7 @@ def unlike_units(record: Record) -> NamedTexts:
     # The unit that such a factor means.
     units = [name for unit, name in UNITS.items() if abs(np.log(factor / unit)) < UNIT_TOLERANCE]
     meaning = f"they are in {units[0]}" if units else "steps of a grid, or another unit"
-    evidence = f"distance explains {stated:.0%} of the variance of the signal strengths as stated, {share:.0%}"
+    evidence = f"distance explains {stated_share:.0%} of the variance of the signal strengths as stated, {share:.0%}"
     remedy = "state both in metres (data import: --units, --pitch, or columns such as x_ft)"
     yield "unlike-units", f"{what} are {factor:.3g} m per unit ({meaning}): {evidence} with that factor; {remedy}"
 
@@ -71,8 +71,8 @@ def explained(levels: FloatArray, distance_m: FloatArray) -> tuple[float, float]
     received = np.isfinite(levels)
     count = np.maximum(received.sum(axis=1, keepdims=True), 1)
     logs = np.where(received, 10 * np.log10(np.maximum(distance_m, NEAREST_M)), 0.0)
-    known = np.where(received, levels, 0.0)
-    x, y = (np.where(received, v - v.sum(axis=1, keepdims=True) / count, 0.0) for v in (logs, known))
+    filled_levels = np.where(received, levels, 0.0)
+    x, y = (np.where(received, v - v.sum(axis=1, keepdims=True) / count, 0.0) for v in (logs, filled_levels))
     covariance, spread, total = np.sum(x * y), np.sum(x * x), np.sum(y * y)
     if covariance >= 0 or spread == 0 or total == 0:
         return 0.0, 0.0

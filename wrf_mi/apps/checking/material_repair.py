@@ -49,12 +49,12 @@ class MaterialRepair:
         """BSDF that a part is to have; None where nothing says which material it is."""
         if part.name in self.of_shapes:
             return self._of_itu(part, self.of_shapes[part.name], "")
-        stated = {} if self.scene is None or part.shape is None else dict(self.scene.materials(part.shape))
-        for identifier, bsdf in stated.items():
+        bsdfs = {} if self.scene is None or part.shape is None else dict(self.scene.materials(part.shape))
+        for identifier, bsdf in bsdfs.items():
             radio = None if bsdf is None else self._radio(bsdf)
             if radio is not None:
                 return self._add(identifier or part.name, radio)
-        return self._by_name(part, [*stated, part.name or part.file.stem])
+        return self._by_name(part, [*bsdfs, part.name or part.file.stem])
 
     def _by_name(self, part: ShapePart, names: Sequence[str]) -> Element | None:
         """Material that one of some names means, or the default."""
@@ -88,8 +88,8 @@ class MaterialRepair:
 
     def _slab(self, bsdf: Element, material: str) -> Element:
         """A material of ITU-R P.2040 with its thickness, colour and scattering."""
-        stated = bsdf.find("float[@name='thickness']")
-        thickness_m = SIONNA_THICKNESS_M if stated is None else float(stated.get("value", "nan"))
+        thickness_element = bsdf.find("float[@name='thickness']")
+        thickness_m = SIONNA_THICKNESS_M if thickness_element is None else float(thickness_element.get("value", "nan"))
         of_kind = self.thickness_m.get(f"itu_{material}", thickness_m)
         slab = itu_bsdf(material, self.thickness_m.get(short_name(bsdf.get("id", "")), of_kind), self.frequency_hz)
         for colour in [each for each in bsdf.iter("rgb") if each.get("name") in COLOURS][:1]:

@@ -25,8 +25,8 @@ def check_plan(path: Path, name: str, units: str) -> SceneReport:
         name: name of the source in the report.
         units: unit of the coordinates of a DXF; m: that which it states.
     """
-    stated = "" if units == "m" else f" --units {units}"
-    command, height = f"wrf-mi mesh {path}{stated} --out SCENE", " --wall-height METRES"
+    units_option = "" if units == "m" else f" --units {units}"
+    command, height = f"wrf-mi mesh {path}{units_option} --out SCENE", " --wall-height METRES"
     try:
         plan = read_plan(path, units=None if units == "m" else units)
         is_town = isinstance(plan, Buildings)

@@ -198,8 +198,8 @@ def locate(source: str | Path) -> Source:
     if path.is_dir():
         return _folder(path)
     if not path.exists():
-        if known := scenes().get(str(source)):
-            return Source(known.xml, known.thickness_m)
+        if named_scene := scenes().get(str(source)):
+            return Source(named_scene.xml, named_scene.thickness_m)
         from sionna.rt import scene as shipped
 
         if isinstance(file := getattr(shipped, str(source), None), str) and file.endswith(".xml"):
@@ -233,9 +233,9 @@ def _folder(folder: Path) -> Source:
 
 def _of_file(scene: SceneXml, where: Source, carriers_hz: Sequence[float]) -> Iterator[Finding]:
     """Findings about a scene file, but for thicknesses that its folder states, and its materials at the carriers."""
-    stated = {f"<bsdf> mat-{material}" for material in where.thickness_m}
+    with_thickness = {f"<bsdf> mat-{material}" for material in where.thickness_m}
     for finding in xml_findings(scene):
-        if finding.kind != "default-thickness" or finding.shape not in stated:
+        if finding.kind != "default-thickness" or finding.shape not in with_thickness:
             yield finding
     yield from _ranges(scene, carriers_hz)
 
@@ -263,15 +263,17 @@ def _carriers(record: Record | None) -> list[float]:
     """Carriers of data in Hz; none where they state none."""
     if record is None:
         return []
-    stated = record.carriers_hz if record.carriers_hz is not None else record.frequencies_hz
-    return [] if stated is None or not len(stated) else [float(np.min(stated)), float(np.max(stated))]
+    carriers_hz = record.carriers_hz if record.carriers_hz is not None else record.frequencies_hz
+    return (
+        [] if carriers_hz is None or not len(carriers_hz) else [float(np.min(carriers_hz)), float(np.max(carriers_hz))]
+    )
 
 
 def _ranges(scene: SceneXml, carriers_hz: Sequence[float]) -> Iterator[Finding]:
     """Materials of ITU-R P.2040 that are not known at the carriers, by shape."""
     for name, shape in scene.shapes:
-        known = {itu_type(bsdf) for _, bsdf in scene.materials(shape) if bsdf is not None}
-        for material in filter(None, known):
+        itu_types = {itu_type(bsdf) for _, bsdf in scene.materials(shape) if bsdf is not None}
+        for material in filter(None, itu_types):
             kind, hz = _range(material, carriers_hz or [SIONNA_HZ])
             if kind:
                 text = f"{material} is not known at {hz / 1e9:g} GHz"
@@ -314,8 +316,8 @@ def _coordinates(
     yield from wrong or ([] if frame.up else _up(sampled(corners), path))
     mesh = Surface("", "other", corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
     if path.suffix.lower() != ".xml" and not path.is_dir() and is_measured([mesh]):
-        stated = frame.up or path.suffix.lower() in STATING_UP
-        up = f" --up {frame.up}" if frame.up else "" if stated else " --up y, or --up z"
+        states_up = frame.up or path.suffix.lower() in STATING_UP
+        up = f" --up {frame.up}" if frame.up else "" if states_up else " --up y, or --up z"
         command = f"wrf-mi mesh {path} --out SCENE{up}"
         text = "faces are uneven as those of a phone's scan, and have few reflections"
         yield Finding("uneven", path, "", text, f"make planes of them: {command}")
@@ -366,10 +368,10 @@ def _check_scan(path: Path, name: str, frame: Frame) -> SceneReport:
 
 def _of_points(points: FloatArray, path: Path, frame: Frame) -> Iterator[Finding]:
     """Findings about units, the axis that is up, and steps of points [n, 3]; with all for which a scene is refused."""
-    stated = stated_units(path)
-    if other := set(stated) - {frame.units}:
-        text = f"{units_text(stated)}, and is read in {frame.units}"
-        yield Finding("stated-units", path, "", text, units_remedy(stated))
+    units = stated_units(path)
+    if other := set(units) - {frame.units}:
+        text = f"{units_text(units)}, and is read in {frame.units}"
+        yield Finding("stated-units", path, "", text, units_remedy(units))
     doubts = list(_units(points, path, BUILDING))
     if not doubts or "units" not in {doubt.kind for doubt in doubts}:
         doubts = [*_refused(check_extent, "units", points, path)] or doubts

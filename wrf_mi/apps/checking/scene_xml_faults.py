@@ -146,17 +146,17 @@ def is_itu(identifier: str) -> bool:
     return identifier.removeprefix(DASH)[:4] in ("itu_", "itu-")
 
 
-def _file(scene: SceneXml, name: str, stated: str) -> Iterator[Finding]:
+def _file(scene: SceneXml, name: str, file_name: str) -> Iterator[Finding]:
     try:
-        file = inside(scene.path.parent, stated, scene.path)
+        file = inside(scene.path.parent, file_name, scene.path)
     except InputError:
-        text = f"{stated[:MOST_NAME]!r} is not in the folder of the scene"
+        text = f"{file_name[:MOST_NAME]!r} is not in the folder of the scene"
         yield Finding("outside-folder", scene.path, name, text, "copy the file there and name it so")
         return
     if not file.is_file():
-        other = similar_file(scene.path.parent, stated)
+        other = similar_file(scene.path.parent, file_name)
         also = "" if other is None else f", but {other.relative_to(scene.path.parent).as_posix()} is"
-        text = f"{stated[:MOST_NAME]!r} is not in its place{also}"
+        text = f"{file_name[:MOST_NAME]!r} is not in its place{also}"
         yield Finding("missing-file", scene.path, name, text, "correct the name (with / between folders)")
 
 
@@ -217,10 +217,10 @@ def bsdf_findings(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Findin
 
 def stated_itu(bsdf: Element) -> str:
     """Material of ITU-R P.2040 that a BSDF states by its type or id, without ``itu_``."""
-    stated = bsdf.find("string[@name='type']")
+    type_element = bsdf.find("string[@name='type']")
     identifier = bsdf.get("id", "")
     named = identifier.removeprefix(DASH)[4:] if is_itu(identifier) else ""
-    return named if stated is None else stated.get("value", "")
+    return named if type_element is None else type_element.get("value", "")
 
 
 def itu_type(bsdf: Element) -> str | None:
@@ -244,17 +244,17 @@ def _itu(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Finding]:
 
 def _values(scene: SceneXml, where: str, bsdf: Element) -> Iterator[Finding]:
     """Numbers of a radio material that are out of bounds, and parameters that it does not have."""
-    stated = {child.get("name", ""): child.get("value", "") for child in bsdf if child.tag in ("float", "string")}
-    stated = {name: text for name, text in stated.items() if name not in SCATTERING}
+    values = {child.get("name", ""): child.get("value", "") for child in bsdf if child.tag in ("float", "string")}
+    values = {name: text for name, text in values.items() if name not in SCATTERING}
     if bsdf.get("type") == "itu-radio-material":
-        stated.pop("type", None)
-    elif "relative_permittivity" not in stated:
+        values.pop("type", None)
+    elif "relative_permittivity" not in values:
         remedy = "state relative_permittivity and conductivity (S/m)"
         yield Finding("no-constants", scene.path, where, "no relative permittivity: that of air is taken", remedy)
-    for name, text in stated.items():
+    for name, text in values.items():
         value = number(text)
         if value is None or value < LEAST.get(name, np.inf):
-            remedy = f"Sionna RT takes {', '.join(f'{known} {least:g}..' for known, least in LEAST.items())}"
+            remedy = f"Sionna RT takes {', '.join(f'{parameter} {least:g}..' for parameter, least in LEAST.items())}"
             yield Finding("material-values", scene.path, where, f"{name} is {text[:40]!r}", remedy)
 
 
@@ -277,9 +277,9 @@ def _shape(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]:
         text = f"a {plugin}, and Sionna RT traces triangles alone"
         yield Finding("shape-type", path, name, text, "--repair makes a mesh of it")
     yield from _parameters(scene, name, shape)
-    stated = scene.file_of(shape)
-    if plugin in ("ply", "obj") and stated and "$" not in stated and not stated.lower().endswith(f".{plugin}"):
-        text = f"of type {plugin!r}, with the file {stated[-60:]!r}"
+    file_name = scene.file_of(shape)
+    if plugin in ("ply", "obj") and file_name and "$" not in file_name and not file_name.lower().endswith(f".{plugin}"):
+        text = f"of type {plugin!r}, with the file {file_name[-60:]!r}"
         yield Finding("mesh", path, name, text, "give a file of that type, converted if need be")
 
 
@@ -287,14 +287,14 @@ def _parameters(scene: SceneXml, name: str, shape: Element) -> Iterator[Finding]
     """Parameters of a shape that it does not have, or that are missing or stated twice."""
     path, plugin = scene.path, shape.get("type", "")
     names = [scene.parameter(child) for child in shape if child.tag in VALUES and child.tag != "ref"]
-    known = (*PARAMETERS[plugin], *ALL_SHAPES)
-    for stated, count in Counter(names).items():
-        if stated not in known:
-            remedy = f"remove it, or write it as {', '.join(known)}"
-            yield Finding("unknown-parameter", path, name, f"no {plugin} has the parameter {stated[:40]!r}", remedy)
+    parameters = (*PARAMETERS[plugin], *ALL_SHAPES)
+    for parameter, count in Counter(names).items():
+        if parameter not in parameters:
+            remedy = f"remove it, or write it as {', '.join(parameters)}"
+            yield Finding("unknown-parameter", path, name, f"no {plugin} has the parameter {parameter[:40]!r}", remedy)
         elif count > 1:
-            yield Finding("parameter", path, name, f"the parameter {stated!r} is stated twice", "remove one of both")
-    if "filename" in known and "filename" not in names:
+            yield Finding("parameter", path, name, f"the parameter {parameter!r} is stated twice", "remove one of both")
+    if "filename" in parameters and "filename" not in names:
         yield Finding("parameter", path, name, "has no file", 'give one: <string name="filename" value="..."/>')
 
 

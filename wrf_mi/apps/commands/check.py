@@ -49,12 +49,12 @@ def check_command(a: Arguments) -> int:
     return exit_status(report.ok, a.strict and report.of_level("warning"))
 
 
-def _materials(stated: list[str]) -> dict[str, Any]:
+def _materials(texts: list[str]) -> dict[str, Any]:
     """Material of shapes that have none, and those of single shapes."""
     from ...core import InputError
 
-    others = [text for text in stated if "=" not in text]
+    others = [text for text in texts if "=" not in text]
     if len(others) > 1:
         raise InputError(f"check: --material {' and '.join(others)}; give one, and SHAPE=NAME for single shapes")
-    of_shapes = dict(text.rsplit("=", 1) for text in stated if "=" in text)
+    of_shapes = dict(text.rsplit("=", 1) for text in texts if "=" in text)
     return {"material": others[0] if others else None, "shape_materials": of_shapes}

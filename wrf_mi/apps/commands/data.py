@@ -148,11 +148,11 @@ def import_command(a: Arguments) -> int:
 
 def _of_many_files(notes: Sequence[str]) -> list[str]:
     """Notes without those that differ from `MOST_ALIKE` others in the name of their file and in numbers alone."""
-    seen, shown = Counter[str](), list[str]()
+    counts, shown = Counter[str](), list[str]()
     for note in notes:
         kind = re.sub(r"\d[\d.,]*", "#", note.partition(": ")[2])
-        seen[kind] += 1
-        shown += [note] * (not kind or seen[kind] <= MOST_ALIKE)
+        counts[kind] += 1
+        shown += [note] * (not kind or counts[kind] <= MOST_ALIKE)
     more = len(notes) - len(shown)
     return shown + [f"import.yml has {more} more notes of this kind on other files"] * bool(more)
 

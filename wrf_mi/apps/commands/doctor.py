@@ -86,9 +86,9 @@ def _missing_of_extras() -> dict[str, list[str]]:
         requirement = Requirement(line)
         for extra in EXTRAS:
             if requirement.marker and requirement.marker.evaluate({"extra": extra}):
-                known = missing.setdefault(extra, [])
+                missing_of_extra = missing.setdefault(extra, [])
                 if not requirement.marker.evaluate({"extra": ""}) and installed_version(requirement.name) is None:
-                    known.append(requirement.name)
+                    missing_of_extra.append(requirement.name)
     return missing
 
 

@@ -55,8 +55,8 @@ def _run(arguments: Sequence[str] | None) -> int:
             print(f"wrf-mi: {_noted('interrupted', error)}", file=sys.stderr)
             return INTERRUPTED
         # Errors of this package have an exit status and a message of one line; any other keeps its traceback.
-        known = {InputError: 2, OSError: 2, BackendError: 1}
-        statuses = (status for kind, status in known.items() if isinstance(error, kind))
+        status_of_kind = {InputError: 2, OSError: 2, BackendError: 1}
+        statuses = (status for kind, status in status_of_kind.items() if isinstance(error, kind))
         exit_status = next(statuses, getattr(error, "exit_status", None))
         if exit_status is None:
             raise

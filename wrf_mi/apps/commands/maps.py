@@ -183,11 +183,11 @@ def _summary(figures: dict[str, Any]) -> str:
         text += f"hold {held_out['inside']:.0%} of them, so that those of {figures['level']:.0%} of the positions have "
         text += f"{figures['region_mass']:.0%}"
     level = f"{figures['level']:.0%}"
-    known = {f"area of the {level} region (m2)": figures["area_m2"], f"radius of {level} (m)": figures["radius_m"]}
-    known["error (m)"] = figures.get("error_m")
+    columns = {f"area of the {level} region (m2)": figures["area_m2"], f"radius of {level} (m)": figures["radius_m"]}
+    columns["error (m)"] = figures.get("error_m")
     if "neighbours" in figures:
-        known[f"error of {figures['neighbours']['count']} nearest neighbours (m)"] = figures.get("neighbours_error_m")
-    text += "\n" + summary_table(f"{figures['n']} positions", known, 2)
+        columns[f"error of {figures['neighbours']['count']} nearest neighbours (m)"] = figures.get("neighbours_error_m")
+    text += "\n" + summary_table(f"{figures['n']} positions", columns, 2)
     if "inside" in figures:
         text += f"\n{figures['inside']:.0%} of the true positions lie inside the {level} regions"
     if "gain_on_neighbours_m" in figures:

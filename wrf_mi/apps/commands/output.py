@@ -72,11 +72,11 @@ def show_metrics(metrics: dict[str, Any], folder: Path | None, as_json: bool, mo
     costs = {"train_seconds": "trained {:.0f} s", "ms_per_sample": "{:.3g} ms per sample"}
     costs |= {"peak_memory_mb": "peak memory {:.0f} MB"}
     # Models of other programs need not state theirs.
-    known = [form.format(metrics[key]) for key, form in costs.items() if math.isfinite(metrics[key])]
+    cost_texts = [form.format(metrics[key]) for key, form in costs.items() if math.isfinite(metrics[key])]
     of_folds, folds = rows_of_folds(metrics.get("n_train_of_folds", ())), metrics.get("cross_validated")
     # With the split "none" the model is fitted to all rows.
     rows = of_folds if of_folds and not folds else f"{metrics['n_train']} training rows"
-    print(", ".join([f"split {metrics['split']}", rows, *known]))
+    print(", ".join([f"split {metrics['split']}", rows, *cost_texts]))
     if folds:
         print(
             f"scores are cross-validated: each row is predicted by a fit to the other {folds['folds'] - 1} of "
@@ -126,8 +126,10 @@ def _show_stages(reports: list[dict[str, Any]], label: str, weighed: dict[str, f
 
     ``weighed`` are the scores by which the hybrid chose weights, after all stages of the scene were chosen.
     """
-    known = ("held_out", "held-out rows", ".3f"), ("test", "test rows", ".3f"), ("seconds", "seconds", ".1f")
-    columns = [each for each in (*known, ("ms", "ms", ".3g")) if any(row.get(each[0]) is not None for row in reports)]
+    usual_columns = ("held_out", "held-out rows", ".3f"), ("test", "test rows", ".3f"), ("seconds", "seconds", ".1f")
+    columns = [
+        each for each in (*usual_columns, ("ms", "ms", ".3g")) if any(row.get(each[0]) is not None for row in reports)
+    ]
     print(f"{'stages up to, mean ' + label:<34}" + "".join(f"{title:>15}" for _, title, _ in columns))
     for report in reports:
         cells = [f"{report[key]:{form}}" if report.get(key) is not None else "" for key, _, form in columns]

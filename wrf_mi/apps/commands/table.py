@@ -54,11 +54,11 @@ def add_entry_command(a: Arguments) -> int:
     from ..table.entries import read_entry
 
     names = [name.replace("-", "_") for name in (*ABOUT, *COSTS)]
-    stated = {name: getattr(a, name) for name in names if getattr(a, name) is not None}
+    facts = {name: getattr(a, name) for name in names if getattr(a, name) is not None}
     if (Path(a.predictions) / CONFIG).exists():
         refuse(a, ("split", "n_train", "seed"), "is stated by the run folder")
     rows = {"split": a.split or "official", "n_train": a.n_train, "seed": a.seed or 0, "replace": a.replace}
-    path = add_entry(Path(a.table), a.predictions, a.dataset, a.method, **rows, **stated)
+    path = add_entry(Path(a.table), a.predictions, a.dataset, a.method, **rows, **facts)
     entry = read_entry(path)
     scores = ", ".join(f"{key} {value:.4g}" for key, value in entry.score.items())
     return show(a.json, {"entry": str(path), "score": dict(entry.score)}, f"{entry.of.label}: {scores}\nentry: {path}")
@@ -82,9 +82,9 @@ def dataset_command(a: Arguments) -> int:
     """Write the file of a data set of the table."""
     from ..table.sources import add_source
 
-    stated: dict[str, Any] = {"licence": a.licence, "origin": a.origin, "get": a.get, "building": a.building}
-    stated["redistributable"] = not a.not_redistributable
-    path = add_source(Path(a.table), a.dataset, a.name, a.split or ["official"], **stated)
+    facts: dict[str, Any] = {"licence": a.licence, "origin": a.origin, "get": a.get, "building": a.building}
+    facts["redistributable"] = not a.not_redistributable
+    path = add_source(Path(a.table), a.dataset, a.name, a.split or ["official"], **facts)
     return show(a.json, {"file": str(path)}, f"data set: {path}")
 
 

@@ -153,7 +153,7 @@ def _show_settings() -> int:
     for name, model in MODELS.items():
         for data, kind in model.settings_by_data().items():
             names.setdefault(kind, []).append(f"{name}, {data}" if data else name)
-    print("\n".join(f"{'; '.join(known)}:\n{describe(kind())}\n" for kind, known in names.items()))
+    print("\n".join(f"{'; '.join(labels)}:\n{describe(kind())}\n" for kind, labels in names.items()))
     return 0
 
 

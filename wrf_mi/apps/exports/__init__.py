@@ -72,8 +72,8 @@ def export(source: str | Path, format: str, out: str | Path, options: ExportOpti
         raise InputError(f"format {format!r}: unknown; choose from {', '.join(FORMATS)}")
     from .source import Source, Write, kinds_of  # imports tracer and models, which the list of formats does without
 
-    form, stated = FORMATS[format], options or ExportOptions()
-    form.check(Path(out), stated)
+    form, chosen_options = FORMATS[format], options or ExportOptions()
+    form.check(Path(out), chosen_options)
     kinds = kinds_of(source)
     kind = next((kind for kind in kinds if kind in form.kinds), None)
     if kind is None:
@@ -81,7 +81,7 @@ def export(source: str | Path, format: str, out: str | Path, options: ExportOpti
         text = f"{source}: a {' and '.join(kinds)}; format {format} takes a {' or a '.join(form.kinds)}"
         raise InputError(f"{text}; choose from {', '.join(others)}")
     write: Write = resolve(form.writer) if isinstance(form.writer, str) else form.writer
-    return write(Source(str(source), kind), Path(out), stated)
+    return write(Source(str(source), kind), Path(out), chosen_options)
 
 
 def export_run(folder: str | Path, format: str, out: str | Path, **options: Any) -> dict[str, Any]:

@@ -45,14 +45,14 @@ def field_of(run: Run) -> FittedField:
 
 
 def _log_carrier(run: Run, field: FittedField, frequency_hz: float | None) -> float:
-    known = field.form.carriers_hz
-    if known is None:
+    carriers_hz = field.form.carriers_hz
+    if carriers_hz is None:
         if frequency_hz is not None:
             raise InputError(f"{run.folder}: its data have one carrier; omit --frequency")
         return 0.0
-    if frequency_hz is None or frequency_hz not in known:
-        raise InputError(f"{run.folder}: trained with {carriers_text(known)}; give one of them as --frequency HZ")
-    return field.predictor.graph.log_carrier(int(np.searchsorted(known, frequency_hz))) or 0.0
+    if frequency_hz is None or frequency_hz not in carriers_hz:
+        raise InputError(f"{run.folder}: trained with {carriers_text(carriers_hz)}; give one of them as --frequency HZ")
+    return field.predictor.graph.log_carrier(int(np.searchsorted(carriers_hz, frequency_hz))) or 0.0
 
 
 def splat_columns(gaussians: Gaussians) -> dict[str, FloatArray]:

@@ -62,8 +62,8 @@ def traced_paths(source: Source, options: ExportOptions) -> TraceResult:
     ends = {"--tx": options.tx_pos_m, "--rx": options.rx_pos_m, "--frequency": options.frequency_hz}
     if source.kind == RUN:
         more = {"--material": options.material, "--paths": options.kinds, "--depth": options.depth}
-        if stated := [name for name, value in (ends | more).items() if value is not None]:
-            raise InputError(f"{source.name}: a run, whose paths are traced; omit {stated[0]}, or give its scene")
+        if unused := [name for name, value in (ends | more).items() if value is not None]:
+            raise InputError(f"{source.name}: a run, whose paths are traced; omit {unused[0]}, or give its scene")
         return source.trace()
     return _traced_now(source, ends, options)
 

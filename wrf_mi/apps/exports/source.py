@@ -93,8 +93,8 @@ def kinds_of(name: str | Path) -> tuple[str, ...]:
     else:
         kinds = {SCENE: text in scenes(), DATASET: text in {dataset.name for dataset in KNOWN}}
     if not any(kinds.values()):
-        known = ", ".join(scenes())
-        ways = f"a run folder, a scene (a folder, XML, mesh, or of {known}) or a data set (`wrf-mi data list`)"
+        scene_names = ", ".join(scenes())
+        ways = f"a run folder, a scene (a folder, XML, mesh, or of {scene_names}) or a data set (`wrf-mi data list`)"
         what = "a file of another kind" if path.exists() else "no such file or name"
         raise InputError(f"{name}: {what}; give {ways}")
     return tuple(kind for kind, fits in kinds.items() if fits)

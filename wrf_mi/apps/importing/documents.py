@@ -71,13 +71,13 @@ def _rows(node: Any, around: Row, is_row: Any) -> Iterator[Row]:
             name = "bssid" if MAC.fullmatch(str(key)) and "bssid" not in around else "key"
             yield from _rows(value, around | {name: key}, is_row)
         return
-    own: Row = around | _point(node)
+    node_fields: Row = around | _point(node)
     for name, value in node.items():
         if not isinstance(value, dict | list):
-            own[str(name)] = value
-    outer = {name: value for name, value in own.items() if not _is_reading({name: value})}
+            node_fields[str(name)] = value
+    outer = {name: value for name, value in node_fields.items() if not _is_reading({name: value})}
     inner = [row for name, value in node.items() for row in _rows(_named_values(name, value), outer, is_row)]
-    yield from inner or ([own] if is_row(node) else [])
+    yield from inner or ([node_fields] if is_row(node) else [])
 
 
 def _point(node: Mapping[Any, Any]) -> Row:

@@ -181,9 +181,9 @@ def _of_program(table: Table, as_is: bool) -> Table:
         notes = (*table.notes, f"{file.name}: columns of {program.name}")
         return replace(table, frame=frame, columns=program.columns, notes=notes)
     if not as_is and (parts := cell_parts(list(frame.columns))):
-        known = frame[parts].notna().all(axis=1)
+        complete = frame[parts].notna().all(axis=1)
         texts = frame[parts].astype("string").apply(lambda column: column.str.strip().map(plain_id, na_action="ignore"))
-        identity = texts[parts[0]].str.cat(texts[parts[1:]], sep="-").where(known)
+        identity = texts[parts[0]].str.cat(texts[parts[1:]], sep="-").where(complete)
         notes = (*table.notes, f"{file.name}: a cell is told by {', '.join(parts)} together")
         return replace(table, frame=frame.assign(**{CELL: identity}), columns={"id": CELL}, notes=notes)
     return replace(table, frame=frame)
@@ -326,8 +326,8 @@ def _chosen_table(
     counts = {name: len(lines) - 1 for name, lines in tables.items()}
     if len(tables) == 1:
         return rows, ""
-    known = [name for name, lines in tables.items() if program_of(fields.split_line(lines[0][1], ","))]
-    name = _chosen_sheet(path, counts, sheet or (known[0] if known else ""))
+    program_sheets = [name for name, lines in tables.items() if program_of(fields.split_line(lines[0][1], ","))]
+    name = _chosen_sheet(path, counts, sheet or (program_sheets[0] if program_sheets else ""))
     others = listed([f"{one_line(other)} ({counts[other]} rows)" for other in tables if other != name])
     return tables[name], f"; tables that are left out, by their first column (--sheet): {others}"
 

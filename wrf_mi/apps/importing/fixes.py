@@ -27,14 +27,14 @@ def without_stale(table: Table, stated: Mapping[str, str]) -> Table:
     of = named_columns(list(table.frame.columns), dict(stated))
     if not {"time", "seen"} <= of.keys():
         return table
-    written, seen = (seconds(table, of[name], may_be_empty=True) for name in ("time", "seen"))
-    age_s = (written - seen) / ticks(written)
+    written, last_seen = (seconds(table, of[name], may_be_empty=True) for name in ("time", "seen"))
+    age_s = (written - last_seen) / ticks(written)
     file, name = table.files[0][0].name, of["seen"]
     if np.isfinite(age_s).any() and abs(float(np.nanmedian(age_s))) > CLOCKS_S:
         return replace(table, notes=(*table.notes, f"{file}: {name} is of another clock than {of['time']}: not used"))
     stale = age_s > STALE_S
-    note = f"{file}: {np.count_nonzero(stale)} of {np.isfinite(seen).sum()} readings were cached, older than"
-    times = np.where(np.isfinite(seen), seen, written)[~stale]
+    note = f"{file}: {np.count_nonzero(stale)} of {np.isfinite(last_seen).sum()} readings were cached, older than"
+    times = np.where(np.isfinite(last_seen), last_seen, written)[~stale]
     frame = table.frame[~stale].assign(**{of["time"]: times})
     return replace(table, frame=frame, notes=(*table.notes, f"{note} {STALE_S:g} s ({name}): left out"))
 
@@ -99,5 +99,5 @@ def _interpolated(table: Table, of: Mapping[str, str], is_fix: NDArray[np.bool_]
     text += f" between them in time, at most {gap / ticks(time_s):.3g} s apart"
     if outside := int(np.count_nonzero(heard & ~within)):
         text += f"; {outside} readings before or after them are left out"
-    stated = {of["floor"]: floors} if "floor" in of else {}
-    return replace(table, frame=table.frame.assign(**values, **stated)[within], notes=(*table.notes, text))
+    floor_column = {of["floor"]: floors} if "floor" in of else {}
+    return replace(table, frame=table.frame.assign(**values, **floor_column)[within], notes=(*table.notes, text))

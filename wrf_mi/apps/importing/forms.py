@@ -135,9 +135,9 @@ def _refuse_pooling(table: Table, columns: Columns, receivers: Sequence[str]) ->
     """Refuse columns of strengths of several receivers, which another column names."""
     if not columns.strengths or receivers:
         return
-    strength, of, one = next(iter(columns.strengths)), columns.of, len(columns.strengths) == 1
+    strength, of, is_single = next(iter(columns.strengths)), columns.of, len(columns.strengths) == 1
     tellers = [name for name in columns.kept if _tells_receivers(table, name)]
-    if not one:
+    if not is_single:
         tellers = [name for name in tellers if _has_addresses(table, name) and table.frame[name].nunique() > 1]
     elif not tellers:  # names that differ from row to row at one place
         pair = next((pair for pair in (("x", "y"), ("lon", "lat")) if set(pair) <= of.keys()), ())
@@ -146,9 +146,9 @@ def _refuse_pooling(table: Table, columns: Columns, receivers: Sequence[str]) ->
         tellers = [name for name in texts if keys and table.frame.groupby(keys)[name].nunique().median() > 1]
     if tellers:
         text = f"{one_line(tellers[0])} has names, {one_line(strength)} strengths"
-        stated = of | {"id": tellers[0], "rssi": strength}
-        other = f"--receivers {shlex.quote(strength)}" if one else f"--columns run={tellers[0]} (what moved)"
-        remedy = f"give --columns {suggested_columns(table, stated)}, or {one_line(other)}"
+        suggested = of | {"id": tellers[0], "rssi": strength}
+        other = f"--receivers {shlex.quote(strength)}" if is_single else f"--columns run={tellers[0]} (what moved)"
+        remedy = f"give --columns {suggested_columns(table, suggested)}, or {one_line(other)}"
         raise DataFault(table.files[0][0], f"{text}: readings of several receivers, or of one; {remedy}", line=1)
 
 

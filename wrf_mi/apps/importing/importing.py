@@ -123,8 +123,8 @@ class _Import:
 
     def __init__(self, files: Sequence[str | Path], out: Path, options: ImportOptions) -> None:
         self.out, self.options, self.notes = out, options, list[str]()
-        stated = options.columns
-        self.stated = parsed_columns(stated) if isinstance(stated, str) else dict(stated)
+        columns = options.columns
+        self.stated = parsed_columns(columns) if isinstance(columns, str) else dict(columns)
         self.table, self.is_test = self._read(files)
         if "cell" in self.stated:
             self.table = with_cells(self.table, self.stated["cell"])
@@ -364,8 +364,8 @@ class _Import:
         carriers = [self.carrier_of.get(name, receiver.frequency_hz) for name, receiver in pairs]
         if None in carriers or options.frequency_hz:  # one carrier for all
             carriers = [None] * len(carriers)
-        stated = zip(receivers, carriers, strict=True)
-        return tuple(dataclasses.replace(receiver, frequency_hz=hz) for receiver, hz in stated), notes
+        with_carriers = zip(receivers, carriers, strict=True)
+        return tuple(dataclasses.replace(receiver, frequency_hz=hz) for receiver, hz in with_carriers), notes
 
     def _record(self, means: Means, position_m: FloatArray, receivers: tuple[Receiver, ...]) -> Record:
         averaged = bool((means.count > 1).any())
@@ -374,8 +374,8 @@ class _Import:
             text = f"{means.count.sum()} readings at {len(position_m)} places are averaged in {what}, up to {most} each"
             self.notes.append(f"{text}; count_ and std_ are their number and the noise of the mean")
         carrier_hz = self.options.frequency_hz or CARRIER_HZ
-        stated = "frequency" in self.columns.of or receivers[0].frequency_hz
-        if not self.options.frequency_hz and not stated:
+        states_carrier = "frequency" in self.columns.of or receivers[0].frequency_hz
+        if not self.options.frequency_hz and not states_carrier:
             self.notes.append(f"no carrier is stated: {carrier_hz:.4g} Hz (--frequency)")
         return Record(
             name=self.out.name,
@@ -404,8 +404,8 @@ class _Import:
 
 def _test_rows(table: Table, column: str) -> NDArray[np.bool_]:
     words = table.frame[column].astype(str).str.strip().str.lower().to_numpy(str)
-    known = np.isin(words, (*TRAIN_WORDS, *TEST_WORDS))
-    if len(wrong := np.flatnonzero(~known)):
+    valid = np.isin(words, (*TRAIN_WORDS, *TEST_WORDS))
+    if len(wrong := np.flatnonzero(~valid)):
         text = f"{one_line(column)} is {one_line(words[wrong[0]])!r}; give train or test, or --columns split=-"
         raise table.fault(text, int(wrong[0]))
     return np.isin(words, TEST_WORDS)

@@ -255,10 +255,10 @@ def with_positions(values: Table, positions: Table, stated: Mapping[str, str]) -
     positions = _with_names(positions, stated)
     if FILE in positions.frame and FILE not in values.frame:  # a place for each file
         path = values.files[0][0]
-        known = positions.frame[FILE].astype(str).str.strip()
-        named = path.name if (known == path.name).any() else path.stem
-        if not (known == named).any():
-            text = f"no row has {FILE} {one_line(path.name)} ({one_line(listed(known))})"
+        file_names = positions.frame[FILE].astype(str).str.strip()
+        named = path.name if (file_names == path.name).any() else path.stem
+        if not (file_names == named).any():
+            text = f"no row has {FILE} {one_line(path.name)} ({one_line(listed(file_names))})"
             raise DataFault(positions.files[0][0], f"{text}; give a row for each file")
         values = replace(values, frame=values.frame.assign(**{FILE: named}))
     in_values, in_positions = list(values.frame.columns), list(positions.frame.columns)
@@ -299,10 +299,10 @@ def _row_by_row(values: Table, positions: Table, new: Sequence[str]) -> Table:
     return replace(values, frame=package("pandas").concat([free, positions.frame[new]], axis=1))
 
 
-def _with_names(positions: Table, stated: Mapping[str, str]) -> Table:
+def _with_names(positions: Table, column_of: Mapping[str, str]) -> Table:
     """Columns of a file without header that are not stated: x, y, and a third one that is the floor or z."""
     columns = list(positions.frame.columns)
-    if positions.has_header or len(columns) not in (2, 3) or set(columns) & set(stated.values()):
+    if positions.has_header or len(columns) not in (2, 3) or set(columns) & set(column_of.values()):
         return positions
     names = ["x", "y"]
     if len(columns) == 3:
@@ -322,14 +322,14 @@ def _looked_up(values: Table, positions: Table, key: str, new: Sequence[str]) ->
 
 
 def _interpolated(values: Table, time: str, positions: Table, other: str, new: Sequence[str]) -> tuple[Table, str]:
-    at, known = (times / ticks(times) for times in (seconds(values, time), seconds(positions, other)))
-    within = (at >= np.nanmin(known)) & (at <= np.nanmax(known))
+    at, position_times = (times / ticks(times) for times in (seconds(values, time), seconds(positions, other)))
+    within = (at >= np.nanmin(position_times)) & (at <= np.nanmax(position_times))
     outside = len(at) - np.count_nonzero(within)
     if outside > MOST_OUTSIDE * len(at):
         what = f"its time is outside those of {positions.files[0][0].name}, as those of {outside} rows are"
         raise values.fault(f"{what}; give both in one unit and time zone", int(np.argmin(within)))
-    order = np.argsort(known, kind="stable")
-    columns = {name: np.interp(at, known[order], positions.numbers(name)[order]) for name in new}
+    order = np.argsort(position_times, kind="stable")
+    columns = {name: np.interp(at, position_times[order], positions.numbers(name)[order]) for name in new}
     text = f"; {outside} rows before or after them are left out" if outside else ""
     return replace(values, frame=values.frame.assign(**columns)[within]), f"by time, linear between positions{text}"
 

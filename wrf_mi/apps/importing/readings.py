@@ -213,11 +213,11 @@ def further_columns(table: Table, columns: Columns, place: IntArray) -> dict[str
 
 def _means(values: FloatArray, place: IntArray, places: int | None = None) -> FloatArray:
     """Means over the rows of each place, NaN without a number."""
-    known = ~np.isnan(values)
+    present = ~np.isnan(values)
     size = int(place.max()) + 1 if places is None else int(places)
     with np.errstate(invalid="ignore"):
-        total = np.bincount(place[known], values[known], minlength=size)
-        return np.asarray(total / np.bincount(place[known], minlength=size))
+        total = np.bincount(place[present], values[present], minlength=size)
+        return np.asarray(total / np.bincount(place[present], minlength=size))
 
 
 def _of_places(table: Table, name: str, place: IntArray) -> NDArray[Any]:

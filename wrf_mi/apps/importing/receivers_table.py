@@ -49,12 +49,12 @@ def read_receivers(
         return tuple(unknown.values()), [text]
     measured = _measured(ids)
     table = _measured_cells(table, measured) if CELL in table.frame else _with_ids(table)
-    stated = _stated(table, frame, units, height_m, measured)
-    if not unknown.keys() & stated.keys():
-        text = f"none of its ids ({listed(list(stated))}) is measured ({listed(list(ids))})"
+    table_receivers = _stated(table, frame, units, height_m, measured)
+    if not unknown.keys() & table_receivers.keys():
+        text = f"none of its ids ({listed(list(table_receivers))}) is measured ({listed(list(ids))})"
         raise DataFault(table.files[0][0], f"{text}; give the ids of the measurements, or omit --anchors")
-    receivers = unknown | {name: receiver for name, receiver in stated.items() if name in unknown}
-    notes = _notes(table, receivers, stated)
+    receivers = unknown | {name: receiver for name, receiver in table_receivers.items() if name in unknown}
+    notes = _notes(table, receivers, table_receivers)
     if "z" not in named_columns(list(table.frame.columns), {}):
         notes.append(f"{table.files[0][0].name}: no column z, so receivers are {height_m:g} m above the floor")
     return tuple(receivers.values()), notes
@@ -92,7 +92,7 @@ def _parts(name: str) -> set[str]:
     return {part for part in re.split(r"\s*[;|]\s*", name) if part}
 
 
-def _notes(table: Table, receivers: Mapping[str, Receiver], stated: Mapping[str, Receiver]) -> list[str]:
+def _notes(table: Table, receivers: Mapping[str, Receiver], table_receivers: Mapping[str, Receiver]) -> list[str]:
     """What the table lacks, and what of it is not used."""
     of = named_columns(list(table.frame.columns), {})
     used = ["id", *map(of.get, ("x", "y", "z", "lat", "lon")), *POSES]
@@ -100,7 +100,7 @@ def _notes(table: Table, receivers: Mapping[str, Receiver], stated: Mapping[str,
     groups = {
         "columns that are not used": [name for name in table.frame.columns if name not in used],
         "receivers without position, which train estimates": lacking,
-        "receivers that are not in the measurements": [name for name in stated if name not in receivers],
+        "receivers that are not in the measurements": [name for name in table_receivers if name not in receivers],
     }
     file = table.files[0][0].name
     return [f"{file}: {what} ({len(names)}): {listed(names)}" for what, names in groups.items() if names]

@@ -113,8 +113,10 @@ def radio_map(
     maps_package("xarray")
     task = opened.problem.record.task
     _check(opened, task, height_m, transmit_dbm, threshold_dbm)
-    known = opened.receivers
-    numbers = range(len(known)) if receivers is None else [receiver_index(known, name) for name in receivers]
+    run_receivers = opened.receivers
+    numbers = (
+        range(len(run_receivers)) if receivers is None else [receiver_index(run_receivers, name) for name in receivers]
+    )
     if task.level_kind != "relative" and threshold_dbm is None:
         threshold_dbm = THRESHOLD_DBM
     conditions = Conditions(threshold_dbm, transmit_dbm, _headings(opened, heading_deg), frequency_hz)
@@ -122,7 +124,7 @@ def radio_map(
     values = map_values(opened, places.positions_m, numbers, conditions, on_progress, scheduler)
     unit = "dB" if task.level_kind == "relative" else "dBm"
     attributes = _attributes(opened, task, conditions, heading_deg) | {"receiver_numbers": list(numbers)}
-    return map_dataset(places, [known[number] for number in numbers], values, unit, attributes)
+    return map_dataset(places, [run_receivers[number] for number in numbers], values, unit, attributes)
 
 
 def _check(run: Run, task: Task, height_m: float | None, transmit_dbm: float, threshold: Any) -> None:
@@ -149,14 +151,14 @@ def _headings(run: Run, heading_deg: float | None) -> tuple[float, ...]:
 def _places(
     run: Run, height_m: float | None, step_m: float | None, surface: str | Path | None
 ) -> grid.Grid | grid.SurfaceMesh:
-    known = run.problem.record.tx_pos_m
+    tx_pos_m = run.problem.record.tx_pos_m
     if surface is not None:
         mesh = grid.surface_of(surface, step_m, height_m or 0.0)
-        grid.warn_of_points_outside(run, mesh.positions_m, known)
+        grid.warn_of_points_outside(run, mesh.positions_m, tx_pos_m)
         return mesh
-    height = grid.usual_height(run, known) if height_m is None else height_m
-    grid.check_height(run, height, known)
-    area = grid.area_of(run, known)
+    height = grid.usual_height(run, tx_pos_m) if height_m is None else height_m
+    grid.check_height(run, height, tx_pos_m)
+    area = grid.area_of(run, tx_pos_m)
     return grid.grid_over(*area, grid.usual_step(*area) if step_m is None else step_m, height)
 
 
@@ -305,9 +307,9 @@ def _each_warning_once() -> Iterator[None]:
     logger, messages = logging.getLogger("wrf_mi.tracing.search.devices"), set[str]()
 
     def new(record: logging.LogRecord) -> bool:
-        known = record.msg in messages
+        is_repeated = record.msg in messages
         messages.add(record.msg)
-        return not known
+        return not is_repeated
 
     logger.addFilter(new)
     try:

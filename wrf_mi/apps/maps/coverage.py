@@ -67,11 +67,11 @@ def reliability(
     ``reception`` is stated and else not at all. Thresholds [t] are by default `QUANTILES` of the measured levels.
     `InputError` where nothing was measured.
     """
-    known = np.isfinite(measured_db)
-    if not known.any():
+    finite = np.isfinite(measured_db)
+    if not finite.any():
         raise InputError("coverage: no measured level to compare with; give a run whose test rows were received")
-    thresholds = np.quantile(measured_db[known], QUANTILES) if threshold_db is None else np.atleast_1d(threshold_db)
-    counted = known if reception is None else np.isfinite(reception)
+    thresholds = np.quantile(measured_db[finite], QUANTILES) if threshold_db is None else np.atleast_1d(threshold_db)
+    counted = finite if reception is None else np.isfinite(reception)
     received = None if reception is None else reception[counted]
     level, std, measured = (np.asarray(values, float)[counted] for values in (level_db, std_db, measured_db))
     probability = np.concatenate([coverage_probability(level, std, float(limit), received) for limit in thresholds])
@@ -97,9 +97,9 @@ def run_reliability(folder: str | Path, threshold_db: FloatArray | None = None) 
         deviations = None if std is None else np.asarray(std, float).reshape(rows, *std.shape[2:])
         return task.level(Prediction(values.reshape(rows, *values.shape[2:]), deviations))
 
-    stated = levels(results.prediction, results.std)
+    predicted = levels(results.prediction, results.std)
     received = None if results.reception is None else results.reception.astype(float).ravel()
-    return reliability(stated.mean, stated.stated_std, levels(results.truth).mean, threshold_db, received)
+    return reliability(predicted.mean, predicted.stated_std, levels(results.truth).mean, threshold_db, received)
 
 
 def reliability_figure(results: Mapping[str, Reliability]) -> Figure:

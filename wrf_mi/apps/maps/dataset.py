@@ -92,8 +92,10 @@ def map_dataset(
     for axis, values_m in zip("xyz", np.stack([receiver.position_m for receiver in receivers], axis=1), strict=True):
         coordinates[f"receiver_{axis}"] = "receiver", values_m, _metres(f"{axis} of the receiver")
     if any(receiver.position_std_m is not None for receiver in receivers):
-        stated = np.zeros(3)
-        stds_m = [stated if receiver.position_std_m is None else receiver.position_std_m for receiver in receivers]
+        surveyed_std_m = np.zeros(3)
+        stds_m = [
+            surveyed_std_m if receiver.position_std_m is None else receiver.position_std_m for receiver in receivers
+        ]
         for axis, values_m in zip("xyz", np.stack(stds_m, axis=1), strict=True):
             words = f"standard deviation of {axis} of the receiver, 0: stated"
             coordinates[f"receiver_{axis}_std"] = "receiver", values_m, _metres(words)
@@ -116,8 +118,8 @@ def map_dataset(
         if name in values:
             data[name] = ("receiver", *dims), values[name].reshape(-1, *shape), _described(name, level_unit)
     power = values[POWER]
-    known = np.where(np.isfinite(power), power, -np.inf)
-    best = np.where(np.isfinite(power).any(axis=0), known.argmax(axis=0), -1).astype(np.int32)
+    received_power = np.where(np.isfinite(power), power, -np.inf)
+    best = np.where(np.isfinite(power).any(axis=0), received_power.argmax(axis=0), -1).astype(np.int32)
     flags: dict[str, Any] = {
         "long_name": "number along the dimension receiver of the receiver of the highest power, -1: none",
         "flag_values": np.arange(-1, len(receivers), dtype=np.int32),

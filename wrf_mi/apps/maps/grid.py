@@ -140,10 +140,10 @@ def area_of(run: Run, tx_pos_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     if (scene := run.problem.opened_scene) is not None:
         box = scene.mi_scene.bbox()
         return np.array(box.min, float).ravel(), np.array(box.max, float).ravel()
-    known = tx_pos_m[np.isfinite(tx_pos_m).all(axis=1)]
-    if not len(known):
+    positions_m = tx_pos_m[np.isfinite(tx_pos_m).all(axis=1)]
+    if not len(positions_m):
         raise InputError(f"{run.folder}: neither scene nor transmitter positions are known; train with --scene")
-    return known.min(axis=0) - MARGIN_M, known.max(axis=0) + MARGIN_M
+    return positions_m.min(axis=0) - MARGIN_M, positions_m.max(axis=0) + MARGIN_M
 
 
 def usual_height(run: Run, tx_pos_m: FloatArray) -> float:
@@ -254,19 +254,19 @@ def candidates_of(
     `InputError`: a step that is not positive or too small, no candidate, or neither scene nor known positions.
     """
     scene, record = run.problem.opened_scene, run.problem.record
-    known = record.tx_pos_m[load_rows(run.folder, record).all_train]
-    known = known[np.isfinite(known).all(axis=1)]
-    low, high = area_of(run, known) if area_m is None else area_m
+    positions_m = record.tx_pos_m[load_rows(run.folder, record).all_train]
+    positions_m = positions_m[np.isfinite(positions_m).all(axis=1)]
+    low, high = area_of(run, positions_m) if area_m is None else area_m
     if step_m is None:
         step_m = max(CANDIDATE_STEP_M, float(np.sqrt(np.prod(high[:2] - low[:2]) / USUAL_CANDIDATES)))
-    height = usual_height(run, known) if height_m is None else height_m
-    check_height(run, height, known)
+    height = usual_height(run, positions_m) if height_m is None else height_m
+    check_height(run, height, positions_m)
     grid = grid_over(low, high, step_m, height)
     area = inside = np.ones(len(grid.x_m) * len(grid.y_m), bool)
     if scene is not None:
         area = over_floor(scene, grid.positions_m)
-        if len(known):
-            area |= cKDTree(known[:, :2]).query(grid.positions_m[:, :2])[0] <= MARGIN_M
+        if len(positions_m):
+            area |= cKDTree(positions_m[:, :2]).query(grid.positions_m[:, :2])[0] <= MARGIN_M
         inside = area & outside_solids(scene, grid.positions_m)
     if not inside.any():
         remedy = "give another --height" if height_m is not None else "give --height"

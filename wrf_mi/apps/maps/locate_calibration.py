@@ -214,7 +214,7 @@ def folds_of(record: Record, split: Split) -> tuple[list[Split], Neighbours, str
         rows = split.all_train
         pairs = list(stretches_of(record.tx_pos_m[rows], FOLDS + 1))[:FOLDS]
         none = np.zeros(0, np.int64)
-        stretches = [Split("held out", split.seed, rows[known], none, rows[out]) for known, out in pairs]
+        stretches = [Split("held out", split.seed, rows[training], none, rows[out]) for training, out in pairs]
         kinds.append((stretches, "in stretches of the data's order"))
     tried = [(folds, words, *choose_neighbours(record, folds)) for folds, words in kinds if folds]
     if not tried:

@@ -112,8 +112,8 @@ def read_observations(
         raise DataFault(file, f"{text} among {one_line(listed(observed.ids))}; name each as in the data of the run")
     if len(np.unique(number_of[heard])) < heard.sum():
         raise DataFault(file, f"two of {one_line(listed(observed.ids))} are of one receiver; remove one of them")
-    known = {key for name in left_out for key in _keys(name)} | numbers.keys()
-    if unknown := [name for name in observed.ids if id_key(name) not in known]:
+    keys = {key for name in left_out for key in _keys(name)} | numbers.keys()
+    if unknown := [name for name in observed.ids if id_key(name) not in keys]:
         logger.warning("%s: %d receivers unknown to the run are not used: %s", file, len(unknown), listed(unknown))
     values = np.full((len(names), len(observed.first_row)), np.nan)
     values[number_of[heard]] = observed.dbm[heard]

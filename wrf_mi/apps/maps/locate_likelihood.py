@@ -41,9 +41,9 @@ class Likelihood:
 
         Predicted means and standard deviations are [headings, n_rx, p], one heading where the model does not use it.
         """
-        known = np.isfinite(observed_dbm)
-        scale = self.scale * std_db[:, known]
-        error = observed_dbm[known, None].astype(mean_dbm.dtype) - mean_dbm[:, known]
+        received = np.isfinite(observed_dbm)
+        scale = self.scale * std_db[:, received]
+        error = observed_dbm[received, None].astype(mean_dbm.dtype) - mean_dbm[:, received]
         log_density = self._with_offset(error, scale) if self.offset_db > 0 else self._density(error, scale)
         return np.asarray(logsumexp(log_density, axis=0) - np.log(len(mean_dbm)), float)
 
@@ -112,9 +112,9 @@ def mass_of(ranks: ArrayLike, level: float) -> float:
     >>> mass_of([], 0.9)
     0.9
     """
-    if not len(known := np.asarray(ranks, float)):
+    if not len(values := np.asarray(ranks, float)):
         return level
-    ascending = np.sort(np.concatenate([known, (np.arange(TRUST) + 0.5) / TRUST]))
+    ascending = np.sort(np.concatenate([values, (np.arange(TRUST) + 0.5) / TRUST]))
     place = int(np.ceil((len(ascending) + 1) * level))
     return float(ascending[place - 1]) if place <= len(ascending) else max(level, float(ascending[-1]))
 

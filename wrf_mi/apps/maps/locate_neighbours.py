@@ -42,14 +42,14 @@ class Neighbours:
 
 def nearest_places(record: Record, rows: IntArray, observed_dbm: FloatArray, metric: str, count: int) -> FloatArray:
     """Positions [m, count, 3] of the nearest of training rows [n], the nearest first; fewer where rows are."""
-    known = np.asarray(record.observation[:, rows].T, float)
-    heard = np.isfinite(known)
-    rows, known, heard = (values[heard.any(axis=1)] for values in (rows, known, heard))
+    measured_dbm = np.asarray(record.observation[:, rows].T, float)
+    heard = np.isfinite(measured_dbm)
+    rows, measured_dbm, heard = (values[heard.any(axis=1)] for values in (rows, measured_dbm, heard))
     asked = np.asarray(observed_dbm.T, float)
     if metric == METRICS[0]:
-        weakest = np.where(heard.any(axis=0), np.where(heard, known, np.inf).min(axis=0), 0.0)
-        known, asked = (np.where(np.isfinite(values), values, weakest) for values in (known, asked))
-    model = NearestNeighbors(n_neighbors=min(count, len(rows)), metric=metric).fit(known)
+        weakest = np.where(heard.any(axis=0), np.where(heard, measured_dbm, np.inf).min(axis=0), 0.0)
+        measured_dbm, asked = (np.where(np.isfinite(values), values, weakest) for values in (measured_dbm, asked))
+    model = NearestNeighbors(n_neighbors=min(count, len(rows)), metric=metric).fit(measured_dbm)
     return np.asarray(record.tx_pos_m[rows[model.kneighbors(asked, return_distance=False)]], float)
 
 

@@ -179,8 +179,8 @@ def _area(
     Those far outside, whose places are often uncertain, would shrink the map.
     """
     axes, names = "xy" if "point" not in dataset.sizes else "xyz", map(str, dataset["receiver"].values)
-    stated = _receivers(dataset)[[name not in estimated for name in names]]
-    points = [rows.points_m for rows in measured] + [stated]
+    surveyed_m = _receivers(dataset)[[name not in estimated for name in names]]
+    points = [rows.points_m for rows in measured] + [surveyed_m]
     shown = [np.concatenate([dataset[axis].values, *(part[:, k] for part in points)]) for k, axis in enumerate(axes)]
     ends = np.array([[np.nanmin(values), np.nanmax(values)] for values in shown]).T
     for lines in walls:
@@ -234,12 +234,12 @@ def _measured(dataset: xarray.Dataset, run: Run, split: Split, number: int) -> _
     task, index = record.task, int(np.atleast_1d(dataset.attrs["receiver_numbers"])[number])
     added = float(dataset.attrs["transmit_power_dbm"]) if task.level_kind == "gain" else 0.0
     level = task.level(Prediction(record.observation[index])).mean + added
-    known = np.isfinite(level) & np.isfinite(record.tx_pos_m).all(axis=1)
+    measured = np.isfinite(level) & np.isfinite(record.tx_pos_m).all(axis=1)
     if record.carriers_hz is not None and FREQUENCY in dataset.attrs:
-        known &= np.isclose(record.carriers_hz, dataset.attrs[FREQUENCY], rtol=SAME_CARRIER, atol=0)
+        measured &= np.isclose(record.carriers_hz, dataset.attrs[FREQUENCY], rtol=SAME_CARRIER, atol=0)
     used = split.left[split.left[:, 0] == index, 1] if index in split.held_receivers else split.all_train
-    trained = np.isin(np.arange(len(known)), used)
-    kinds = (np.flatnonzero(known & part) for part in (trained, ~trained))
+    trained = np.isin(np.arange(len(measured)), used)
+    kinds = (np.flatnonzero(measured & part) for part in (trained, ~trained))
     rows = np.concatenate([part[:: max(1, -(-len(part) // MOST_POINTS))] for part in kinds])
     return _Measured(record.tx_pos_m[rows], level[rows], trained[rows])
 

@@ -146,7 +146,7 @@ def _walkable(
 
 
 def _stated(candidates_m: FloatArray) -> FloatArray:
-    stated = np.atleast_2d(np.asarray(candidates_m, float))
-    if stated.shape[1] != 3 or not np.isfinite(stated).all():
+    positions_m = np.atleast_2d(np.asarray(candidates_m, float))
+    if positions_m.shape[1] != 3 or not np.isfinite(positions_m).all():
         raise InputError("candidates: give finite x, y, z in metres for each")
-    return np.unique(stated, axis=0)
+    return np.unique(positions_m, axis=0)

@@ -65,9 +65,9 @@ def add_entry(
     with tempfile.TemporaryDirectory() as place:
         folder = Path(predictions)
         if (folder / CONFIG).exists():
-            run, known = _of_run(folder)
+            run, run_facts = _of_run(folder)
             source, _ = source_of(table, data or run.dataset)
-            stated = known | stated
+            stated = run_facts | stated
             method = method or str(run.metrics["model"])
         else:
             if data is None or method is None:
@@ -86,13 +86,13 @@ def add_entry(
         # Without the measurements, whose licence may not allow to pass them on.
         with readable(folder / PREDICTIONS, f"{folder}: no {PREDICTIONS}; score the run by evaluate", REMEDY):
             arrays = stored_arrays(folder / PREDICTIONS, PREDICTED)
-        kept = Path(place) / "kept.npz"
-        write_arrays(kept, arrays, compressed=True)
+        compressed_file = Path(place) / "kept.npz"
+        write_arrays(compressed_file, arrays, compressed=True)
         # Where a split holds receivers out, nothing is predicted at the others: no file of another program.
         stored = _predictions(table, entry.name)
-        if kept.stat().st_size <= MOST_BYTES and np.isfinite(arrays["prediction"]).all():
+        if compressed_file.stat().st_size <= MOST_BYTES and np.isfinite(arrays["prediction"]).all():
             stored.parent.mkdir(exist_ok=True)
-            write_atomically(stored, kept.read_bytes())
+            write_atomically(stored, compressed_file.read_bytes())
         else:
             stored.unlink(missing_ok=True)  # of the entry that is replaced
         return write_entry(table, entry)
@@ -126,20 +126,20 @@ class Checked:
 def check_table(table: Path) -> Checked:
     """Check a table: entries, data sets and splits of this machine, and stored predictions."""
     entries, sources = read_entries(table), read_sources(table)
-    found = [
+    faults = [
         f"{each.name}: data set {each.dataset} has no file" for each in entries.values() if each.dataset not in sources
     ]
     # Known data sets that are not here would be traced for minutes, and others have no name of their own.
-    here = {data.name for data in KNOWN} | {name for name in sources if Path(name).exists()}
-    records = {name: load_record(name) for name in sources if name in here and dataset_files(name)}
+    local_names = {data.name for data in KNOWN} | {name for name in sources if Path(name).exists()}
+    records = {name: load_record(name) for name in sources if name in local_names and dataset_files(name)}
     for name, record in records.items():
-        found += faults_of(sources[name], record)
+        faults += faults_of(sources[name], record)
     stored = [
         name for name, entry in entries.items() if entry.dataset in records and _predictions(table, name).exists()
     ]
     for name in stored:
-        found += _scored_again(table, entries[name], records[entries[name].dataset])
-    return Checked(len(entries), len(stored), sorted(sources.keys() - records.keys()), found)
+        faults += _scored_again(table, entries[name], records[entries[name].dataset])
+    return Checked(len(entries), len(stored), sorted(sources.keys() - records.keys()), faults)
 
 
 def _predictions(table: Path, name: str) -> Path:
@@ -153,11 +153,11 @@ def _scored_again(table: Path, entry: Entry, record: Record) -> list[str]:
         where = record, _predictions(table, entry.name), Path(place) / "run", f"{entry.method} again"
         again = score_predictions(*where, entry.split, share, entry.seed or 0)
         scores = {key: again.metrics[entry.of.block][key] for key in entry.score}
-        found = [
+        faults = [
             f"{entry.name}: {key} {value}, its predictions score {scores[key]}"
             for key, value in entry.score.items()
             if not np.isclose(scores[key], value, rtol=SAME, atol=SAME)
         ]
         if predictions_digest(read_run(again.folder)) != entry.predictions:
-            found.append(f"{entry.name}: other predictions are stored than its entry states")
-        return found
+            faults.append(f"{entry.name}: other predictions are stored than its entry states")
+        return faults

@@ -101,19 +101,19 @@ class Entry:
 def entry_of(run: Results, predictions: str | None = None, **facts: Any) -> Entry:
     """Entry of a finished run; ``facts`` are fields that its folder does not hold."""
     task, metrics = TASKS[run.task], run.metrics
-    known = {key: metrics[key] for key in COPIED} | {key: metrics[key] for key in STATED if key in metrics}
+    entry_fields = {key: metrics[key] for key in COPIED} | {key: metrics[key] for key in STATED if key in metrics}
     score = {key: value for key, value in metrics[task.block].items() if isinstance(value, (int, float))}
     scores, scored = np.clip(run.score, *task.limits), np.isfinite(run.score)
-    whole = scored.any(axis=0)
-    means = np.where(scored, scores, 0).sum(axis=0)[whole] / scored.sum(axis=0)[whole]
+    scored_rows = scored.any(axis=0)
+    means = np.where(scored, scores, 0).sum(axis=0)[scored_rows] / scored.sum(axis=0)[scored_rows]
     # Receivers of a row have errors in common, and so have near rows.
-    interval = block_bootstrap(means, row_blocks(run.tx_pos_m[whole]))
+    interval = block_bootstrap(means, row_blocks(run.tx_pos_m[scored_rows]))
     every = np.sort(run.score[np.isfinite(run.score)])
-    known |= {"score": score, "mean_interval": [interval.low, interval.high], "predictions": predictions}
-    known |= {"quantiles": [round(float(q), 5) for q in np.quantile(every, np.linspace(0, 1, QUANTILES))]}
-    unknown = {key for key, value in known.items() if isinstance(value, float) and np.isnan(value)}
-    known = {key: value for key, value in known.items() if key not in unknown}
-    return Entry(**{"task": run.task, **known, **facts})
+    entry_fields |= {"score": score, "mean_interval": [interval.low, interval.high], "predictions": predictions}
+    entry_fields |= {"quantiles": [round(float(q), 5) for q in np.quantile(every, np.linspace(0, 1, QUANTILES))]}
+    unknown = {key for key, value in entry_fields.items() if isinstance(value, float) and np.isnan(value)}
+    entry_fields = {key: value for key, value in entry_fields.items() if key not in unknown}
+    return Entry(**{"task": run.task, **entry_fields, **facts})
 
 
 def predictions_digest(run: Results) -> str:
@@ -125,10 +125,10 @@ def predictions_digest(run: Results) -> str:
 
 def write_entry(folder: Path, entry: Entry) -> Path:
     """Write an entry into a folder of entries; fields that are not known are left out."""
-    known = {key: value for key, value in asdict(entry).items() if value is not None and value != ()}
+    content = {key: value for key, value in asdict(entry).items() if value is not None and value != ()}
     # A seed that is not there is 0.
-    known |= {"seed": None} if entry.seed is None else {}
-    return write_atomically(folder / f"{entry.name}.json", json.dumps(known, indent=1) + "\n")
+    content |= {"seed": None} if entry.seed is None else {}
+    return write_atomically(folder / f"{entry.name}.json", json.dumps(content, indent=1) + "\n")
 
 
 def read_entry(path: Path) -> Entry:
@@ -140,8 +140,8 @@ def read_entry(path: Path) -> Entry:
     if not isinstance(content, dict):
         raise InputError(f"{path}: no entry of a table; delete it")
     needed = {field.name for field in fields(Entry) if field.default is MISSING}
-    known = {field.name for field in fields(Entry)}
-    for names, what in ((needed - content.keys(), "lacks"), (content.keys() - known, "has the unknown field")):
+    field_names = {field.name for field in fields(Entry)}
+    for names, what in ((needed - content.keys(), "lacks"), (content.keys() - field_names, "has the unknown field")):
         if names:
             raise InputError(f"{path}: {what} {sorted(names)[0]}; write it by wrf-mi table add")
     entry = Entry(**content)

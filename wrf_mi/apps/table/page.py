@@ -60,9 +60,9 @@ def group_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
         used = [entry for entry in seeds if entry.seed is None] or seeds
         rows.append(_row(used))
     first = next((entry for entry in entries if entry.constant), None)
-    known = {"n_train": entries[0].n_train, "n_test": entries[0].n_test}
+    row_counts = {"n_train": entries[0].n_train, "n_test": entries[0].n_test}
     if first is not None and first.constant:
-        rows.append(known | _scores(first.constant) | {"method": f"constant: {first.constant.get('words', '')}"})
+        rows.append(row_counts | _scores(first.constant) | {"method": f"constant: {first.constant.get('words', '')}"})
         if first.constant_rmse:
             rows[-1] |= {key: first.constant_rmse.get(key) for key in ("bias", "rmse")}
         rows[-1]["kind"] = "constant"
@@ -71,7 +71,7 @@ def group_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
         plain = key.rstrip("0123456789")  # earlier entries name IDW with its number of neighbours
         if plain not in by_method:
             words = reference_words(task, dict(references), key) if key in task.references else key
-            rows.append(known | _scores(block) | {"method": f"{words} (reference)", "kind": "reference"})
+            rows.append(row_counts | _scores(block) | {"method": f"{words} (reference)", "kind": "reference"})
     rows.sort(key=lambda row: float(row["median"]), reverse=task.higher_is_better)
     return [row | {"rank": number} for number, row in enumerate(rows, 1)]
 
@@ -82,8 +82,8 @@ def _row(seeds: Sequence[Entry]) -> dict[str, Any]:
     keys = {key for entry in seeds for key in entry.score}
     row |= {key: float(np.mean([entry.score[key] for entry in seeds if key in entry.score])) for key in keys}
     for key in ("inside_90", "train_seconds", "ms_per_sample", "peak_memory_mb"):
-        stated = [value for entry in seeds if (value := getattr(entry, key)) is not None]
-        row[key] = float(np.median(stated)) if stated else None
+        values = [value for entry in seeds if (value := getattr(entry, key)) is not None]
+        row[key] = float(np.median(values)) if values else None
     interval = first.mean_interval if len(seeds) == 1 else None
     row["interval"] = None if interval is None else f"{interval[0]:.3g} to {interval[1]:.3g}"
     machine = first.machine
@@ -107,7 +107,7 @@ def verdict(rows: Sequence[Mapping[str, Any]], label: str) -> str:
     learned = [row for row in rows if row["kind"] not in SIMPLE]
     simple = [row for row in rows if row["kind"] in SIMPLE and row["kind"] != CONSTANT]
     constant = [row for row in rows if row["kind"] == CONSTANT]
-    named = [(words, found[0]) for words, found in (("best simple model", simple), ("constant", constant)) if found]
+    named = [(words, ranked[0]) for words, ranked in (("best simple model", simple), ("constant", constant)) if ranked]
     beside = "; ".join(
         f"{words}: {row['method'].removeprefix('constant: ')}, {row['median']:.3g}" for words, row in named
     )
@@ -172,8 +172,8 @@ def _question(number: int, question: str, groups: Mapping[Group, Sequence[Entry]
         parts += [f"<h3>{escaped(title)}</h3>", f"<p>{escaped(verdict(rows, task.label))}.</p>"]
         parts.append(f'<div class="flat">{sorted_table(COLUMNS, rows, frozenset(COLUMNS) - TEXTS)}</div>')
         if figure is not None:
-            seen = "; ".join(f"{row['method']} {row['median']:.3g}" for row in rows)
-            shown = picture(_png(figure), f"Time against error: {dataset}, {split}", f"points of methods: {seen}")
+            medians = "; ".join(f"{row['method']} {row['median']:.3g}" for row in rows)
+            shown = picture(_png(figure), f"Time against error: {dataset}, {split}", f"points of methods: {medians}")
             parts.append(f"<details><summary>Time against error</summary>{shown}</details>")
     return "\n".join(parts)
 

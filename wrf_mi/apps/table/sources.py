@@ -54,10 +54,10 @@ def read_sources(table: Path) -> dict[str, Source]:
 
     `InputError` for a file that lacks a field or has an unknown one.
     """
-    known = {data.name: {"licence": data.licence, "origin": data.origin} for data in KNOWN}
+    built_in = {data.name: {"licence": data.licence, "origin": data.origin} for data in KNOWN}
     sources = {}
     for path in sorted((table / FOLDER).glob("*.yml")):
-        content = {"name": path.stem} | known.get(path.stem, {}) | read_yaml(path)
+        content = {"name": path.stem} | built_in.get(path.stem, {}) | read_yaml(path)
         if unknown := content.keys() - {field.name for field in fields(Source)}:
             raise InputError(f"{path}: unknown field {sorted(unknown)[0]}; omit it")
         if lacking := [name for name in ("licence", "origin", "get") if name not in content]:
@@ -91,8 +91,8 @@ def add_source(table: Path, data: str, name: str, splits: list[str], **stated: A
     record = load_record(data)
     digests = {split: split_digest(record, split) for split in splits}
     # Rounding of traced data differs between machines.
-    made = any(known.name == data and known.base_url is None for known in KNOWN)
-    observations = None if made else observations_digest(record)
+    is_traced = any(data_set.name == data and data_set.base_url is None for data_set in KNOWN)
+    observations = None if is_traced else observations_digest(record)
     source = Source(name=name, observations=observations, splits=digests, **stated)
     content = {key: value for key, value in asdict(source).items() if key != "name"}
     return write_atomically(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))

@@ -69,8 +69,8 @@ def _coloured(bar: str, label: str, low: float, high: float, shown: bool = True)
 
 def _ends(values: NDArray[Any], tail: float) -> tuple[float, float]:
     """Ends of a colour scale that leave a percentage of the known values beyond either of them."""
-    known = values[np.isfinite(values)]
-    low, high = np.percentile(known, [tail, 100 - tail]).tolist() if known.size else (0.0, 1.0)
+    finite = values[np.isfinite(values)]
+    low, high = np.percentile(finite, [tail, 100 - tail]).tolist() if finite.size else (0.0, 1.0)
     return low, high
 
 
@@ -130,12 +130,12 @@ class SceneFigure:
 
     def _add_receivers(self, names: Sequence[str], positions_m: FloatArray) -> None:
         """Receivers, the chosen one larger."""
-        known = np.flatnonzero(np.isfinite(positions_m).all(axis=1)).tolist()
+        placed = np.flatnonzero(np.isfinite(positions_m).all(axis=1)).tolist()
         marker = {"color": ENDS["receiver"][1], "symbol": "diamond", "line": {"width": 1, "color": "#fff"}}
-        how = {"mode": "markers", "text": [plain(names[k]) for k in known], "hovertemplate": "%{text}<extra></extra>"}
-        number = self._add("scatter3d", f"receivers ({len(known)})", positions_m[known], marker=marker, **how)
+        how = {"mode": "markers", "text": [plain(names[k]) for k in placed], "hovertemplate": "%{text}<extra></extra>"}
+        number = self._add("scatter3d", f"receivers ({len(placed)})", positions_m[placed], marker=marker, **how)
         for receiver, changes in enumerate(self.receivers):
-            changes[number] = {"marker.size": [9 if k == receiver else 6 for k in known]}
+            changes[number] = {"marker.size": [9 if k == receiver else 6 for k in placed]}
 
     def _add_paths(self, paths: PathsContent) -> None:
         """Paths of each pair of devices, coloured by their gain, a trace for each sequence of interactions."""
@@ -178,7 +178,7 @@ class SceneFigure:
         """Maps from below to above, a trace for each quantity of each; a menu chooses one of them."""
         numbers: list[int] = []
         labels = []
-        for shown in sorted(maps, key=lambda one: np.inf if one.height_m is None else one.height_m):
+        for shown in sorted(maps, key=lambda content: np.inf if content.height_m is None else content.height_m):
             for name, values in shown.values.items():
                 numbers.append(self._add_map(shown, shown.labels[name], values, receivers, not numbers))
                 place = shown.name if shown.height_m is None else f"{shown.height_m:.2f} m"

@@ -135,8 +135,8 @@ def observations_of(results: Results, rows: IntArray) -> dict[str, Any]:
     both = {"measured": results.truth[:, rows], "predicted": results.prediction[:, rows]}
     if task.image:
         # Spectra that were not received are zero.
-        known = {key: np.clip(np.nan_to_num(values), 0, 1) for key, values in both.items()}
-        return {"kind": "image"} | {key: np.round(255 * values).astype(np.uint8) for key, values in known.items()}
+        clipped = {key: np.clip(np.nan_to_num(values), 0, 1) for key, values in both.items()}
+        return {"kind": "image"} | {key: np.round(255 * values).astype(np.uint8) for key, values in clipped.items()}
     if task.axes == 0:
         return {"kind": "level"} | both
     return {"kind": "curve"} | {key: power_db(values) for key, values in both.items()}

@@ -85,8 +85,8 @@ class _Gathered:
             self.titles.append("scene")
             self.scenes.append(layers.surfaces_in(source))
         elif not Path(source).exists() and str(source) not in scenes():
-            known = ", ".join(scenes())
-            raise InputError(f"{source}: no such file; give a run folder, a map or a scene (or its name: {known})")
+            names = ", ".join(scenes())
+            raise InputError(f"{source}: no such file; give a run folder, a map or a scene (or its name: {names})")
         elif (Path(source) / CONFIG).is_file():
             self._add_run(open_run(source))
         elif Path(source).suffix.lower() in SUFFIXES:
