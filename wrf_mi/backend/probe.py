@@ -74,9 +74,9 @@ def _try(name: str, variable: str, library: Path, fresh: bool) -> Verdict:
         key = "|".join([name, file_key(library), *versions, script, platform.node(), devices])
     except OSError as error:
         return Verdict(False, f"cannot be read: {error.strerror}")
-    known = None if fresh else recall(key)
-    if known is not None:
-        return Verdict(**{field.name: known[field.name] for field in fields(Verdict)})
+    recalled = None if fresh else recall(key)
+    if recalled is not None:
+        return Verdict(**{field.name: recalled[field.name] for field in fields(Verdict)})
     verdict, final = _run_trial(VARIANTS[name], variable, library)
     if final:
         remember(key, vars(verdict), float("inf") if verdict.usable else FAILURE_KEPT_S)

@@ -99,9 +99,9 @@ class Antenna:
 
     def __post_init__(self) -> None:
         path = pattern_path(self.pattern)
-        for name, known in (("pattern", PATTERNS), ("polarization", POLARIZATIONS), ("frame", FRAMES)):
-            if (value := getattr(self, name)) not in known and (name != "pattern" or path is None):
-                text = f"antenna: {name} is {str(value)[:40]!r}; choose from {', '.join(known)}"
+        for name, choices in (("pattern", PATTERNS), ("polarization", POLARIZATIONS), ("frame", FRAMES)):
+            if (value := getattr(self, name)) not in choices and (name != "pattern" or path is None):
+                text = f"antenna: {name} is {str(value)[:40]!r}; choose from {', '.join(choices)}"
                 raise InputError(text + f", or a file *{', *'.join(PATTERN_FILES)}" * (name == "pattern"))
         if path is not None:
             digest = content_digest(path)
@@ -203,9 +203,11 @@ class AntennaOptions:
 
         `InputError`: names that `Antenna` refuses.
         """
-        stated = {field.name[3:]: getattr(self, field.name) for field in fields(self) if field.name.startswith(end)}
-        stated = {name: value for name, value in stated.items() if value is not None}
-        return replace(antenna, **stated, **({"digest": ""} if "pattern" in stated else {}))
+        replacements = {
+            field.name[3:]: getattr(self, field.name) for field in fields(self) if field.name.startswith(end)
+        }
+        replacements = {name: value for name, value in replacements.items() if value is not None}
+        return replace(antenna, **replacements, **({"digest": ""} if "pattern" in replacements else {}))
 
 
 AS_STATED = AntennaOptions()  # antennas as in the data

@@ -43,8 +43,8 @@ def middle_carrier(carriers_hz: FloatArray) -> float:
 
 def carriers_text(carriers_hz: FloatArray) -> str:
     """Carriers of rows in words, such as ``rows at 2 carriers, 920000000, 2440000000 Hz``."""
-    known = [f"{carrier:.10g}" for carrier in np.unique(carriers_hz)]
-    if len(known) == 1:
-        return f"rows at {known[0]} Hz"
-    named = ", ".join(known) if len(known) <= MOST_NAMED else f"{known[0]} to {known[-1]}"
-    return f"rows at {len(known)} carriers, {named} Hz"
+    carriers = [f"{carrier:.10g}" for carrier in np.unique(carriers_hz)]
+    if len(carriers) == 1:
+        return f"rows at {carriers[0]} Hz"
+    named = ", ".join(carriers) if len(carriers) <= MOST_NAMED else f"{carriers[0]} to {carriers[-1]}"
+    return f"rows at {len(carriers)} carriers, {named} Hz"

@@ -74,8 +74,8 @@ class MeasuredPattern:
         """Gain, direction of its maximum in the antenna's frame, efficiency and frequency."""
         azimuth, elevation = self.peak_deg
         text = f"{self.peak_dbi:.1f} dBi at azimuth {azimuth:g} deg, elevation {elevation:g} deg"
-        known = "" if self.frequency_hz is None else f", measured at {self.frequency_hz / 1e6:g} MHz"
-        return f"{text}, efficiency {self.efficiency:.0%}{known}"
+        frequency_text = "" if self.frequency_hz is None else f", measured at {self.frequency_hz / 1e6:g} MHz"
+        return f"{text}, efficiency {self.efficiency:.0%}{frequency_text}"
 
     def amplitude(self, arrays: Any, zenith: Any, azimuth: Any, tables: list[Any] | None = None) -> list[Any]:
         """Real and, where a phase was measured, imaginary part at zenith angles and azimuths (-pi to pi), rad.

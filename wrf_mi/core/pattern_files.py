@@ -104,9 +104,9 @@ def _pattern_of(path: Path, values: dict[tuple[float, float], list[float]], with
         grid[round(theta * n / 180), round(phi * m / 360), : len(of_direction)] = of_direction
     # A pole may be measured at one azimuth alone.
     for pole in (0, -1):
-        known = grid[pole, ~np.isnan(grid[pole, :, 0])]
-        if len(known):
-            grid[pole, np.isnan(grid[pole, :, 0])] = known[0]
+        at_pole = grid[pole, ~np.isnan(grid[pole, :, 0])]
+        if len(at_pole):
+            grid[pole, np.isnan(grid[pole, :, 0])] = at_pole[0]
     gain_db, missing = grid[..., 0], np.isnan(grid[..., 0])
     if missing.any():
         cuts = np.zeros_like(missing)
@@ -128,14 +128,14 @@ def _equal(angles: FloatArray, expected: FloatArray) -> bool:
 def _read_planet(path: Path, lines: list[str]) -> MeasuredPattern:
     keys: dict[str, str] = {}
     cuts: dict[str, FloatArray] = {}
-    rest = iter(enumerate(lines, start=1))
-    for line, text in rest:
+    numbered_lines = iter(enumerate(lines, start=1))
+    for line, text in numbered_lines:
         key, value = [*text.split(maxsplit=1), "", ""][:2]
         if key.upper() in ("HORIZONTAL", "VERTICAL"):
             if not value.strip().isdecimal() or len(value) > 9:
                 raise DataFault(path, f"{one_line(text)[:40]!r} has no number of angles; give 360", line=line)
             count = int(value)
-            cuts[key.upper()] = _attenuations(path, line, [text for _, text in islice(rest, count)], count)
+            cuts[key.upper()] = _attenuations(path, line, [text for _, text in islice(numbered_lines, count)], count)
         else:
             keys[key.upper()] = value.strip()
     gain = GAIN.fullmatch(keys.get("GAIN", ""))

@@ -35,10 +35,10 @@ class Prediction:
 
     def __post_init__(self) -> None:
         for name in ("std", "std_mean"):
-            stated = getattr(self, name)
-            if stated is not None and np.shape(self.mean) != np.shape(stated):
+            deviation = getattr(self, name)
+            if deviation is not None and np.shape(self.mean) != np.shape(deviation):
                 raise ValueError(
-                    f"Prediction: mean {np.shape(self.mean)} and {name} {np.shape(stated)} differ in shape"
+                    f"Prediction: mean {np.shape(self.mean)} and {name} {np.shape(deviation)} differ in shape"
                 )
 
     @property

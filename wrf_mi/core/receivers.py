@@ -28,7 +28,7 @@ def receiver_index(receivers: Sequence[Receiver], receiver: int | str) -> int:
     >>> receiver_index(both, "kitchen"), receiver_index(both, 0), receiver_index(both, "0")
     (0, 0, 1)
     """
-    names = [known.name for known in receivers]
+    names = [each.name for each in receivers]
     if isinstance(receiver, str):
         if names.count(receiver) > 1:
             numbers = listed(str(index) for index, name in enumerate(names) if name == receiver)

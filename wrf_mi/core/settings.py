@@ -72,8 +72,8 @@ def _ranges(kind: Any) -> dict[str, tuple[TypeAdapter[Any], str]]:
     """Ranges of all fields of a class, as if they were numbers; a subclass that changes a default keeps the range."""
     hints = [typing.get_type_hints(base, include_extras=True) for base in reversed(kind.__mro__)]
     items = (item for of_class in hints for item in of_class.items())
-    stated = {name: typing.get_args(hint)[1] for name, hint in items if typing.get_origin(hint) is Annotated}
-    limits = {field.name: stated.get(field.name, NOT_NEGATIVE) for field in dataclasses.fields(kind)}
+    annotated = {name: typing.get_args(hint)[1] for name, hint in items if typing.get_origin(hint) is Annotated}
+    limits = {field.name: annotated.get(field.name, NOT_NEGATIVE) for field in dataclasses.fields(kind)}
     finite = Field(allow_inf_nan=False)
     return {name: (TypeAdapter(Annotated[float, each, finite]), each.description) for name, each in limits.items()}
 
@@ -84,9 +84,9 @@ def check(settings: Any, prefix: str = "") -> None:
     hints = typing.get_type_hints(kind)
     for name, (adapter, words) in _ranges(kind).items():
         value = getattr(settings, name)
-        known = typing.get_args(hints[name]) if typing.get_origin(hints[name]) is typing.Literal else (value,)
-        if value not in known:
-            raise InputError(f"setting {prefix}{name}: {value!r}; choose from {', '.join(map(str, known))}")
+        choices = typing.get_args(hints[name]) if typing.get_origin(hints[name]) is typing.Literal else (value,)
+        if value not in choices:
+            raise InputError(f"setting {prefix}{name}: {value!r}; choose from {', '.join(map(str, choices))}")
         if dataclasses.is_dataclass(value):
             check(value, f"{prefix}{name}.")
         elif isinstance(value, int | float):
@@ -127,8 +127,8 @@ def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
                 raise InputError(f"{source}, setting {name}: {text}")
             continue
         if key not in hints:
-            known = ", ".join(f"{prefix}{k}" for k in hints)
-            raise InputError(f"{source}, setting {name}: unknown; known here: {known}")
+            choices = ", ".join(f"{prefix}{k}" for k in hints)
+            raise InputError(f"{source}, setting {name}: unknown; known here: {choices}")
         arguments[key] = converted(hints[key], value, source, name)
     return kind(**arguments)
 
@@ -182,18 +182,18 @@ def stated_values(config: Any, settings: Iterable[str]) -> dict[str, str]:
     >>> stated_values(TrainConfig(), ["steps=200", "traced.depth=3"])
     {'steps': '200', 'traced.depth': '3'}
     """
-    known = [name for name, _ in flat(dataclasses.asdict(config))]
+    names = [name for name, _ in flat(dataclasses.asdict(config))]
     values: dict[str, str] = {}
     for setting in settings:
         key, _, text = (part.strip() for part in setting.partition("="))
-        key = _present_name(key, known)
+        key = _present_name(key, names)
         if values.setdefault(key, text) != text:
             raise InputError(f"setting {key}: stated as {values[key]} and as {text}; give one of both")
     return values
 
 
-def _present_name(key: str, known: Iterable[str]) -> str:
-    return key if key in known else FORMER_NAMES.get(key, key)
+def _present_name(key: str, names: Iterable[str]) -> str:
+    return key if key in names else FORMER_NAMES.get(key, key)
 
 
 def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
@@ -205,14 +205,14 @@ def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
     (200, 500)
     """
     values: dict[str, Any] = dataclasses.asdict(config)  # type: ignore[call-overload]
-    known = [name for name, _ in flat(values)]
+    names = [name for name, _ in flat(values)]
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:
             raise InputError(f"--set {setting}: expected key=value, e.g. --set steps=2000")
-        key = _present_name(key.strip(), known)
-        if key not in known:
-            close = get_close_matches(key, known, n=3)
+        key = _present_name(key.strip(), names)
+        if key not in names:
+            close = get_close_matches(key, names, n=3)
             meant = f"did you mean {' or '.join(close)}? " if close else ""
             remedy = f"{meant}All are listed by `wrf-mi train --help-settings`"
             raise InputError(f"--set {setting}: unknown setting {key}; {remedy}")

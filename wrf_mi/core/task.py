@@ -183,10 +183,10 @@ class Task(ABC):
     @property
     def references(self) -> dict[str, str]:
         """Words for each possible reference by its key."""
-        known = {IDW: "IDW"}
-        known |= {LAW: "one path-loss law of all receivers"} if self.shares_law else {}
-        known |= {CARRIER: "nearest carrier's rows"} if self.several_carriers else {}
-        return {UPLINK: self.from_uplink} | known if self.from_uplink else known
+        words = {IDW: "IDW"}
+        words |= {LAW: "one path-loss law of all receivers"} if self.shares_law else {}
+        words |= {CARRIER: "nearest carrier's rows"} if self.several_carriers else {}
+        return {UPLINK: self.from_uplink} | words if self.from_uplink else words
 
     def loss(self, prediction: Any, truth: Any, batch: int, *shape: int, ssim_weight: float) -> Any:
         """Loss of the training, a Dr.Jit float of one value: mean absolute difference over received observations.

@@ -245,8 +245,8 @@ class Record:
     def receiver_carriers_hz(self) -> FloatArray | None:
         """Carrier in Hz of each receiver, [n_rx], where receivers state their carriers; else None."""
         carriers = [receiver.frequency_hz for receiver in self.receivers]
-        stated = np.array([np.nan if carrier is None else carrier for carrier in carriers])
-        return None if np.isnan(stated).all() else stated
+        carriers_hz = np.array([np.nan if carrier is None else carrier for carrier in carriers])
+        return None if np.isnan(carriers_hz).all() else carriers_hz
 
     def precision(self, rows: IntArray) -> FloatArray | None:
         """Inverse variance [n_rx, m] of the noise of m rows' observations, relative to a typical reading's.
@@ -258,9 +258,9 @@ class Record:
         if self.std is None:
             return None if self.n_readings is None else np.maximum(self.n_readings[:, rows], 1).astype(float)
         std = self.std[:, rows]
-        known = np.isfinite(std)
-        relative = std / (np.median(std[known]) if known.any() else 1.0)
-        return np.where(known, relative, 1.0) ** -2
+        finite = np.isfinite(std)
+        relative = std / (np.median(std[finite]) if finite.any() else 1.0)
+        return np.where(finite, relative, 1.0) ** -2
 
     def to_xarray(self) -> Any:
         """The record as an `xarray.Dataset` with named dimensions, which `wrf_mi.load` reads.

@@ -23,21 +23,21 @@ class _Loader(yaml.SafeLoader):
             self._written_out(node, {})
         return node
 
-    def _written_out(self, node: yaml.Node, known: dict[int, int]) -> int:
+    def _written_out(self, node: yaml.Node, counts: dict[int, int]) -> int:
         """Number of nodes at and below a node, those of aliases each time."""
-        if (count := known.get(id(node))) is not None:
+        if (count := counts.get(id(node))) is not None:
             if not count:
                 raise yaml.constructor.ConstructorError(None, None, "an alias of what holds it", node.start_mark)
             return count
-        known[id(node)], count = 0, 1  # open until it is counted
+        counts[id(node)], count = 0, 1  # open until it is counted
         if isinstance(node, yaml.SequenceNode):
-            count += sum(self._written_out(each, known) for each in node.value)
+            count += sum(self._written_out(each, counts) for each in node.value)
         elif isinstance(node, yaml.MappingNode):
-            count += sum(self._written_out(each, known) for pair in node.value for each in pair)
+            count += sum(self._written_out(each, counts) for pair in node.value for each in pair)
         if count > MOST_NODES:
             text = f"more than {MOST_NODES} values with its aliases written out"
             raise yaml.constructor.ConstructorError(None, None, text, node.start_mark)
-        known[id(node)] = count
+        counts[id(node)] = count
         return count
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:

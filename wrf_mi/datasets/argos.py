@@ -182,8 +182,8 @@ def _check_samples(file: Path, pilots: Any) -> tuple[int, ...]:
 
 
 def _argos(file: Path, shape: tuple[int, ...], attributes: dict[str, Any]) -> _Layout:
-    stated = [attempt(_whole, file, attributes, key) for key in ("num_mob_ant", "samples_per_user")]
-    users, slot = (number.value for number in stated)
+    numbers = [attempt(_whole, file, attributes, key) for key in ("num_mob_ant", "samples_per_user")]
+    users, slot = (number.value for number in numbers)
     if shape[3] != 2 or shape[2] < users * slot:
         text = f"{PILOTS} has shape {list(shape)}, but {users} users have {slot} samples each"
         raise DataFault(file, f"{text}; correct num_mob_ant or samples_per_user")
@@ -195,8 +195,8 @@ def _sounder(file: Path, shape: tuple[int, ...], attributes: dict[str, Any]) -> 
         raise DataFault(file, f"{PILOTS} has {shape[4]} numbers a slot, which are no pairs of I and Q; correct it")
     slot = shape[4] // 2
     attempt(_check_sequence, file, attributes)
-    stated = [attempt(_whole, file, attributes, key) for key in ("CP_LEN", "PREFIX_LEN")]
-    guard, prefix = (number.value for number in stated)
+    numbers = [attempt(_whole, file, attributes, key) for key in ("CP_LEN", "PREFIX_LEN")]
+    guard, prefix = (number.value for number in numbers)
     first, room = guard + prefix, slot - prefix - int(_number(attributes, "POSTFIX_LEN") or 0)
     starts = tuple(first + k * (FFT + guard) for k in range(max(1, room // (FFT + guard))))
     return _Layout(shape[2], shape[3], slot, starts)

@@ -77,13 +77,13 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
     rx_antennas = attempt(read_antennas, anchors, "", orientations)
     tx_antenna = attempt(read_transmitter, anchors)
     plane = attempt(np.concatenate, [attempt(read_positions, table, "xy") for table in tables])
-    stated = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY, files.RUN)}
+    optional = {column: attempt(_in_both, column, tables) for column in ("z", "heading", FREQUENCY, files.RUN)}
     split = attempt(_read_split, tables)
     strengths = [attempt(_signal_strength, table, ids, anchors) for table in tables]
     observation = attempt(np.concatenate, strengths, 1)
     noise = {kind: attempt(_of_anchors, kind, tables, ids, strengths) for kind in (COUNT, STD)}
     stop_at_faults()
-    height, counts = stated["z"].value, noise[COUNT].value
+    height, counts = optional["z"].value, noise[COUNT].value
     if height is None:
         logger.info("%s: no column z; all transmitters are taken to be %g m above the floor", folder, TAG_HEIGHT_M)
         height = np.full(len(plane.value), TAG_HEIGHT_M)
@@ -96,14 +96,14 @@ def read_ble_folder(path: str | Path, name: str | None = None) -> Record:
         receivers=tuple(receiver_of(*fields) for fields in zip(*columns, strict=True)),
         observation=observation,
         frequencies_hz=np.array([CARRIER_HZ]),
-        tx_heading_rad=stated["heading"],
+        tx_heading_rad=optional["heading"],
         tx_antenna=tx_antenna,
         n_readings=None if counts is None else np.nan_to_num(counts).astype(np.int64),
         std=noise[STD],
-        runs=stated[files.RUN],
+        runs=optional[files.RUN],
         **split.value,
     )
-    return record.at_carriers(stated[FREQUENCY].value).at_receiver_carriers(receivers_hz.value)
+    return record.at_carriers(optional[FREQUENCY].value).at_receiver_carriers(receivers_hz.value)
 
 
 def _files(folder: Path) -> list[Path]:

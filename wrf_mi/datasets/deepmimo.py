@@ -130,11 +130,11 @@ def _antennas(chosen: _ChannelParams) -> tuple[Antenna, ...]:
     return tuple(ANTENNA if name == "isotropic" else Antenna("hw_dipole", frame=frame) for name, frame in patterns)
 
 
-def _channel_params(file: Path, stated: Mapping[str, Any] | None) -> _ChannelParams:
-    if stated is None:
-        stated = read_yaml(file) if file.exists() else {}
+def _channel_params(file: Path, params: Mapping[str, Any] | None) -> _ChannelParams:
+    if params is None:
+        params = read_yaml(file) if file.exists() else {}
     try:
-        return settings_from(_ChannelParams, stated, str(file))
+        return settings_from(_ChannelParams, params, str(file))
     except InputError as error:
         text = str(error).removeprefix(f"{file}, ")
         raise InputError(f"{file}: {text}{'' if ';' in text else '; correct it (docs/data.md)'}") from None
@@ -207,15 +207,15 @@ def read_deepmimo(path: str | Path, name: str | None = None, params: Mapping[str
 
 def _read_scenario(folder: Path) -> _Scenario:
     file = folder / PARAMS
-    stated = _read_params(folder)
-    scene, rt_params = (_mapping(file, stated, key) for key in ("scene", "rt_params"))
+    params = _read_params(folder)
+    scene, rt_params = (_mapping(file, params, key) for key in ("scene", "rt_params"))
     if (scenes := scene.get("num_scenes", 1)) != 1:
         text = f"dynamic scenario of {shown(scenes)} scenes"
         raise InputError(f"{file}: {text}; give the folder of one scene, with a {PARAMS} that states num_scenes 1")
     carrier = numbers_of(rt_params.get("frequency"))
     if carrier.size != 1 or not 0 < carrier.item() < np.inf:
         raise InputError(f"{file}: rt_params: frequency is {shown(rt_params.get('frequency'))}; give the carrier in Hz")
-    return _Scenario(folder, float(carrier.item()), *_stations_and_users(file, _mapping(file, stated, "txrx_sets")))
+    return _Scenario(folder, float(carrier.item()), *_stations_and_users(file, _mapping(file, params, "txrx_sets")))
 
 
 def _read_params(folder: Path) -> Mapping[str, Any]:
@@ -226,20 +226,20 @@ def _read_params(folder: Path) -> Mapping[str, Any]:
         raise InputError(f"{text}; fetch it in version 4, which has {PARAMS}")
     lines = text_lines(file)
     with readable(file, "", "fetch the scenario again"):
-        stated = json.loads("\n".join(lines))
-    stated = stated if isinstance(stated, dict) else {}
-    version = stated.get("version", VERSION)  # the first scenarios of version 4 do not state it
+        params = json.loads("\n".join(lines))
+    params = params if isinstance(params, dict) else {}
+    version = params.get("version", VERSION)  # the first scenarios of version 4 do not state it
     if not isinstance(version, str) or version.partition(".")[0] != "4":
         text = f"version {shown(version)} of DeepMIMO"
         raise InputError(f"{file}: {text}; give a scenario of version 4, such as {VERSION}")
-    return stated
+    return params
 
 
-def _stations_and_users(file: Path, stated: Mapping[Any, Any]) -> tuple[list[tuple[int, int]], list[int]]:
+def _stations_and_users(file: Path, sets: Mapping[Any, Any]) -> tuple[list[tuple[int, int]], list[int]]:
     """Base stations as (set, number in the set), and sets of users."""
     stations: list[tuple[int, int]] = []
     users: list[int] = []
-    for entry in (_mapping(file, stated, key) for key in sorted(stated, key=str) if str(key).startswith("txrx_set_")):
+    for entry in (_mapping(file, sets, key) for key in sorted(sets, key=str) if str(key).startswith("txrx_set_")):
         if entry.get("is_tx"):
             stations += [(_number(file, entry, "id"), k) for k in range(_number(file, entry, "num_points"))]
         elif entry.get("is_rx"):
@@ -250,8 +250,8 @@ def _stations_and_users(file: Path, stated: Mapping[Any, Any]) -> tuple[list[tup
     return stations, users
 
 
-def _mapping(file: Path, stated: Mapping[Any, Any], key: str) -> Mapping[Any, Any]:
-    value = stated.get(key)
+def _mapping(file: Path, entries: Mapping[Any, Any], key: str) -> Mapping[Any, Any]:
+    value = entries.get(key)
     if not isinstance(value, Mapping):
         state = "missing" if value is None else shown(value)
         raise InputError(f"{file}: {key} is {state}; give a scenario of DeepMIMO 4")

@@ -333,8 +333,8 @@ def _read_index(path: Path, rows: int, first: int, source: str) -> IntArray:
         with recoverable():
             row = whole_number(path, line, text)
             if not first <= row < rows + first:
-                known = f"{source} has rows {first} to {rows + first - 1}"
-                raise DataFault(path, f"row {row} is out of range; {known}", line=line)
+                valid_range = f"{source} has rows {first} to {rows + first - 1}"
+                raise DataFault(path, f"row {row} is out of range; {valid_range}", line=line)
             if row in line_of_row:
                 text = f"row {row} stands in line {line_of_row[row]} already; remove one of them"
                 raise DataFault(path, text, line=line)

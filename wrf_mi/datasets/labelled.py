@@ -164,13 +164,13 @@ class LabelledPrediction(Prediction):
         `InputError`: xarray is not installed.
         """
         arrays = {"prediction": self.mean, "std": self.std, "std_mean": self.std_mean}
-        stated = {
+        predicted = {
             name: values[None] if self.of_one else values for name, values in arrays.items() if values is not None
         }
         task = TASKS[self.task]
-        variables: dict[str, Any] = {name: _variable(name, values, task) for name, values in stated.items()}
+        variables: dict[str, Any] = {name: _variable(name, values, task) for name, values in predicted.items()}
         if self.reception is not None:
             variables["reception"] = PAIR, (self.reception[None] if self.of_one else self.reception).T
         variables["tx_pos_m"] = _variable("tx_pos_m", self.tx_pos_m, task)
-        labels = _labels(self.receiver_names, task, stated["prediction"].shape)
+        labels = _labels(self.receiver_names, task, predicted["prediction"].shape)
         return xarray_package().Dataset(variables, labels, {"task": self.task})

@@ -56,10 +56,10 @@ def read_nerf2_csi(path: str | Path, name: str | None = None) -> Record:
             raise DataFault(station, f"{text}; give one for each")
     frequencies = attempt(_frequencies, station, info, channel)
     positions = folder / files.POSITIONS
-    stated = attempt(files.read_positions, positions, ()) if positions.exists() else None
+    table = attempt(files.read_positions, positions, ()) if positions.exists() else None
     with recoverable():
-        if stated is not None and len(stated.value.positions_m) != n.value:
-            text = f"{len(stated.value.positions_m)} rows, but {CHANNELS} has {n.value} samples; give one for each"
+        if table is not None and len(table.value.positions_m) != n.value:
+            text = f"{len(table.value.positions_m)} rows, but {CHANNELS} has {n.value} samples; give one for each"
             raise DataFault(positions, text)
     truth = attempt(_read_truth, folder / TRUTH, channel)
     official = attempt(files.read_official, folder, n, 0, CHANNELS)
@@ -70,7 +70,7 @@ def read_nerf2_csi(path: str | Path, name: str | None = None) -> Record:
         folder,
         name,
         CSI,
-        tx_pos_m=np.full((n.value, 3), np.nan) if stated is None else stated.value.positions_m,
+        tx_pos_m=np.full((n.value, 3), np.nan) if table is None else table.value.positions_m,
         receivers=(receiver.value,),
         observation=channel.value[None, :, :, half:],
         official=official,
@@ -159,12 +159,12 @@ def _count_samples(path: Path, channel: NDArray[np.complex64]) -> int:
 
 def _frequencies(path: Path, info: dict[Any, Any], channel: NDArray[np.complex64]) -> FloatArray | None:
     """Frequencies of all subcarriers, if ``base-station.yml`` states any."""
-    if (stated := info.get("frequencies_hz")) is None:
+    if (entry := info.get("frequencies_hz")) is None:
         return None
-    frequencies, subcarriers = files.numbers_of(stated), channel.shape[2]
+    frequencies, subcarriers = files.numbers_of(entry), channel.shape[2]
     positive = (frequencies > 0) & (frequencies <= files.SINGLE_MAX)
     if frequencies.ndim != 1 or not len(frequencies) or not positive.all():
-        raise DataFault(path, f"frequencies_hz is {files.shown(stated)}; give a list of frequencies in Hz")
+        raise DataFault(path, f"frequencies_hz is {files.shown(entry)}; give a list of frequencies in Hz")
     if len(frequencies) != subcarriers:
         text = f"{len(frequencies)} frequencies_hz, but {CHANNELS} has {subcarriers} subcarriers"
         raise DataFault(path, f"{text}; give one for each, the uplink's first")

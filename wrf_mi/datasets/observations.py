@@ -109,20 +109,20 @@ def check_observations(record: Record, split: Split, complete: bool = False, may
         InputError: a receiver without any training row; an observation of a training row that
             is not finite; an uplink of any row that is not finite, or all zero.
     """
-    known = split.all_train
-    states = [_states(observed, known) for observed in record.observation]
+    training_rows = split.all_train
+    states = [_states(observed, training_rows) for observed in record.observation]
     never = np.setdiff1d(np.flatnonzero([missing.all() for missing, _ in states]), split.held_receivers)
     if len(never) and not (complete or may_be_silent):
-        text = f"receiver {record.receivers[never[0]].name}: received none of {len(known)} training rows"
+        text = f"receiver {record.receivers[never[0]].name}: received none of {len(training_rows)} training rows"
         raise InputError(f"{place_of(record)}, {text}; leave it out or use another split")
     for receiver, observed, (missing, broken) in zip(record.receivers, record.observation, states, strict=True):
         bad = np.flatnonzero(broken | missing & complete)
         if len(bad):
-            row = known[bad[0]]
+            row = training_rows[bad[0]]
             where = f"{place_of(record)}, receiver {receiver.name}, row {row}"
             remedy = "correct or remove the row" if broken[bad[0]] else "remove the row or choose another model"
             raise InputError(f"{where}: {count_not_finite(observed[row])}; {remedy}")
-    _check_uplink(record, np.concatenate([known, split.test]))
+    _check_uplink(record, np.concatenate([training_rows, split.test]))
 
 
 def _check_uplink(record: Record, used: IntArray) -> None:

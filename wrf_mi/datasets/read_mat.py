@@ -34,9 +34,9 @@ def mat_arrays(files: Mapping[str, Path], remedy: str) -> dict[str, NDArray[Any]
         return {}
     with tempfile.TemporaryDirectory() as place:
         out = Path(place) / "arrays.npz"
-        stated = [f"{key}={file}" for key, file in files.items()]
+        arguments = [f"{key}={file}" for key, file in files.items()]
         seconds = MAT_S + sum(file.stat().st_size for file in files.values()) / MAT_BYTES_PER_S
-        status, _ = run_module("wrf_mi.datasets.read_mat", [str(out), *stated], quiet=True, most_s=seconds)
+        status, _ = run_module("wrf_mi.datasets.read_mat", [str(out), *arguments], quiet=True, most_s=seconds)
         if status != 0:
             first = next(iter(files.values()))
             what = "damaged" if len(files) == 1 else "it, or a matrix beside it, is damaged"

@@ -33,8 +33,8 @@ WHOLE = re.compile(r"([+-]?)0*(\d+?)(?:\.0*)?", re.ASCII)
 def read_ids(table: CsvTable) -> list[str]:
     """Ids of the anchors in normal form."""
     if unused := [column for column in table.header if column not in COLUMNS]:
-        known = ", ".join(COLUMNS)
-        logger.warning("%s: columns that are not used: %s (known: %s)", table.path, listed(unused), known)
+        column_names = ", ".join(COLUMNS)
+        logger.warning("%s: columns that are not used: %s (known: %s)", table.path, listed(unused), column_names)
     ids: list[str] = []
     for row, text in enumerate(table.texts("id"), start=1):
         anchor = plain_id(text)
@@ -84,9 +84,9 @@ def read_antennas(table: CsvTable, prefix: str, orientations: Sequence[FloatArra
 
 def _antenna_entries(table: CsvTable, prefix: str) -> list[dict[str, str]]:
     """Attributes of the antenna of each row whose fields are not empty."""
-    stated = {word: table.texts(prefix + word) for word in WORDS[prefix] if prefix + word in table.header}
+    columns = {word: table.texts(prefix + word) for word in WORDS[prefix] if prefix + word in table.header}
     rows = range(len(table.rows))
-    return [{word: text for word, texts in stated.items() if (text := texts[row].strip())} for row in rows]
+    return [{word: text for word, texts in columns.items() if (text := texts[row].strip())} for row in rows]
 
 
 def read_orientations(table: CsvTable) -> list[FloatArray | None]:
@@ -95,22 +95,22 @@ def read_orientations(table: CsvTable) -> list[FloatArray | None]:
     columns = {name: table.numbers(name, may_be_empty=True) for name in names}
     orientations: list[FloatArray | None] = [None] * len(table.rows)
     for row in range(len(table.rows)):
-        stated = {name: float(values[row]) for name, values in columns.items() if not np.isnan(values[row])}
-        if np.isfinite([*stated.values()]).all():  # else a damaged row, or a field that is refused already
+        row_fields = {name: float(values[row]) for name, values in columns.items() if not np.isnan(values[row])}
+        if np.isfinite([*row_fields.values()]).all():  # else a damaged row, or a field that is refused already
             with recoverable():
-                orientations[row] = _orientation(table, row, stated)
+                orientations[row] = _orientation(table, row, row_fields)
     return orientations
 
 
-def _orientation(table: CsvTable, row: int, stated: dict[str, float]) -> FloatArray | None:
+def _orientation(table: CsvTable, row: int, row_fields: dict[str, float]) -> FloatArray | None:
     """Orientation [4] of a row from those of its fields that are not empty; None without any."""
-    numbers = np.array([*stated.values()])
-    if not stated:
+    numbers = np.array([*row_fields.values()])
+    if not row_fields:
         return None
-    if tuple(stated) in ((AZIMUTH,), (AZIMUTH, DOWNTILT)):
+    if tuple(row_fields) in ((AZIMUTH,), (AZIMUTH, DOWNTILT)):
         return boresight_orientation(*np.radians(numbers))
-    text = f"{', '.join(stated)} alone; give {','.join(QUATERNION)}, or {AZIMUTH} and, if not 0, {DOWNTILT}"
-    if tuple(stated) == QUATERNION:
+    text = f"{', '.join(row_fields)} alone; give {','.join(QUATERNION)}, or {AZIMUTH} and, if not 0, {DOWNTILT}"
+    if tuple(row_fields) == QUATERNION:
         norm = np.linalg.norm(numbers)
         if abs(norm - 1) <= UNIT_QUATERNION_TOLERANCE:
             return numbers
@@ -141,9 +141,9 @@ def receiver_columns(record: Record, ids: list[str]) -> dict[str, Any]:
     return columns | _antenna_columns(TX, [record.tx_antenna] * len(ids))
 
 
-def _antenna_columns(prefix: str, antennas: list[Antenna], stated: bool = False) -> dict[str, list[str]]:
-    """Columns of antennas; none where all are the default, unless they are to be ``stated``."""
-    if not stated and all(antenna == ANTENNA for antenna in antennas):
+def _antenna_columns(prefix: str, antennas: list[Antenna], always: bool = False) -> dict[str, list[str]]:
+    """Columns of antennas; none where all are the default, unless they are ``always`` to be written."""
+    if not always and all(antenna == ANTENNA for antenna in antennas):
         return {}
     words = [antenna_words(antenna) for antenna in antennas]
     return {prefix + word: [of_antenna[word] for of_antenna in words] for word in WORDS[prefix]}

@@ -28,7 +28,7 @@ OPTIONAL = tuple(field.name for field in fields(Record) if field.default is None
 
 def record_arrays(record: Record) -> dict[str, Any]:
     """Arrays of a record by name, of which `record_from_arrays` makes an equal record."""
-    stated = {name: getattr(record, name) for name in OPTIONAL if getattr(record, name) is not None}
+    optional = {name: getattr(record, name) for name in OPTIONAL if getattr(record, name) is not None}
     parts = {} if record.official is None else dict(zip(("train", "test"), record.official, strict=True))
     return {
         "tx_pos_m": record.tx_pos_m,
@@ -36,7 +36,7 @@ def record_arrays(record: Record) -> dict[str, Any]:
         "tx_antenna": np.array(astuple(record.tx_antenna)),
         **receiver_arrays(record.receivers),
         **parts,
-        **stated,
+        **optional,
     }
 
 

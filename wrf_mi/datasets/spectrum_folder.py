@@ -54,9 +54,9 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
     array = attempt(_array, gateways, info, "array")
     receivers = attempt(_receivers, gateways, poses, array)
     table = attempt(files.read_positions, folder / files.POSITIONS)
-    stated = attempt(_frequency, gateways, info)
+    carrier = attempt(_frequency, gateways, info)
     with recoverable():
-        if stated.value is not None and table.value.carriers_hz is not None:
+        if carrier.value is not None and table.value.carriers_hz is not None:
             text = f"column frequency_hz, but {GATEWAYS} states a carrier too; remove one of them"
             raise DataFault(folder / files.POSITIONS, text, line=1)
     rows = attempt(lambda read: len(read.positions_m), table)
@@ -74,7 +74,7 @@ def read_spectrum_folder(path: str | Path, name: str | None = None) -> Record:
         observation=observation,
         official=official,
         folds=folds,
-        frequencies_hz=stated,
+        frequencies_hz=carrier,
         tx_antenna=tx_antenna,
         runs=table.value.runs,
     ).at_carriers(table.value.carriers_hz)
@@ -109,8 +109,8 @@ def write_spectrum_folder(
                 Image.fromarray(image).save(images / f"{row:05d}.png")
         info = yaml.safe_dump(_gateway_info(record), sort_keys=False, default_flow_style=None)
         (part / GATEWAYS).write_text(info, encoding="utf-8")
-        stated = files.PositionTable(record.tx_pos_m, record.carriers_hz, record.runs)
-        files.write_positions(part / files.POSITIONS, stated)
+        table = files.PositionTable(record.tx_pos_m, record.carriers_hz, record.runs)
+        files.write_positions(part / files.POSITIONS, table)
         files.write_official(part, record.official, first=1, digits=5)
         if record.folds is not None:
             files.write_lines(part / FOLDS, [str(fold) for fold in record.folds])
@@ -170,12 +170,12 @@ def parse_folds(path: Path, rows: int) -> IntArray:
 
 def _frequency(path: Path, info: dict[Any, Any]) -> FloatArray | None:
     """The carrier [1] of all rows; None if it is not stated."""
-    if (stated := info.get(FREQUENCY)) is None:
+    if (entry := info.get(FREQUENCY)) is None:
         return None
-    carrier_hz = files.numbers_of(stated)  # YAML reads 920e6 as text
+    carrier_hz = files.numbers_of(entry)  # YAML reads 920e6 as text
     if carrier_hz.ndim or not 0 < carrier_hz < np.inf:
         remedy = f"give the carrier in Hz, such as 920e6, or those of rows in {files.POSITIONS}, column {FREQUENCY}"
-        raise DataFault(path, f"{FREQUENCY} is {files.shown(stated)}; {remedy}")
+        raise DataFault(path, f"{FREQUENCY} is {files.shown(entry)}; {remedy}")
     return carrier_hz.reshape(1)
 
 

@@ -272,8 +272,8 @@ def _train_and_test(record: Record, name: str, seed: int) -> list[_Rows]:
 def _rule_of(name: str) -> str:
     """Name of a split without the number of a fold or of the rows left; an `InputError` if it is unknown."""
     if not NAME.fullmatch(name):
-        known = f"{', '.join(SPLIT_NAMES)}, a fold such as blocked:0, or rows left such as receiver+20"
-        raise InputError(f"split {name!r}: unknown; choose {known}")
+        choices = f"{', '.join(SPLIT_NAMES)}, a fold such as blocked:0, or rows left such as receiver+20"
+        raise InputError(f"split {name!r}: unknown; choose {choices}")
     return re.split("[+:]", name)[0]
 
 
