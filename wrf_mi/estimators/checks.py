@@ -100,8 +100,8 @@ def check_parts(record: Record) -> None:
 
 
 def _check_noise(record: Record) -> None:
-    stated = {"n_readings": record.n_readings, "std": record.std}
-    for name, values in stated.items():
+    noise = {"n_readings": record.n_readings, "std": record.std}
+    for name, values in noise.items():
         if values is None:
             continue
         if not record.task.has_readings:

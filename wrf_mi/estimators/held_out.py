@@ -33,16 +33,16 @@ class HoldOut(NamedTuple):
 
 def hold_out_once(problem: Problem, split: Split) -> HoldOut | None:
     """`wrf_mi.training.selection.hold_out` of a split, computed once for all that choose by its rows; None: no rows."""
-    record, known = problem.record, cast(list[HoldOut], problem.hold_outs)
-    for each in known:
+    record, hold_outs = problem.record, cast(list[HoldOut], problem.hold_outs)
+    for each in hold_outs:
         if each.split is split and each.observation is record.observation and each.seed == problem.seed:
             return each
     fold = hold_out(record, split)
     held_out = None if fold is None else HeldOut.of(record, fold, problem.seed)
     if fold is None or not held_out:
         return None
-    known.append(HoldOut(split, record.observation, problem.seed, fold, held_out))
-    return known[-1]
+    hold_outs.append(HoldOut(split, record.observation, problem.seed, fold, held_out))
+    return hold_outs[-1]
 
 
 def labelled(session: Session, label: str) -> Session:
@@ -89,11 +89,11 @@ def with_error_ratio(mean: NDArray[Any], problem: Problem, held_out: HeldOut) ->
     record, data = problem.record, read_correction_data(problem.scene)
     if data is None:
         return mean
-    observed, known = held_out.observed(record), data.knows(record.name, held_out.row)
+    observed, in_correction = held_out.observed(record), data.knows(record.name, held_out.row)
     # The scene was corrected by these rows, too: their errors are smaller than those of rows to be predicted.
     enlarged = observed + data.error_ratio * (mean - observed)
     enlarged = record.task.limited(enlarged, most=False)
-    return np.where(known.reshape(-1, *[1] * (mean.ndim - 1)), enlarged, mean)
+    return np.where(in_correction.reshape(-1, *[1] * (mean.ndim - 1)), enlarged, mean)
 
 
 def held_out_predictions(

@@ -336,8 +336,8 @@ def default_settings(model: Model, settings: Iterable[str], arguments: Mapping[s
 
     ``arguments`` are those of `wrf_mi.train`, some of which are settings, too (`Model.train_arguments`).
     """
-    stated = {key: arguments[key] for key in model.train_arguments if arguments.get(key) is not None}
-    return with_settings(model.settings(**stated), [*model.defaults, *settings])
+    setting_arguments = {key: arguments[key] for key in model.train_arguments if arguments.get(key) is not None}
+    return with_settings(model.settings(**setting_arguments), [*model.defaults, *settings])
 
 
 def received_rows(record: Record, split: Split, receiver: int, name: str) -> tuple[IntArray, IntArray]:

@@ -54,15 +54,15 @@ def checked_readings(tx_pos_m: ArrayLike, power_dbm: ArrayLike, record: Record, 
     Raises:
         InputError: a record of another task or of several carriers, or arrays of other shapes.
     """
-    own = OwnReadings(np.atleast_2d(np.asarray(tx_pos_m, float)), np.asarray(power_dbm, float))
+    readings = OwnReadings(np.atleast_2d(np.asarray(tx_pos_m, float)), np.asarray(power_dbm, float))
     if not record.task.in_decibel or record.task.axes:
         raise InputError(f"predicts {record.task.name}; readings tell offsets of signal strengths alone")
     if record.carriers_hz is not None:
         raise InputError("its data have several carriers; own readings are of one")
-    if own.power_dbm.shape != (receivers, len(own.tx_pos_m)) or own.tx_pos_m.shape[1:] != (3,):
-        shapes = f"{list(own.tx_pos_m.shape)} and {list(own.power_dbm.shape)}"
+    if readings.power_dbm.shape != (receivers, len(readings.tx_pos_m)) or readings.tx_pos_m.shape[1:] != (3,):
+        shapes = f"{list(readings.tx_pos_m.shape)} and {list(readings.power_dbm.shape)}"
         raise InputError(f"own readings {shapes}; give positions [m, 3] and strengths [{receivers}, m]")
-    return own
+    return readings
 
 
 NO_READINGS = OwnReadings(np.zeros((0, 3)), np.zeros((0, 0)))
@@ -123,11 +123,11 @@ def device_offset(fitted: Fitted, own: OwnReadings | None) -> DeviceOffset:
     return replace(offset, loses_weak=count > 0 and _loses_weak(fitted, own, offset))
 
 
-def _loses_weak(fitted: Fitted, own: OwnReadings, offset: DeviceOffset) -> bool:
+def _loses_weak(fitted: Fitted, readings: OwnReadings, offset: DeviceOffset) -> bool:
     """Whether what a device received is clearly likelier by reception of strengths with its offset."""
-    inputs = Inputs(own.tx_pos_m, runs=np.full(len(own.tx_pos_m), ""))
-    loss = np.zeros((2, len(own.tx_pos_m)))  # of the mean device and with the offset, by reading
-    for receiver, power_dbm in enumerate(own.power_dbm):
+    inputs = Inputs(readings.tx_pos_m, runs=np.full(len(readings.tx_pos_m), ""))
+    loss = np.zeros((2, len(readings.tx_pos_m)))  # of the mean device and with the offset, by reading
+    for receiver, power_dbm in enumerate(readings.power_dbm):
         of_mean = fitted.predict(inputs, receiver)
         if of_mean.reception is None:
             continue

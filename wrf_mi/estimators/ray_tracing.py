@@ -180,7 +180,7 @@ def _graph_problem(problem: Problem) -> Problem:
         if is_stated:
             raise InputError(f"calibration: {text}")
     reflections = options.depth if options.reflections is None else options.reflections
-    stated = [
+    overrides = [
         f"seed={problem.seed}",
         f"traced.depth={options.depth}",
         f"traced.reflections={reflections if options.reflection else 0}",
@@ -189,7 +189,7 @@ def _graph_problem(problem: Problem) -> Problem:
         *settings.chosen(),
     ]
     config = with_settings(
-        calibration_config(settings.calibration.split(","), problem.record.task.settings_of_paths), stated
+        calibration_config(settings.calibration.split(","), problem.record.task.settings_of_paths), overrides
     )
     return replace(problem, settings=config.resolved(problem.record.tx_pos_m[:1]))
 
@@ -287,12 +287,12 @@ class RayTracing(Model):
         seconds = time.perf_counter() - start
         offsets = None
         if record.task.has_offsets:
-            known = split.all_train
-            reported = tracer.observe(traced)[:, known]
+            training_rows = split.all_train
+            reported = tracer.observe(traced)[:, training_rows]
             if not settings.transmission:
-                _warn_of_walls(reported, record.observation[:, known])
+                _warn_of_walls(reported, record.observation[:, training_rows])
             try:
-                offsets = fit_offsets(reported, record.observation[:, known])
+                offsets = fit_offsets(reported, record.observation[:, training_rows])
             except InputError:  # a resumed fit would be refused for the same paths: no progress
                 if not stored:  # else fitted folds have them
                     path.unlink()

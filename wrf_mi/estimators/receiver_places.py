@@ -83,30 +83,30 @@ def place_of_receiver(
     """
     places, power, count = _averaged(tx_pos_m, power_dbm)
     likelihood = _Likelihood(places, power, count, extent_m)
-    around_m, known = max(AROUND * extent_m, LEAST_AROUND_M), np.isfinite(stated_m)
-    middle = np.where(known, stated_m, places.mean(axis=0) + np.array([0, 0, MOUNTED_M[0]]))
-    deviation = np.array([around_m, around_m, np.hypot(MOUNTED_M[1], places[:, 2].std())]) * ~known
+    around_m, is_stated = max(AROUND * extent_m, LEAST_AROUND_M), np.isfinite(stated_m)
+    middle = np.where(is_stated, stated_m, places.mean(axis=0) + np.array([0, 0, MOUNTED_M[0]]))
+    deviation = np.array([around_m, around_m, np.hypot(MOUNTED_M[1], places[:, 2].std())]) * ~is_stated
     bounds = np.array([[0.0, 1.0]] * 3)
-    if not known[2]:
+    if not is_stated[2]:
         bounds[2] = ndtr((np.array(height_m) - middle[2]) / deviation[2])
 
     def positions(quantile: FloatArray) -> FloatArray:
         return np.asarray(middle + deviation * ndtri(quantile))
 
-    low, width, density = _cells(lambda quantile: likelihood(positions(quantile)), positions, bounds, known)
+    low, width, density = _cells(lambda quantile: likelihood(positions(quantile)), positions, bounds, is_stated)
     at_m, mass = positions(low + width / 2), density + np.log(width).sum(axis=1)
     share = np.exp(mass - np.logaddexp.reduce(mass))
 
     def posterior(at_m: FloatArray, likelihood: FloatArray) -> FloatArray:
         # Over metres, while cells are of quantiles: with the density of the prior.
-        return np.asarray(likelihood - np.square((at_m - middle) / np.where(known, 1.0, deviation)).sum(axis=1) / 2)
+        return np.asarray(likelihood - np.square((at_m - middle) / np.where(is_stated, 1.0, deviation)).sum(axis=1) / 2)
 
     best = int(np.argmax(posterior(at_m, density)))
     mode_m, step_m = at_m[best], _sides(positions, low[best], width[best]) / 2
     offsets = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     for _ in range(ZOOMS):
         tried_m = mode_m + offsets * step_m
-        if not known[2]:
+        if not is_stated[2]:
             tried_m[:, 2] = np.clip(tried_m[:, 2], *height_m)
         mode_m, step_m = tried_m[np.argmax(posterior(tried_m, likelihood(tried_m)))], step_m / 2
 
@@ -121,13 +121,13 @@ Positions = Callable[[FloatArray], FloatArray]
 
 
 def _cells(
-    likelihood: Positions, positions: Positions, bounds: FloatArray, known: NDArray[np.bool_]
+    likelihood: Positions, positions: Positions, bounds: FloatArray, is_stated: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Cells of the cube ``bounds`` [3, 2], fine where the posterior is: least corners, widths [n, 3] and densities [n].
 
-    ``likelihood`` is the logarithm at quantiles [n, 3]; coordinates that are ``known`` [3] are not divided.
+    ``likelihood`` is the logarithm at quantiles [n, 3]; coordinates that are ``is_stated`` [3] are not divided.
     """
-    number = np.where(known, 1, CELLS)
+    number = np.where(is_stated, 1, CELLS)
     width = np.tile(np.ptp(bounds, axis=1) / number, (int(np.prod(number)), 1))
     low = bounds[:, 0] + width * np.stack(np.unravel_index(np.arange(len(width)), number), axis=1)
     density = likelihood(low + width / 2)

@@ -233,11 +233,13 @@ class Reception:
             pairs = receiver == number
             near[pairs], distance_m[pairs] = shares.near(record.tx_pos_m[row[pairs]], int(number))
 
-        def fitted(known: NDArray[np.bool_]) -> tuple[Sensitivity, Weights, FloatArray]:
+        def fitted(used_pairs: NDArray[np.bool_]) -> tuple[Sensitivity, Weights, FloatArray]:
             """Sensitivity and weights by some pairs [q], and probabilities of all pairs by the parts [q, 3]."""
-            by_strength = Sensitivity.fit(mean[known], std[known], receiver[known], received[known], shares.rate)
+            by_strength = Sensitivity.fit(
+                mean[used_pairs], std[used_pairs], receiver[used_pairs], received[used_pairs], shares.rate
+            )
             parts = np.stack([shares.rate[receiver], by_strength(mean, std, receiver), near], axis=1)
-            return by_strength, Weights.fit(parts[known], distance_m[known], received[known]), parts
+            return by_strength, Weights.fit(parts[used_pairs], distance_m[used_pairs], received[used_pairs]), parts
 
         sensitivity, weights, parts = fitted(np.ones(len(row), bool))
         scores, group = None, _groups(record, row)

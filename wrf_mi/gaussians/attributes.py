@@ -123,8 +123,8 @@ def with_attributes(field: Any, names: str) -> Any:
     wanted = [name.strip() for name in names.split(",") if name.strip()]
     for name in wanted:
         if name not in ATTRIBUTES or wanted.count(name) > 1:
-            known = ", ".join(ATTRIBUTES) or "none: no installed package adds one"
-            raise InputError(f"setting attributes: {name!r} is unknown or stated twice; known are {known}")
+            choices = ", ".join(ATTRIBUTES) or "none: no installed package adds one"
+            raise InputError(f"setting attributes: {name!r} is unknown or stated twice; known are {choices}")
     return WithAttributes(field, tuple(ATTRIBUTES[name] for name in wanted)) if wanted else field
 
 

@@ -325,9 +325,9 @@ class Graph:
         """
         model = self.models[number]
         unscaled = model.unscaled
-        known = np.flatnonzero(np.isfinite(observed).reshape(len(observed), -1).all(axis=1))
+        finite_rows = np.flatnonzero(np.isfinite(observed).reshape(len(observed), -1).all(axis=1))
         # Images of thousands of rows would take gigabytes, for a start that training changes anyway.
-        rows = known[:: -(-len(known) // MATCHED)] if len(known) else known
+        rows = finite_rows[:: -(-len(finite_rows) // MATCHED)] if len(finite_rows) else finite_rows
         gain = np.zeros(2, np.float32)
         # Reports are linear in the gain but for floors, which further passes leave behind.
         for _ in range(MATCHING if len(rows) else 0):

@@ -234,8 +234,8 @@ class CsiReceiver(ReceiverModel):
     def of(cls, form: ObservationSpec, receiver: Receiver) -> CsiReceiver:
         """Model of a receiver whose observations have a form."""
         # Without frequencies no path is evaluated. Narrow channels may state their carrier alone.
-        known = 0.0 if form.frequencies_hz is None else form.frequencies_hz
-        tones = tuple(map(float, np.broadcast_to(known, form.outputs[-1:])))
+        frequencies_hz = 0.0 if form.frequencies_hz is None else form.frequencies_hz
+        tones = tuple(map(float, np.broadcast_to(frequencies_hz, form.outputs[-1:])))
         # With features (uplink) each antenna has a condition, so the model has one antenna.
         several = len(form.outputs) > 1 and not form.features
         return cls(*form.size, tones, _elements(receiver, form.outputs[0]) if several else None, form.basis)

@@ -196,7 +196,7 @@ def register(model: type[ReceiverModel]) -> None:
 
 def receiver_model(name: str, task: str) -> type[ReceiverModel]:
     """The receiver model of a name, for a task; `InputError` for an unknown name, or a model of another task."""
-    able = [known for known in RECEIVERS if task in RECEIVERS[known].tasks]
+    able = [key for key in RECEIVERS if task in RECEIVERS[key].tasks]
     if name not in RECEIVERS:
         raise InputError(f"receiver model {name!r}: unknown; choose from {', '.join(able)}")
     if name not in able:

@@ -64,10 +64,10 @@ class Residuals:
         """Residuals that a model left, at the training rows of a split that is the model's or holds out more."""
         by_receiver: dict[int, Kriged] = {}
         for receiver, (rows, residual) in left.items():
-            known = np.isin(rows, _training_rows(record, split, receiver))
-            if known.sum() >= LEAST_RESIDUALS:
-                residual = residual if known.all() else residual[known]
-                by_receiver[receiver] = Kriging(seed=seed).fit(record.tx_pos_m[rows[known]], residual)
+            in_training = np.isin(rows, _training_rows(record, split, receiver))
+            if in_training.sum() >= LEAST_RESIDUALS:
+                residual = residual if in_training.all() else residual[in_training]
+                by_receiver[receiver] = Kriging(seed=seed).fit(record.tx_pos_m[rows[in_training]], residual)
         return cls(by_receiver)
 
     def __call__(self, tx_pos_m: FloatArray, receiver: int, shape: tuple[int, ...]) -> NDArray[Any] | float:
@@ -302,8 +302,8 @@ class FittedMixture(Fitted):
         """Fit the probability of reception by the parts' predictions of `HeldOut.every`, fitted without these rows."""
         record, pairs = self.problem.record, rows.held_out.every.T
         distance_m = RowDistance.of_rows(record, rows.fold.all_train).of_pairs(record, *pairs)
-        stated = self.with_intervals(mixed(self.weights(distance_m), every, self._states), distance_m)
-        self.reception = Reception.fit(record, self.known, rows.fold.all_train, rows.held_out, stated)
+        predictions = self.with_intervals(mixed(self.weights(distance_m), every, self._states), distance_m)
+        self.reception = Reception.fit(record, self.known, rows.fold.all_train, rows.held_out, predictions)
 
     def arrays(self) -> Arrays:
         """Fields, and the arrays of the parts."""

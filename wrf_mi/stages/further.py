@@ -56,8 +56,8 @@ class Further(Fitted):
 
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions by the stages before, up to each and to the last of them."""
-        kept = [report["stage"] for report in self.facts()["stages"] if report["kept"]]
-        last = kept[kept.index(self.stage) - 1] if self.stage in kept[1:] else ""
+        kept_stages = [report["stage"] for report in self.facts()["stages"] if report["kept"]]
+        last = kept_stages[kept_stages.index(self.stage) - 1] if self.stage in kept_stages[1:] else ""
         if not last:
             return self.before.by_stage(split)
         count = len(first_of(self).problem.record.receivers)
@@ -130,10 +130,10 @@ def fit_further(
     assert fitted is not None
     for stage in stages:
         of_stage = [report for report in engine.reports if report.stage == stage.name]
-        taken = next((report for report in of_stage if report.taken), None)
-        if taken is not None:
+        taken_report = next((report for report in of_stage if report.taken), None)
+        if taken_report is not None:
             seconds = sum(report.seconds or 0.0 for report in of_stage)
-            reports.append(StageReport(stage.name, taken is not of_stage[0], taken.held_out, seconds))
+            reports.append(StageReport(stage.name, taken_report is not of_stage[0], taken_report.held_out, seconds))
     options = [report for report in engine.stated_reports() if report["stage"] in names]
     return fitted, stated_reports(reports), options
 

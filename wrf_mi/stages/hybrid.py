@@ -179,8 +179,8 @@ def _fitted(problem: Problem, split: Split, session: Session) -> FittedMixture:
     if KRIGING in fit.names and len(fit.names) > 1:
         gained = problem.record.task.kriged_about_paths or not {KRIGING, RESIDUAL}.isdisjoint(used)
         reports.append(StageReport(RESIDUAL, gained, scores.get(NAME), time.perf_counter() - begun))
-    stated = {"stages": stated_reports(reports), "form": chosen.form, "held_out": scores}
-    fitted = fit.mixture(chosen, residuals, stated)
+    facts = {"stages": stated_reports(reports), "form": chosen.form, "held_out": scores}
+    fitted = fit.mixture(chosen, residuals, facts)
     weights = zip(map(float, fitted.mixture.distance_m), fitted.mixture.weights.tolist(), strict=True)
     fitted.stated["weights"] = [{"distance_m": at_m, **dict(zip(used, row, strict=True))} for at_m, row in weights]
     options = [{"part": name, **report} for name, part in fit.fitted.items() for report in part.options]
@@ -226,9 +226,9 @@ class Hybrid(Model):
         if not names:
             return _fitted(problem, split, session)
         fitted, reports, options = fit_further(self, _fitted, names, problem, split, session)
-        stated = first_of(fitted).stated
-        stated["stages"] = [*stated["stages"], *reports]
-        stated["options"] = [*stated.get("options", []), *options]
+        facts = first_of(fitted).stated
+        facts["stages"] = [*facts["stages"], *reports]
+        facts["options"] = [*facts.get("options", []), *options]
         return fitted
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:

@@ -55,8 +55,8 @@ class StrengthKriging(GenericKriging):
         if self.pools_receivers(problem):
             return {**unused, **unused_of_pooled(problem)}
         why = "no single carrier is known"
-        if stated := sorted(GENERIC_ONLY & problem.stated_settings) or ["generic"] * problem.settings.generic:
-            why = f"each receiver is kriged alone with {stated[0]}"
+        if generic_settings := sorted(GENERIC_ONLY & problem.stated_settings) or ["generic"] * problem.settings.generic:
+            why = f"each receiver is kriged alone with {generic_settings[0]}"
         return {**unused, **dict.fromkeys(POOLED_ONLY, why)}
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:

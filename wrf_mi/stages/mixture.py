@@ -124,7 +124,8 @@ class MixtureFit:
         distance_m, higher = self.rows.held_out.distance_m, self._problem.record.task.higher_is_better
         every, alone = np.arange(len(distance_m)), np.eye(len(self.names))
         weights = {
-            name: np.broadcast_to(one, (len(every), len(one))) for name, one in zip(self.names, alone, strict=True)
+            name: np.broadcast_to(weight, (len(every), len(weight)))
+            for name, weight in zip(self.names, alone, strict=True)
         }
         weights[self.name] = chosen.mixture(distance_m)
         return {name: (1 if higher else -1) * float(self._score(each, every).mean()) for name, each in weights.items()}
@@ -146,7 +147,7 @@ class MixtureFit:
             residuals: what the scene's side leaves, if that has a weight.
             stated: entries of ``metrics.json``, to which the sizes of expected errors are added.
         """
-        used, known = self.used(chosen), self._problem.rows(self._split)
+        used, trained_rows = self.used(chosen), self._problem.rows(self._split)
         parts = {name: self.part(name) for name in used if name != RESIDUAL}
         columns = [self.names.index(name) for name in used]
         weights = Mixture(chosen.mixture.distance_m, chosen.mixture.weights[:, columns])
@@ -155,7 +156,7 @@ class MixtureFit:
             deviations, intervals = self._intervals(self.rows.held_out, chosen.cross_fitted, parts)
         of_errors = residuals if RESIDUAL in used else None, intervals, deviations
         stated = stated | {"sizes": STATED if deviations else PREDICTED}
-        fitted = FittedMixture(self.name, self._problem, known, parts, weights, *of_errors, stated)
+        fitted = FittedMixture(self.name, self._problem, trained_rows, parts, weights, *of_errors, stated)
         if self.rows is not None:
             every = [self.predictions[name].every for name in parts]
             pairs = [predicted for predicted in every if predicted is not None]

@@ -75,10 +75,10 @@ class StrengthResidual(Stage):
         if option.name != BY_SEARCH:
             return option
         assert isinstance(chosen.fitted, Strengths)
-        found = replace(self.settings, shadowing=DEFAULT, **asdict(chosen.fitted.field.hyperparameters))
+        settings = replace(self.settings, shadowing=DEFAULT, **asdict(chosen.fitted.field.hyperparameters))
 
         def fit(state: State, split: Split, session: Session) -> State:
-            state = self._fit(found, state, split, session)
+            state = self._fit(settings, state, split, session)
             assert isinstance(state.fitted, Strengths)
             return replace(state, fitted=replace(state.fitted, shadowing=BY_SEARCH))
 

@@ -64,10 +64,10 @@ class FittedInScene(Fitted):
     def traced(self, problem: Problem, split: Split) -> PredictAll:
         """Observations [n_rx, m, ...] traced in a problem's scene, of strengths with offsets by some training rows."""
         record, how = problem.record, default_options(problem.record)
-        stated = record if record.carriers_hz is None else record.at_carrier(record.carriers_hz[0])
+        single_carrier = record if record.carriers_hz is None else record.at_carrier(record.carriers_hz[0])
         options = TraceOptions(transmission=True, depth=how.depth, reflections=how.reflections)
         assert problem.scene is not None
-        tracer = RayTracer(problem.scene, instrument_of(stated), options, problem.material)
+        tracer = RayTracer(problem.scene, instrument_of(single_carrier), options, problem.material)
         offsets = None
         if record.task.has_offsets:
             rows = some_rows(split)

@@ -181,6 +181,6 @@ class TracedStrengths(Model):
 def _stage_reports(options: Sequence[OptionReport]) -> list[StageReport]:
     """Reports of the mean, and of the calibration where it was tried: whether it was taken, and its score."""
     of_mean = [option for option in options if option.stage == MEAN]
-    taken = next(option for option in of_mean if option.taken)
+    taken_option = next(option for option in of_mean if option.taken)
     seconds = sum(option.seconds or 0.0 for option in of_mean)
-    return [StageReport(MEAN, True, taken.held_out, seconds), *scene_reports(options, False)[1:]]
+    return [StageReport(MEAN, True, taken_option.held_out, seconds), *scene_reports(options, False)[1:]]

@@ -23,8 +23,8 @@ LOSSES.add_builtin(
 def known_loss(name: str) -> Loss:
     """The loss of a name (InputError: there is none)."""
     if name not in LOSSES:
-        known = ", ".join(LOSSES)
-        raise InputError(f"loss {name!r}: no such loss; choose from {known}, or add yours (docs/howto/extend.md)")
+        choices = ", ".join(LOSSES)
+        raise InputError(f"loss {name!r}: no such loss; choose from {choices}, or add yours (docs/howto/extend.md)")
     return LOSSES[name]
 
 

@@ -75,15 +75,15 @@ def conditions_of(rows: IntArray, outputs: Outputs) -> IntArray:
 def outputs_of(record: Record) -> Outputs:
     """The outputs for a record (InputError: other antennas than the uplink's, or several receivers beside one)."""
     if not record.task.is_complex:
-        known = record.frequencies_hz
-        return Outputs(False, 1, np.zeros(1) if known is None else np.asarray(known, float)[:1])
+        frequencies_hz = record.frequencies_hz
+        return Outputs(False, 1, np.zeros(1) if frequencies_hz is None else np.asarray(frequencies_hz, float)[:1])
     shape = record.observation.shape
     antennas, subcarriers = (1, shape[2]) if len(shape) == 3 else (shape[2], shape[3])
     # Narrow channels may come with their carrier alone.
-    stated = np.zeros(1) if record.frequencies_hz is None else np.asarray(record.frequencies_hz, float)
-    known = np.broadcast_to(stated, (subcarriers,))
+    stated_hz = np.zeros(1) if record.frequencies_hz is None else np.asarray(record.frequencies_hz, float)
+    frequencies_hz = np.broadcast_to(stated_hz, (subcarriers,))
     if record.uplink is None:
-        return Outputs(False, antennas, np.tile(known, antennas))
+        return Outputs(False, antennas, np.tile(frequencies_hz, antennas))
     if record.uplink.shape[1] != antennas:
         raise InputError(
             f"{record.name}: has an uplink of {record.uplink.shape[1]} antennas and a downlink of {antennas}; "
@@ -91,7 +91,7 @@ def outputs_of(record: Record) -> Outputs:
         )
     if len(record.receivers) != 1:
         raise InputError(f"{record.name}: has one uplink for {len(record.receivers)} receivers; give one each")
-    return Outputs(True, antennas, known)
+    return Outputs(True, antennas, frequencies_hz)
 
 
 def scene_carrier(record: Record, rows: IntArray | slice = slice(None)) -> float:

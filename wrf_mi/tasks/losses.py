@@ -39,10 +39,10 @@ def squared_error(prediction: Any, truth: Any, *shape: int) -> Any:
 
 
 def _mean_error(function: Callable[[Any], Any], prediction: Any, truth: Any) -> Any:
-    known = dr.isfinite(truth)
-    count = dr.sum(dr.select(known, type(truth)(1), 0))
-    error = function(prediction - dr.select(known, truth, 0))
-    return dr.sum(dr.select(known, error, 0)) / dr.maximum(count, 1)
+    finite = dr.isfinite(truth)
+    count = dr.sum(dr.select(finite, type(truth)(1), 0))
+    error = function(prediction - dr.select(finite, truth, 0))
+    return dr.sum(dr.select(finite, error, 0)) / dr.maximum(count, 1)
 
 
 def light_error(prediction: Any, truth: Any, pixels: int) -> Any:

@@ -103,8 +103,8 @@ def inside_interval(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> 
     """
     error = np.abs(np.asarray(prediction) - np.asarray(truth))
     bound = COMPLEX_90 if np.iscomplexobj(truth) else REAL_90
-    known = np.isfinite(error)
-    return float((error <= bound * np.asarray(std, float))[known].mean())
+    finite = np.isfinite(error)
+    return float((error <= bound * np.asarray(std, float))[finite].mean())
 
 
 def crps(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> float:
@@ -122,8 +122,8 @@ def crps(prediction: ArrayLike, std: ArrayLike, truth: ArrayLike) -> float:
     if np.iscomplexobj(expected):
         parts = (crps(part(mean), spread / np.sqrt(2), part(expected)) for part in (np.real, np.imag))
         return sum(parts) / 2
-    known = np.isfinite(expected)
-    error, spread = (expected - mean)[known].astype(float), spread[known]
+    finite = np.isfinite(expected)
+    error, spread = (expected - mean)[finite].astype(float), spread[finite]
     z = error / spread
     density = np.exp(-np.square(z) / 2) / np.sqrt(2 * np.pi)
     return float((spread * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))).mean())

@@ -341,8 +341,8 @@ def fit_intervals(
     ratio = np.empty(len(error))
     for name in names:
         out = number == name
-        kept = [values[~out] for values in (sizes, error / inside, distance, rows)]
-        others = _fitted_intervals(kept[0], kept[1], kept[2], kept[3], floor, one_each)
+        remaining = [values[~out] for values in (sizes, error / inside, distance, rows)]
+        others = _fitted_intervals(remaining[0], remaining[1], remaining[2], remaining[3], floor, one_each)
         ratio[out] = error[out] / (inside * others.widths(sizes[out], distance[out]))
     return replace(of_all, std=of_all.std * max(float(np.quantile(ratio, LEVEL)), 1.0))
 

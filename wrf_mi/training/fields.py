@@ -57,8 +57,8 @@ def make_field(config: TrainConfig, components: int = 1, features: int = 0, carr
 
 
 def _sizes(model: str, network: NetworkConfig) -> dict[str, Any]:
-    stated = {name: getattr(network, name) for name in ("width", "layers", "terms")}
-    sizes: dict[str, Any] = {name: size for name, size in stated.items() if size}
+    network_sizes = {name: getattr(network, name) for name in ("width", "layers", "terms")}
+    sizes: dict[str, Any] = {name: size for name, size in network_sizes.items() if size}
     if model == "wrf-gs" and network.width:
         sizes["signal_widths"] = (network.width, max(1, network.width // 2))
     if model == "wrf-gs+":

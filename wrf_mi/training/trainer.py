@@ -107,11 +107,11 @@ class Trainer(TrainingLoop):
         keep their starting values, but for Gaussians on surfaces, which have places of their own.
         """
         start, chosen = self.state.params(), before.state
-        stated, stated_before = (trainer.graph.parameters(trainer.plan.sides) for trainer in (self, before))
+        parameters, parameters_before = (trainer.graph.parameters(trainer.plan.sides) for trainer in (self, before))
         fitted = {name: v for name, v in params.items() if name in start and v.shape == start[name].shape}
-        for name, values in stated.items():
-            if name in fitted and name in stated_before and stated_before[name].shape == values.shape:
-                fitted[name] = values + (fitted[name] - stated_before[name])
+        for name, values in parameters.items():
+            if name in fitted and name in parameters_before and parameters_before[name].shape == values.shape:
+                fitted[name] = values + (fitted[name] - parameters_before[name])
         discs = {name: values for name, values in params.items() if name in (DISC, FACTOR)}
         self.state = FitState(start | fitted | discs, self.state.adam.beta_1)
         for name in ("chosen", "reach_m", "phase_error", *OF_FIT):

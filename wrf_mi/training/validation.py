@@ -112,8 +112,8 @@ class Validation:
         if not len(test):
             return facts
         # Validation rows are compared with test rows as they are predicted: by a field that all of these rows trained.
-        known = split.all_train if plan.schedule.joined < plan.loop.steps else split.train
-        facts["test_m"] = float(np.median(cKDTree(record.tx_pos_m[known]).query(record.tx_pos_m[test])[0]))
+        training_rows = split.all_train if plan.schedule.joined < plan.loop.steps else split.train
+        facts["test_m"] = float(np.median(cKDTree(record.tx_pos_m[training_rows]).query(record.tx_pos_m[test])[0]))
         far = (away_m >= facts["test_m"]) & np.isfinite(self.scores)
         if not far.any():
             return facts

@@ -119,9 +119,9 @@ class FittedField(Fitted):
         if self.problem.scene is None:
             return super().in_scene(scene)
         edited = replace(self.problem, scene=scene, material=None)
-        opened, stated = (problem.open_scene(self.form.carrier_hz) for problem in (edited, self.problem))
+        opened, fitted_scene = (problem.open_scene(self.form.carrier_hz) for problem in (edited, self.problem))
         try:
-            params = parameters_in(opened, stated, self.params)
+            params = parameters_in(opened, fitted_scene, self.params)
         except InputError as error:
             raise InputError(f"{scene}: {error}; trained in {self.problem.scene}") from None
         return replace(self, problem=edited, params=params)
@@ -358,9 +358,9 @@ class GaussianField(Model):
     def _plan(self, problem: Problem, split: Split) -> FitPlan:
         """Plan of a fit, taken from `check` where data, rows, settings and scene are the same."""
         (record, rows), scene = trained_part(problem.record, split), _scene(problem, split)
-        config, known = problem.settings.resolved(record.tx_pos_m[rows.all_train]), list[FitPlan](problem.checked)
+        config, plans = problem.settings.resolved(record.tx_pos_m[rows.all_train]), list[FitPlan](problem.checked)
         problem.checked.clear()  # a training changes the graph of its plan
-        for plan in known:
+        for plan in plans:
             same = plan.record is record and plan.config == config and plan.graph.scene is scene
             parts = (plan.split.train, rows.train), (plan.split.validation, rows.validation)
             if same and all(np.array_equal(*part) for part in parts):

@@ -126,8 +126,8 @@ class ByReceiver(Fitted):
                 return model.prediction(tx_pos_m)
             return Prediction(model.predict(tx_pos_m, heading))
         if inputs.carriers_hz is None:
-            known = carriers_text(self.carriers_hz)
-            raise InputError(f"{self.name}: trained at {known}; give the carrier of every row")
+            carriers = carriers_text(self.carriers_hz)
+            raise InputError(f"{self.name}: trained at {carriers}; give the carrier of every row")
         models = self._of(receiver)
         fitted, known_log = list(models.values()), np.log(self.carriers_hz[list(models)])
 

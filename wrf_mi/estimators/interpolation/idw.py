@@ -146,8 +146,8 @@ class Idw(ByReceiverModel):
 
 
 def _softening_m(problem: Problem) -> float:
-    stated: float | None = problem.settings.softening_m
-    return problem.record.task.softening_m if stated is None else stated
+    softening_m: float | None = problem.settings.softening_m
+    return problem.record.task.softening_m if softening_m is None else softening_m
 
 
 def best_count(problem: Problem, split: Split) -> int:
@@ -160,14 +160,17 @@ def best_count(problem: Problem, split: Split) -> int:
     record, task, rows = problem.record, problem.record.task, hold_out_once(problem, split)
     if rows is None:
         return task.neighbours
-    seen, held_out, apart = record.seen(rows.fold), rows.held_out, _rows_apart(split)
+    fold_record, held_out, apart = record.seen(rows.fold), rows.held_out, _rows_apart(split)
     softening_m, total = _softening_m(problem), np.zeros(len(COUNTS))
     for receiver in np.unique(held_out.receiver):
-        known, values = rows_at_receiver(seen, rows.fold.all_train, receiver), record.observation[receiver]
+        training_rows, values = (
+            rows_at_receiver(fold_record, rows.fold.all_train, receiver),
+            record.observation[receiver],
+        )
         tested, blends = list[int](), list[NDArray[Any]]()
         for row in held_out.row[held_out.receiver == receiver]:
             # By place alone flat-ble's path chose 8, with 0.4 dB more error on another path than 100.
-            usable = _at_nearest_carrier(record, known[np.abs(known - row) >= apart], row)
+            usable = _at_nearest_carrier(record, training_rows[np.abs(training_rows - row) >= apart], row)
             if len(usable):
                 distance_m = np.linalg.norm(record.tx_pos_m[usable] - record.tx_pos_m[row], axis=1) + softening_m
                 nearest = np.argsort(distance_m)[: COUNTS[-1]]

@@ -198,9 +198,9 @@ class Kriging(CovarianceSettings):
             (self.heading_length, HEADING_LENGTH, 1.0),
             (self.noise, NOISE, 0.1),
         ]
-        stated, limits, first = zip(*(table if circle is not None else [table[0], table[2]]), strict=True)
-        free = np.array([value is None for value in stated])
-        value = np.array([0.0 if v is None else v for v in stated])
+        hyperparameters, limits, first = zip(*(table if circle is not None else [table[0], table[2]]), strict=True)
+        free = np.array([value is None for value in hyperparameters])
+        value = np.array([0.0 if v is None else v for v in hyperparameters])
         if not free.any():
             return value[:-1], float(value[-1])
         root = component_root(field[rows])
@@ -330,6 +330,6 @@ def kriged(rows: ReceiverRows) -> Kriged:
         raise InputError(f"kriging: trend {name!r}; choose {CONSTANT} or {LOG_DISTANCE}")
     # The law of distance is that of the whole room: each row weighs the same in it, however dense the rows around it.
     how: Any = s.trend_fit or ("ols" if name == LOG_DISTANCE else "gls")
-    stated = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
-    kriging = Kriging(*stated, _trend(name, rows.receiver), how, rows.problem.seed)
+    arguments = s.length_m, s.noise, s.heading_length, s.kernel, s.likelihood_rows
+    kriging = Kriging(*arguments, _trend(name, rows.receiver), how, rows.problem.seed)
     return kriging.fit(rows.tx_pos_m, rows.observation, rows.tx_heading_rad)

@@ -185,15 +185,15 @@ class KrigingSystem:
         others, and so its inverse times K^-1 y is what these others leave of the block's observations (Dubrule, 1983).
         """
         half, trend, solved = self._half_inverse(), self.solve(self.trend), self.solve(values)
-        found = []
+        results = []
         for rows in blocks:
             system = KrigingSystem(half[np.ix_(rows, rows)])
             error, gap = system.solve(solved[rows]), system.solve(trend[rows])
             lost = trend[rows].T @ gap, trend[rows].T @ error
             if len(rows) == len(half):  # the same, and without rounding nothing is left of both
                 lost = self.information, self.trend.T @ solved
-            found.append(Block(error, gap, system.inverse_diagonal, *lost))
-        return found
+            results.append(Block(error, gap, system.inverse_diagonal, *lost))
+        return results
 
     def restricted_cost(self, root: FloatArray, least: float) -> float:
         """Minus twice the logarithm of the restricted likelihood of one component, the field's variance at its best.

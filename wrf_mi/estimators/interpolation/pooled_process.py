@@ -88,46 +88,48 @@ class Coefficients:
         self._parts = list[tuple[Any, ...]]()
         self.log_determinant = 0.0
         for basis, block, value in zip(bases, information, projected, strict=True):
-            own = count[basis.used] == 1
-            shared, own_prior = place[basis.used[~own]], np.diag(prior[basis.used[own]])
-            inverse = np.linalg.inv(block[np.ix_(own, own)] + own_prior)
-            twins = _twins(basis.columns, own)
+            unshared = count[basis.used] == 1
+            shared, own_prior = place[basis.used[~unshared]], np.diag(prior[basis.used[unshared]])
+            inverse = np.linalg.inv(block[np.ix_(unshared, unshared)] + own_prior)
+            twins = _twins(basis.columns, unshared)
             # Schur complement: what is left of the common coefficients' precision, A - A (A + L)^-1 A.
             if twins is None:
-                coupling = block[np.ix_(~own, own)] @ inverse
-                precision[np.ix_(shared, shared)] += block[np.ix_(~own, ~own)] - coupling @ block[np.ix_(own, ~own)]
-                right[shared] += value[~own] - coupling @ value[own]
+                coupling = block[np.ix_(~unshared, unshared)] @ inverse
+                precision[np.ix_(shared, shared)] += (
+                    block[np.ix_(~unshared, ~unshared)] - coupling @ block[np.ix_(unshared, ~unshared)]
+                )
+                right[shared] += value[~unshared] - coupling @ value[unshared]
             else:
                 # Without noise A is 1e14 times L, and the difference rounding: it is L - L (A + L)^-1 L.
                 chosen = own_prior[:, twins]
                 coupling = (np.eye(len(own_prior))[:, twins] - inverse @ chosen).T
                 precision[np.ix_(shared, shared)] += chosen[twins] - chosen.T @ inverse @ chosen
-                right[shared] += chosen.T @ inverse @ value[own]
+                right[shared] += chosen.T @ inverse @ value[unshared]
             self.log_determinant -= float(np.linalg.slogdet(inverse)[1])
-            self._parts.append((own, shared, inverse, coupling))
+            self._parts.append((unshared, shared, inverse, coupling))
         self.log_determinant += float(np.linalg.slogdet(precision)[1])
         self._common = np.linalg.inv(precision)
         self.mean = np.zeros(len(prior_sd))
         self.mean[common] = self._common @ right
-        for number, value, (own, shared, inverse, coupling) in zip(used, projected, self._parts, strict=True):
-            self.mean[number[own]] = inverse @ value[own] - coupling.T @ self.mean[common[shared]]
+        for number, value, (unshared, shared, inverse, coupling) in zip(used, projected, self._parts, strict=True):
+            self.mean[number[unshared]] = inverse @ value[unshared] - coupling.T @ self.mean[common[shared]]
 
     def covariance(self, receiver: int) -> FloatArray:
         """Covariance [p, p] of the coefficients of a receiver."""
-        own, shared, inverse, coupling = self._parts[receiver]
+        unshared, shared, inverse, coupling = self._parts[receiver]
         common = self._common[np.ix_(shared, shared)]
-        result = np.empty((len(own), len(own)))
-        result[np.ix_(~own, ~own)], across = common, -common @ coupling
-        result[np.ix_(~own, own)], result[np.ix_(own, ~own)] = across, across.T
-        result[np.ix_(own, own)] = inverse - coupling.T @ across
+        result = np.empty((len(unshared), len(unshared)))
+        result[np.ix_(~unshared, ~unshared)], across = common, -common @ coupling
+        result[np.ix_(~unshared, unshared)], result[np.ix_(unshared, ~unshared)] = across, across.T
+        result[np.ix_(unshared, unshared)] = inverse - coupling.T @ across
         return result
 
 
-def _twins(columns: FloatArray, own: NDArray[np.bool_]) -> list[int] | None:
+def _twins(columns: FloatArray, unshared: NDArray[np.bool_]) -> list[int] | None:
     """For each common column of a receiver the place of an equal one among its own; None where one has none."""
     places = [
-        next((j for j, other in enumerate(columns.T[own]) if np.array_equal(column, other)), None)
-        for column in columns.T[~own]
+        next((j for j, other in enumerate(columns.T[unshared]) if np.array_equal(column, other)), None)
+        for column in columns.T[~unshared]
     ]
     return None if None in places else [place for place in places if place is not None]
 
@@ -216,7 +218,7 @@ class PooledProcess:
 
         numbers = range(len(self._parts))
         of_receivers = of_each(blocks, numbers, sum(len(part.value) for part in self._parts))
-        found = []
+        results = []
         for fold, of_fold in zip(folds, zip(*of_receivers, strict=True), strict=True):
             information = [every - block.information for every, block in zip(self._information, of_fold, strict=True)]
             projected = [every - block.projected for every, block in zip(self._projected, of_fold, strict=True)]
@@ -228,8 +230,8 @@ class PooledProcess:
                 field = np.maximum(block.variance - part.variance[rows], 0)
                 trend = np.einsum("mp,mp->m", block.gap @ left.covariance(receiver), block.gap)
                 variances.append(field + np.maximum(trend, 0))
-            found.append(LeftOut(left.mean, means, variances))
-        return found
+            results.append(LeftOut(left.mean, means, variances))
+        return results
 
     def trend(self, basis: Basis) -> FloatArray:
         """Posterior mean [m] of phi . beta."""

@@ -82,8 +82,8 @@ class RunOffsets:
         offsets, variances = np.zeros(count), np.full(count, self.sd_db**2)
         if runs is not None:
             number = run_numbers(runs, self.names.tolist())
-            known = (number >= 0) & (number < len(self.names))
-            offsets[known] = self.offset_db[number[known]]
+            has_offset = (number >= 0) & (number < len(self.names))
+            offsets[has_offset] = self.offset_db[number[has_offset]]
             variances[number < len(self.names)] = 0.0
         return offsets, variances
 
@@ -92,10 +92,10 @@ def _differences(stops: Stops) -> Iterator[FloatArray]:
     """Runs of two stops that are near each other, and the difference of what a receiver received there [q, 3]."""
     run, position_m = stops.poses.run, stops.poses.position_m
     assert run is not None
-    stated = run >= 0
-    reach_m = float(np.clip(_apart_m(position_m[stated], run[stated]), NEAR_M, FAR_M))
+    in_run = run >= 0
+    reach_m = float(np.clip(_apart_m(position_m[in_run], run[in_run]), NEAR_M, FAR_M))
     for values in stops.value_dbm:
-        received = np.flatnonzero(np.isfinite(values) & stated)
+        received = np.flatnonzero(np.isfinite(values) & in_run)
         if len(received) > MOST_STOPS:
             received = received[np.linspace(0, len(received) - 1, MOST_STOPS).round().astype(np.int64)]
         near = cKDTree(position_m[received]).query_pairs(reach_m, output_type="ndarray")
@@ -109,6 +109,6 @@ def _apart_m(position_m: FloatArray, run: IntArray) -> float:
     """Distance to the nearest stop of another run that a share `SHARE` of the stops has, metres."""
     nearest = np.full(len(run), np.inf)
     for number in np.unique(run):
-        own = run == number
-        nearest[own] = cKDTree(position_m[~own]).query(position_m[own])[0] if (~own).any() else np.inf
+        in_run = run == number
+        nearest[in_run] = cKDTree(position_m[~in_run]).query(position_m[in_run])[0] if (~in_run).any() else np.inf
     return float(np.quantile(nearest, SHARE)) if len(run) and np.isfinite(nearest).all() else 0.0

@@ -215,8 +215,8 @@ class SignalProcess:
         cross = self.covariances.mixed(np.asarray(tx_pos_m, float), self.tx_pos_m, self.weight)
         mean = np.einsum("cqi,ci->qc", cross, self._solved)
         whitened = (system.whiten(part.conj().T) for system, part in zip(self._systems, cross, strict=True))
-        known = np.stack([np.square(np.abs(part)).sum(axis=0) for part in whitened], axis=1)
-        return self._posterior(mean, self.prior - known)
+        explained = np.stack([np.square(np.abs(part)).sum(axis=0) for part in whitened], axis=1)
+        return self._posterior(mean, self.prior - explained)
 
     @property
     def prior(self) -> FloatArray:

@@ -354,8 +354,8 @@ class SpectrumKriging(GenericKriging):
                         raise InputError(f"{len(observed)} rows are too many for a process of element signals")
                     signals = _retrieved(observed, lags, rows.problem.seed, rows.on_progress)
                 except InputError as error:  # or a line of elements, or elements too far apart for lags
-                    if stated := OF_SIGNALS & rows.problem.stated_settings:
-                        raise InputError(f"setting {min(stated)}: no effect, as {error}; omit it") from None
+                    if unused_settings := OF_SIGNALS & rows.problem.stated_settings:
+                        raise InputError(f"setting {min(unused_settings)}: no effect, as {error}; omit it") from None
                     what = f"{record.name}, receiver {receiver.name}"
                     logger.warning("%s: the spectra themselves are kriged: %s", what, error)
                 else:

@@ -166,12 +166,14 @@ class StrengthPosterior:
         blocks = [[np.flatnonzero(mask[k, rows]) for k, rows in enumerate(received)] for mask in left]
         folds = self._process.without(blocks)
         spread = folds if self._spread_process is self._process else self._spread_process.without(blocks)
-        found = []
+        predictions = []
         for mask, block, means, variances in zip(left, blocks, folds, spread, strict=True):
             mean, variance = np.full((2, *mask.shape), np.nan)
             residuals = self._process.residuals(means.beta)
-            known = [(rows[~mask[k, rows]], value[~mask[k, rows]]) for k, (rows, value) in enumerate(residuals)]
-            forest = Forest.grown(known, self.stops.poses, trees) if self.trees else None
+            training_residuals = [
+                (rows[~mask[k, rows]], value[~mask[k, rows]]) for k, (rows, value) in enumerate(residuals)
+            ]
+            forest = Forest.grown(training_residuals, self.stops.poses, trees) if self.trees else None
             for k, rows in enumerate(received):
                 out, (_, _, value) = rows[block[k]], self._terms[k]
                 # Values of the process are less what is expected.
@@ -181,8 +183,8 @@ class StrengthPosterior:
                     mean[k, out], variance[k, out] = np.add(
                         (mean[k, out], variance[k, out]), forest.predict(self.stops.poses.take(out), k)
                     )
-            found.append((mean, variance))
-        return found
+            predictions.append((mean, variance))
+        return predictions
 
     @property
     def noise(self) -> float:
@@ -291,16 +293,16 @@ def by_search(
             ]
         return float(np.nanmean(np.concatenate(errors)))
 
-    found, best = start, error_db(start) if parts else 0.0
+    chosen, best = start, error_db(start) if parts else 0.0
     for names in (("shadow_m",), ("shadow_db",), PARTS_OF_NOISE) if parts else ():
         free = [name for name in names if name not in stated]
         for factor in (SEARCH_STEP, 1 / SEARCH_STEP) if free else ():
             for _ in range(MOST_STEPS):
-                other = replace(found, **{name: getattr(found, name) * factor for name in free})
+                other = replace(chosen, **{name: getattr(chosen, name) * factor for name in free})
                 if (error := error_db(other)) > best - LEAST_GAIN_DB:
                     break
-                found, best = other, error
-    return found
+                chosen, best = other, error
+    return chosen
 
 
 def likely_deviations(
@@ -358,11 +360,11 @@ def widening(residual_db: FloatArray, std_db: FloatArray) -> FloatArray:
     The factor of a receiver with few residuals tends to that of all, and that of few residuals in all to 1.
     """
     score = np.abs(residual_db) / std_db / REAL_90
-    known = np.isfinite(score)
+    finite = np.isfinite(score)
 
     def quantile(values: FloatArray, prior: float) -> float:
         weight = len(values) / (len(values) + TRUST)
         return float(np.quantile(values, LEVEL) ** weight * prior ** (1 - weight)) if len(values) else prior
 
-    pooled = quantile(score[known], 1.0)
-    return np.array([quantile(row[which], pooled) for row, which in zip(score, known, strict=True)])
+    pooled = quantile(score[finite], 1.0)
+    return np.array([quantile(row[which], pooled) for row, which in zip(score, finite, strict=True)])

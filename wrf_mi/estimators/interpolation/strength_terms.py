@@ -175,10 +175,10 @@ def basis(
     # The part of each term that is common to all receivers, and that of each; a deviation of 0: there is no such part.
     count, columns, used, deviations = len(receivers_m), list[FloatArray](), list[int](), list[float]()
     for column, common, each in terms:
-        for deviation, size, own in ((common, 1, 0), (each, count, receiver)):
+        for deviation, size, index in ((common, 1, 0), (each, count, receiver)):
             if deviation > 0:
                 columns.append(column)
-                used.append(len(deviations) + own)
+                used.append(len(deviations) + index)
                 deviations += [deviation] * size
     return Basis(np.stack(columns, axis=1), np.array(used)), np.array(deviations)
 
@@ -256,9 +256,9 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
     value = np.where(reports == 1, sums(value_dbm), np.nan)
     for receiver, stop in np.argwhere(reports > 1):
         chunk = slice(begins[stop], begins[stop + 1])
-        known = received[receiver, chunk]
+        heard = received[receiver, chunk]
         # A median, as fades skew the reports of a stop.
-        value[receiver, stop] = _median(value_dbm[receiver, chunk][known], weight[receiver, chunk][known])
+        value[receiver, stop] = _median(value_dbm[receiver, chunk][heard], weight[receiver, chunk][heard])
     run = None if measured.poses.run is None else measured.poses.run[begins[:-1]]
     return Stops(Poses(centre, direction, run), value, total, mean(measured.rows.astype(float)))
 

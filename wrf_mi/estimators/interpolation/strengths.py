@@ -181,8 +181,8 @@ class Strengths(Fitted):
             if EXACT in arrays:
                 assert trace is not None
                 positions_m, power_dbm = arrays["field/stops/poses/position_m"], arrays[EXACT].T
-                known = dict(zip(map(np.ndarray.tobytes, positions_m), power_dbm, strict=True))
-                traced = TracedPower(traced, trace, np.arange(power_dbm.shape[1]), known, keeps=False)
+                power_of_position = dict(zip(map(np.ndarray.tobytes, positions_m), power_dbm, strict=True))
+                traced = TracedPower(traced, trace, np.arange(power_dbm.shape[1]), power_of_position, keeps=False)
         return from_arrays(cls, arrays, traced=traced)
 
     def facts(self) -> dict[str, Any]:
@@ -276,8 +276,8 @@ def calibrated(
     if len(measured.rows) < 2:
         return strengths
     # Rows of a run that is held out have an offset that nobody knows.
-    known = measured if new_runs else _without_offsets(measured, record, strengths.offsets)
-    values, variance = known.value_dbm, strengths.offsets.sd_db**2 if new_runs and strengths.offsets else 0.0
+    calibration_data = measured if new_runs else _without_offsets(measured, record, strengths.offsets)
+    values, variance = calibration_data.value_dbm, strengths.offsets.sd_db**2 if new_runs and strengths.offsets else 0.0
     on_progress("strengths: all rows", 0.8)
     spread = _deviations(strengths, stated)
     field = field.with_spread(spread)
@@ -299,7 +299,7 @@ def calibrated(
     return replace(strengths, field=field, widen=widen, fit_facts=facts)
 
 
-def _deviations(strengths: Strengths, stated: Collection[str]) -> Hyperparameters | None:
+def _deviations(strengths: Strengths, fixed: Collection[str]) -> Hyperparameters | None:
     """Hyperparameters of the deviations, see `likely_deviations`; None: those of the means."""
     field, shadowing = strengths.field, strengths.shadowing
     h, likely = field.hyperparameters, partial(likely_deviations, field.prior, field.stops)
@@ -307,9 +307,9 @@ def _deviations(strengths: Strengths, stated: Collection[str]) -> Hyperparameter
         return None
     if shadowing == TREES:
         # The noise about the shadowing, which the spread of the trees stands for.
-        noise = likely(Hyperparameters(lever_m=h.lever_m), stated)
+        noise = likely(Hyperparameters(lever_m=h.lever_m), fixed)
         return replace(h, drift_db=noise.drift_db, noise_db=noise.noise_db)
-    return likely(h, {*stated, "shadow_db"} if shadowing == NONE else stated)
+    return likely(h, {*fixed, "shadow_db"} if shadowing == NONE else fixed)
 
 
 def _without_offsets(measured: Measured, record: Record, offsets: RunOffsets | None) -> Measured:
@@ -374,5 +374,5 @@ def _transmit_dbm(at_0_dbm: PriorMean, measured: Measured) -> float:
         measured.value_dbm[receiver] - at_0_dbm.columns(measured.poses, receiver)[0]
         for receiver in range(len(measured.value_dbm))
     ]
-    known = np.concatenate(excess)[np.isfinite(np.concatenate(excess))]
-    return float(np.median(known)) if len(known) else 0.0
+    finite_excess = np.concatenate(excess)[np.isfinite(np.concatenate(excess))]
+    return float(np.median(finite_excess)) if len(finite_excess) else 0.0

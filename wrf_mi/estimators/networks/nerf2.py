@@ -226,14 +226,14 @@ def _fit_group(
     record: Record, split: Split, field: Nerf2Field, seed: int, session: FitSession, members: tuple[int, ...]
 ) -> Nerf2Network:
     s, outputs = field.settings, field.outputs
-    known = split.all_train
+    training_rows = split.all_train
     # From here on rows count within the training rows.
     received = {r: received_rows(record, split, r, "nerf2") for r in members}
-    rows = {r: tuple(np.searchsorted(known, part) for part in parts) for r, parts in received.items()}
+    rows = {r: tuple(np.searchsorted(training_rows, part) for part in parts) for r, parts in received.items()}
     rng = np.random.default_rng([seed, *members])
-    condition, _ = field.condition_of(record.inputs(known), members[0])
+    condition, _ = field.condition_of(record.inputs(training_rows), members[0])
     truth = np.concatenate(
-        [conditions.truth_of(record, outputs, r, known, field.scales) for r in range(len(record.receivers))]
+        [conditions.truth_of(record, outputs, r, training_rows, field.scales) for r in range(len(record.receivers))]
     )
     data = field.data | {"condition": condition, "truth": to_tensor(np.nan_to_num(truth))}
     dr.make_opaque(data)
@@ -241,7 +241,7 @@ def _fit_group(
     if field.task.has_offsets:
         # Offsets start at the mean level: the networks then learn differences of a few dB.
         for r in members:
-            initial.offset[r] = np.mean(record.observation[r, known[np.concatenate(rows[r])]])
+            initial.offset[r] = np.mean(record.observation[r, training_rows[np.concatenate(rows[r])]])
     n_rays, spectrum = field.n_rays, field.by_pixel
     config = s if spectrum else replace(s, batch=s.sphere_batch)
     all_rays = opaque_rows(np.arange(n_rays))
@@ -298,16 +298,16 @@ class Nerf2Model(Model):
 
     def fit(self, problem: Problem, split: Split, session: FitSession) -> Nerf2Field:
         """Fit the networks (InputError: unknown positions or poses, or a receiver without training rows)."""
-        record, known = problem.record, split.all_train
+        record, training_rows = problem.record, split.all_train
         outputs, settings = conditions.outputs_of(record), problem.settings
-        where = record.tx_pos_m[known] if outputs.by_uplink else known_positions(record, known, "nerf2")
+        where = record.tx_pos_m[training_rows] if outputs.by_uplink else known_positions(record, training_rows, "nerf2")
         known_rx = np.stack([receiver.position_m for receiver in record.receivers])
         rx = np.stack([receiver.position_m for receiver in conditions.placed_receivers(record, outputs.by_uplink)])
         if np.isfinite(where).all() and np.isfinite(known_rx).all():
             farthest = float(np.linalg.norm(where[:, None] - rx, axis=2).max())
         else:
             where, farthest = rx, FAR_M
-        scales = conditions.channel_scales(record, known)
+        scales = conditions.channel_scales(record, training_rows)
         field = Nerf2Field(problem, settings, Coordinates.of(where), settings.far_m or farthest, scales, [])
         for members in field.groups:
             field.weights.append(_fit_group(record, split, field, problem.seed, session, members).arrays())

@@ -99,9 +99,11 @@ class SpectrumNetwork(Model):
         weights = []
         for r, receiver in enumerate(record.receivers):
             train, validation = received_rows(record, split, r, self.name)
-            known = np.concatenate([train, validation])
-            where = coordinates.features(record.tx_pos_m[known], settings.octaves, settings.scale_m)
-            rows = NetworkRows(receiver.name, np.asarray(record.observation[r, known], np.float32), where, len(train))
+            all_train = np.concatenate([train, validation])
+            where = coordinates.features(record.tx_pos_m[all_train], settings.octaves, settings.scale_m)
+            rows = NetworkRows(
+                receiver.name, np.asarray(record.observation[r, all_train], np.float32), where, len(train)
+            )
             network = self.network(rows, settings, np.random.default_rng([seed, r]))
             trained = train_network(network, settings, (seed, r), session)[0]
             weights.append(getattr(trained, self.generator).arrays())

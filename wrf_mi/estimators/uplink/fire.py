@@ -160,11 +160,14 @@ def _fit(
     """Network and its best validation score."""
     record, s = problem.record, problem.settings
     assert record.uplink is not None
-    known = np.concatenate([train, validation])
-    uplink, downlink = samples_of(record.uplink[known], sample), samples_of(record.observation[0, known], sample)
+    all_train = np.concatenate([train, validation])
+    uplink, downlink = (
+        samples_of(record.uplink[all_train], sample),
+        samples_of(record.observation[0, all_train], sample),
+    )
     unit = units_of(uplink)
     x, y = (real_parts(coefficients / unit[:, None, None]).T for coefficients in (uplink, downlink))
-    per_row = uplink.shape[0] // len(known)
+    per_row = uplink.shape[0] // len(all_train)
     # Samples are in units of their uplink; errors count in units of their row.
     energy = np.square(np.abs(downlink)).sum(axis=(1, 2)).reshape(-1, per_row).mean(axis=1).repeat(per_row)
     # A row without energy has no relative error.
@@ -185,7 +188,7 @@ def _fit(
         rows = (samples.reshape(len(validation), -1) for samples in (predicted, downlink[judges]))
         return float(np.median(relative_error(*rows)))
 
-    first, everything = ([np.arange(len(part) * per_row)] for part in (train, known))
+    first, everything = ([np.arange(len(part) * per_row)] for part in (train, all_train))
     rows_of = draw, first, everything, score if len(validation) else None
     network = Network(f"fire {sample}", fire, fire_loss, data, *rows_of, "relative error")
     config = s if sample == "antenna" else replace(s, batch=ROW_BATCH)

@@ -109,12 +109,12 @@ class LinearModel(UplinkModel):
         """Choose the penalty, then fit the map to all training rows."""
         record, settings = problem.record, problem.settings
         train, validation = self.known_rows(record, split)
-        known = np.concatenate([train, validation])
+        all_train = np.concatenate([train, validation])
         if not len(validation):
             picked = np.arange(len(train)) % JUDGES == 0
             train, validation = train[~picked], train[picked]
         penalty = settings.penalty or choose(record, train, validation, session.report)
-        matrix = ridge(record, known)(penalty)
+        matrix = ridge(record, all_train)(penalty)
         session.report(f"linear: penalty {penalty:.2g}", 1.0)
         return LinearMap(matrix, record.observation.shape[2], penalty)
 

@@ -181,8 +181,8 @@ def _options(record: Record, settings: PathSettings, directions: bool) -> list[t
     """Wave models and bands among which `choose` chooses; errors as there."""
     first = bands_of(record, settings.spacing_hz)
     kinds = _wave_models(record, settings, first.elements_m is not None, directions)
-    known = [first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS]
-    return [(kind, bands) for bands in known for kind in kinds]
+    candidates = [first] if first.known else [bands_of(record, settings.spacing_hz, gap) for gap in BOTH_GAPS]
+    return [(kind, bands) for bands in candidates for kind in kinds]
 
 
 def choose(
@@ -246,10 +246,10 @@ class R2F2(Fitted):
 
     def paths(self, h: Complex, inputs: Inputs) -> UplinkPaths:
         """Paths of uplinks [m, antennas, f] from the positions of ``inputs``."""
-        s, known = self.settings, None
+        s, start = self.settings, None
         if self.scene is not None:
-            known = self.scene(self.waves, h, inputs.tx_pos_m, inputs.tx_heading_rad)
-        return find_paths(self.waves, h, s.max_paths, s.between, s.final, known)
+            start = self.scene(self.waves, h, inputs.tx_pos_m, inputs.tx_heading_rad)
+        return find_paths(self.waves, h, s.max_paths, s.between, s.final, start)
 
 
 class R2F2Model(UplinkModel):

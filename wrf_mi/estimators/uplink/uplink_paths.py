@@ -78,8 +78,8 @@ def find_paths(
     All paths are refined by ``between`` steps after each addition, and by ``final`` steps after the last; those of the
     start by as many before.
     """
-    known = start or Start.none(len(h), 1 + waves.cosines.shape[1])
-    return join_paths(in_parts(lambda rows: _find(waves, h[rows], max_paths, between, final, known[rows]), len(h)))
+    initial = start or Start.none(len(h), 1 + waves.cosines.shape[1])
+    return join_paths(in_parts(lambda rows: _find(waves, h[rows], max_paths, between, final, initial[rows]), len(h)))
 
 
 def refine_paths(waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int) -> UplinkPaths:
@@ -108,15 +108,15 @@ def join_paths(parts: list[UplinkPaths]) -> UplinkPaths:
     )
 
 
-def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int, known: Start) -> UplinkPaths:
+def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int, start: Start) -> UplinkPaths:
     count = h.shape[1] * h.shape[2]
     energy = np.square(np.abs(h)).sum(axis=(1, 2))
     # An uplink of zeros has no paths; its row is predicted as zero.
     active = np.flatnonzero(energy > 0)
-    present: Mask = known.present & (energy > 0)[:, None]
-    theta, best, residual = known.theta, energy.copy(), h.copy()
+    present: Mask = start.present & (energy > 0)[:, None]
+    theta, best, residual = start.theta, energy.copy(), h.copy()
     if present.any():
-        theta, solved = refine(waves, h, theta, present, final, known)
+        theta, solved = refine(waves, h, theta, present, final, start)
         best, residual = solved.energy, solved.residual
     for _ in range(max_paths):
         # A finished row gets its first path's parameters, masked.
@@ -126,11 +126,11 @@ def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int, kn
         # A single path costs little to refine, and brings the refinement of all nearer to convergence.
         single = np.ones((len(active), 1), bool)
         fresh[active] = refine(waves, residual[active], fresh[active][:, None], single, FIRST_STEPS)[0][:, 0]
-        theta, known = np.concatenate([theta, fresh[:, None]], axis=1), known.joined(fresh[:, None])
+        theta, start = np.concatenate([theta, fresh[:, None]], axis=1), start.joined(fresh[:, None])
         present = np.concatenate([present, np.zeros((len(h), 1), bool)], axis=1)
         trial = present[active]
         trial[:, -1] = True
-        refined, solved = refine(waves, h[active], theta[active], trial, between, known[active])
+        refined, solved = refine(waves, h[active], theta[active], trial, between, start[active])
         left = solved.energy
         floor = ACCURACY * energy[active]
         # Bayesian information criterion (Schwarz, 1978), of noise whose power is unknown.
@@ -142,13 +142,13 @@ def _find(waves: Waves, h: Complex, max_paths: int, between: int, final: int, kn
         active = improved[best[improved] > ACCURACY * energy[improved]]
         if not len(active):
             break
-    return _finish(waves, h, theta, present, final, known)
+    return _finish(waves, h, theta, present, final, start)
 
 
 def _finish(
-    waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int, known: Start | None = None
+    waves: Waves, h: Complex, theta: FloatArray, present: Mask, steps: int, start: Start | None = None
 ) -> UplinkPaths:
-    theta, solved = refine(waves, h, theta, present, steps, known)
+    theta, solved = refine(waves, h, theta, present, steps, start)
     return UplinkPaths(theta, present, expected_gains(waves, h, present, solved)[0])
 
 

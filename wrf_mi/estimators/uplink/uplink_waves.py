@@ -66,19 +66,19 @@ def bands_of(record: Record, spacing_hz: float, gap: int = 1) -> Bands:
     (antennas, up), down = record.uplink.shape[1:], record.observation.shape[3]
     if up < 2:
         raise InputError(f"{record.name}: {up} uplink subcarrier; delays show in two or more")
-    known = _knows_frequencies(record)
-    if known:
+    has_frequencies = _knows_frequencies(record)
+    if has_frequencies:
         uplink_hz, downlink_hz = np.asarray(record.uplink_hz, float), np.asarray(record.frequencies_hz, float)
     else:
         uplink_hz = spacing_hz * (np.arange(up) - up - (gap - 1) / 2 + 0.5)
         downlink_hz = spacing_hz * (np.arange(down) + (gap - 1) / 2 + 0.5)
     array_m = record.receivers[0].array_m
-    elements = None if array_m is None or not known else np.asarray(array_m, float)
+    elements = None if array_m is None or not has_frequencies else np.asarray(array_m, float)
     if elements is not None:
         if elements.shape != (antennas, 3):
             raise InputError(f"{record.name}: array {elements.shape} for {antennas} antennas; give x, y, z of each")
         elements = (elements - elements.mean(axis=0)) @ principal_axes(elements).T
-    return Bands(uplink_hz, downlink_hz, antennas, known, elements)
+    return Bands(uplink_hz, downlink_hz, antennas, has_frequencies, elements)
 
 
 def _knows_frequencies(record: Record) -> bool:
