@@ -117,8 +117,8 @@ class Misfit:
         placed = placed_receivers(record, by_uplink=False)
         # Receivers without any observation are not traced, though their parameters are entries of the vector: some
         # hundred others may have heard these rows.
-        known = np.isfinite(record.observation[:, rows]).reshape(len(placed), -1).any(axis=1)
-        numbers = np.flatnonzero(known) if known.any() else np.arange(len(placed))
+        observed = np.isfinite(record.observation[:, rows]).reshape(len(placed), -1).any(axis=1)
+        numbers = np.flatnonzero(observed) if observed.any() else np.arange(len(placed))
         self.receivers = [placed[number] for number in numbers]
         self._size = self._task.image_size(record.observation.shape[2:])
         self._strides = [_stride(n, most) for n, most in zip(self._size, LATTICE, strict=False)]  # none of no image
@@ -177,10 +177,10 @@ class Misfit:
     def of_scene(self, vector: FloatArray) -> dict[str, FloatArray]:
         """Parameters of a vector [p] by name, for all planes and surfaces of the scene: others are as stated."""
         # Of planes and surfaces that have no entry, the stated values.
-        stated = self.tables.slabs.parameters(QUANTITIES) | self.tables.planes.parameters()
+        stated_parameters = self.tables.slabs.parameters(QUANTITIES) | self.tables.planes.parameters()
         parameters = {name: vector[part].reshape(self._shapes[name]) for name, part in self.parts.items()}
-        for name in stated.keys() & parameters.keys():
-            every = stated[name].astype(float)
+        for name in stated_parameters.keys() & parameters.keys():
+            every = stated_parameters[name].astype(float)
             every[self.slabs if name.startswith(PREFIX) else self.planes] = parameters[name]
             parameters[name] = every
         return parameters

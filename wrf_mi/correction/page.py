@@ -256,8 +256,8 @@ def _materials_text(correction: Correction, materials: list[dict[str, Any]]) -> 
     for material in sorted(materials, key=lambda material: -material["paths"]):
         if material["sd_log"] is None:
             continue
-        known = zip(CONSTANTS, material["sd_log"], material["measured"], strict=False)
-        cells = [_constant(name, material[name][1], sd, measured) for name, sd, measured in known]
+        constants = zip(CONSTANTS, material["sd_log"], material["measured"], strict=False)
+        cells = [_constant(name, material[name][1], sd, measured) for name, sd, measured in constants]
         choice = "absent, left out" if material["absent"] else material["first_choice"] or "as stated"
         rows.append((material["surface"], str(material["paths"]), choice, *cells))
     if not rows:

@@ -272,11 +272,11 @@ class PathSum:
                 beside[together] += STEP
                 moved, waves = self._changed(beside[None])
                 for column in together.tolist():
-                    own = self._touched_by(self._met_by(column))
-                    change = waves[np.searchsorted(moved.paths, own.paths), 0] - present[own.paths]
+                    touched = self._touched_by(self._met_by(column))
+                    change = waves[np.searchsorted(moved.paths, touched.paths), 0] - present[touched.paths]
                     # Parameters are rounded to single precision, gains are not.
                     step = float(np.float32(beside[column])) - float(np.float32(vector[column]))
-                    changes[column] = own.rows, own.sums(change / step)
+                    changes[column] = touched.rows, touched.sums(change / step)
         return changes
 
     def _met_by(self, column: int) -> NDArray[np.bool_]:

@@ -107,8 +107,8 @@ class UncertainPhases:
         self._channel = channel[self._rows]
         self._known = np.isfinite(self._channel).all(axis=1)
         self._unit = float(np.median(np.square(np.abs(self._channel[self._known])).mean(axis=1)))
-        stated = self._moments_at(posterior.stated)
-        self.noise = noise or float(min(NOISE, key=lambda each: self._cost(stated, noise=each)))
+        stated_moments = self._moments_at(posterior.stated)
+        self.noise = noise or float(min(NOISE, key=lambda each: self._cost(stated_moments, noise=each)))
 
     @staticmethod
     def serves(misfit: Misfit) -> bool:
@@ -229,7 +229,7 @@ class UncertainPhases:
         slope = np.zeros(len(free))
         for place, (paths, change) in enumerate(self._gain_changes(vector, gain, free)):
             rows, row = np.unique(self._row[paths], return_inverse=True)
-            known = self._known[rows]
+            finite = self._known[rows]
             resultant = self.resultant[paths]
             spread = (1 - resultant**2) * 2 * (gain[paths].conj() * change).real
             changed = _sums(resultant * change, spread, self._wave[paths], row, len(rows))
@@ -238,9 +238,9 @@ class UncertainPhases:
             trace = np.einsum("knn->k", covariance).real
             along = np.einsum("kn,knm,km->k", white[rows].conj(), covariance, white[rows]).real
             along += 2 * (white[rows].conj() * mean).sum(axis=1).real
-            slope[place] = (known * trace - weight[rows] * along).sum()
+            slope[place] = (finite * trace - weight[rows] * along).sum()
             parts = np.concatenate([np.sqrt(2) * mean, covariance.reshape(len(rows), -1)], axis=1)
-            columns[place, rows] = known[:, None] * parts.view(float)
+            columns[place, rows] = finite[:, None] * parts.view(float)
         flat = columns.reshape(len(free), -1)
         return (flat @ flat.T).astype(float), slope
 

@@ -98,8 +98,8 @@ class TraceOptions(SpecularOptions):
     @property
     def most_reflections(self) -> int:
         """Largest number of reflections of a specular path."""
-        stated = self.depth if self.reflections is None else self.reflections
-        return min(stated, self.depth) if self.reflection else 0
+        reflections = self.depth if self.reflections is None else self.reflections
+        return min(reflections, self.depth) if self.reflection else 0
 
     @property
     def surfaces_met(self) -> int:

@@ -132,8 +132,8 @@ class TracedPower:
     def of_predictions(self, position_m: FloatArray) -> TracedPower:
         """The power for predictions, which keeps nothing but what is known at some positions [k, 3]."""
         self.traced_dbm(position_m)
-        known = {row.tobytes(): self._known[row.tobytes()] for row in position_m}
-        return TracedPower(self.local, self._trace, self._places, known, keeps=False)
+        power_of_position = {row.tobytes(): self._known[row.tobytes()] for row in position_m}
+        return TracedPower(self.local, self._trace, self._places, power_of_position, keeps=False)
 
     def at(self, places: IntArray) -> TracedPower:
         """Power at some of the receivers, which shares what is known."""

@@ -129,8 +129,8 @@ def fit_offsets(traced_dbm: ArrayLike, measured_dbm: ArrayLike) -> Offsets:
     traced, measured = np.asarray(traced_dbm, float), np.asarray(measured_dbm, float)
     difference = measured - traced
     heard = ~np.isnan(measured).all(axis=1)
-    for receiver, known in enumerate(~np.isnan(difference)):
-        if heard[receiver] and not known.any():
+    for receiver, comparable in enumerate(~np.isnan(difference)):
+        if heard[receiver] and not comparable.any():
             text = "no training row is both received and reached by a path; trace more kinds of path"
             raise InputError(f"receiver {receiver}: {text}")
     offset_db, floor_dbm = np.empty((2, len(measured)))
@@ -146,11 +146,11 @@ def cross_polarized(traced: TraceResult, scene: Any) -> dict[str, float]:
     sample = traced.select(np.isin(traced.paths.tx, spread(len(traced.tx_pos_m), SAMPLE)))
     if sample.carriers_hz is not None:  # both at the scene's carrier
         sample = recompute(sample, scene)
-    stated = _median_power(sample)
+    unturned = _median_power(sample)
     receivers = tuple(replace(rx, antenna=rx.antenna.turned) for rx in traced.receivers)
     turned = _median_power(recompute(replace(sample, receivers=receivers), scene))
     tiny = np.finfo(np.float32).tiny
-    gain_db = 10 * np.log10(np.maximum(turned, tiny) / np.maximum(stated, tiny))
+    gain_db = 10 * np.log10(np.maximum(turned, tiny) / np.maximum(unturned, tiny))
     return {rx.name: float(g) for rx, g in zip(traced.receivers, gain_db, strict=True) if g >= GAIN_DB}
 
 
@@ -173,9 +173,12 @@ def check_polarization(scene: Any, tx_pos_m: FloatArray, receivers: Sequence[Rec
 
     Whoever has not stated where a receiver is has not stated its antenna either.
     """
-    few, stated = tx_pos_m[spread(len(tx_pos_m), TRACED)], [receiver for receiver in receivers if receiver.is_surveyed]
-    if stated:
-        tried = [stated[place] for place in spread(len(stated), TRIED)]
+    few, surveyed = (
+        tx_pos_m[spread(len(tx_pos_m), TRACED)],
+        [receiver for receiver in receivers if receiver.is_surveyed],
+    )
+    if surveyed:
+        tried = [surveyed[place] for place in spread(len(surveyed), TRIED)]
         traced = trace_paths(scene, few, tried, ROUGH, tx_antenna=tx_antenna, check=False)
         warn_of_cross_polarization(traced, scene)
 

@@ -99,17 +99,17 @@ def _classes(model: Any) -> list[str]:
     """Classes of `CLASSES` that the schema of a model has."""
     from ifcopenshell import ifcopenshell_wrapper
 
-    known = {each.name() for each in ifcopenshell_wrapper.schema_by_name(model.schema_identifier).entities()}
-    return [name for name in CLASSES if name in known]
+    schema_classes = {each.name() for each in ifcopenshell_wrapper.schema_by_name(model.schema_identifier).entities()}
+    return [name for name in CLASSES if name in schema_classes]
 
 
 def _role(element: Any) -> tuple[Kind, str, str]:
     kind, name, usual = next(role for of, role in CLASSES.items() if element.is_a(of))
-    stated = str(getattr(element, "PredefinedType", None) or "")
-    if element.is_a("IfcSlab") and stated == "ROOF":
+    predefined_type = str(getattr(element, "PredefinedType", None) or "")
+    if element.is_a("IfcSlab") and predefined_type == "ROOF":
         kind = "ceiling"
     elif element.is_a("IfcCovering"):
-        kind = COVERINGS.get(stated, kind)
+        kind = COVERINGS.get(predefined_type, kind)
     return kind, kind if name in ("floor", "ceiling") else name, usual
 
 
@@ -117,8 +117,8 @@ def _material_names(element: Any) -> Sequence[str]:
     """Names that state the material of an element, the most telling first."""
     from ifcopenshell.util.element import get_material, get_materials, get_type
 
-    stated = get_material(element, should_skip_usage=True)
-    layers = sorted(getattr(stated, "MaterialLayers", None) or (), key=lambda layer: -layer.LayerThickness)
+    material = get_material(element, should_skip_usage=True)
+    layers = sorted(getattr(material, "MaterialLayers", None) or (), key=lambda layer: -layer.LayerThickness)
     of_layers = [layer.Material for layer in layers if layer.Material]
     parts = [*(of_layers or get_materials(element)), get_type(element), element]
     return [name for part in parts if part is not None and (name := part.Name)]

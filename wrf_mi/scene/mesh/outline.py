@@ -192,21 +192,21 @@ def levels_completed(
     levels = [(kind, float(planes[i].lift(_middle(areas[i]))[2]), i) for i, kind in enumerate(roles)]
     floors_m = np.array([height for kind, height, _ in levels if kind == "floor"])
     for kind, other, side in (("floor", "ceiling", 1), ("ceiling", "floor", -1)):
-        own = [(height, i) for each, height, i in levels if each == kind]
-        for height, number in own:
+        of_kind = [(height, i) for each, height, i in levels if each == kind]
+        for height, number in of_kind:
             plane = planes[number]
             opposite = [
                 i
                 for each, at, i in levels
                 if each == other and side * (at - height) > STOREY_M and not _between(floors_m, height, at).any()
             ]
-            covered, seen = (
+            covered, visible = (
                 shapely.union_all([_seen_on(plane, planes[i], areas[i]) for i in chosen])
-                for chosen in ([i for _, i in own], opposite)
+                for chosen in ([i for _, i in of_kind], opposite)
             )
             behind = -plane.distance(points_m) * np.sign(plane.normal[2]) * side
             flat = plane.flat(points_m[(behind > band_m) & (behind < STOREY_M)])
-            gaps = polygons(opened(shapely.difference(seen, covered), SEAM_M))
+            gaps = polygons(opened(shapely.difference(visible, covered), SEAM_M))
             gaps = [gap for gap in gaps if gap.area > SMALLEST_GAP_M2 and not _is_hidden(gap, flat)]
             beside = [gap for gap in gaps if shapely.distance(gap, areas[number]) < RASTER_M]
             if beside:

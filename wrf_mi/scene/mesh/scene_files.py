@@ -119,10 +119,10 @@ def _polygons(vertices: ArrayLike, corners: IntArray, sizes: IntArray, name: str
     return Polygons.of(vertices, corners, sizes, parts, lambda polygon: f"face {polygon + 1} of {name}")
 
 
-def _up(path: Path, stated: str) -> Up:
-    if stated not in UP:
-        raise InputError(f"{path}: states {stated} as its axis up; export it with y or z up")
-    return "y" if UP[stated] == "y" else "z"
+def _up(path: Path, axis: str) -> Up:
+    if axis not in UP:
+        raise InputError(f"{path}: states {axis} as its axis up; export it with y or z up")
+    return "y" if UP[axis] == "y" else "z"
 
 
 def gltf_facts(file: Path) -> dict[str, Any]:

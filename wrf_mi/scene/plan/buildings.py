@@ -100,8 +100,8 @@ def building_surfaces(buildings: Buildings, height_m: float | None, floor_m: flo
     surfaces = [Surface("floor", "floor", np.insert(ground, 2, floor_m, axis=1), faces)]
     numbers = number_names(["wall"] * len(outlines)), number_names(["ceiling"] * len(outlines))
     for number, (outline, wall, roof) in enumerate(zip(outlines, *numbers, strict=True)):
-        stated = [tags[number].get(f"{part}:material", "") for part in ("building", "roof")]
-        of_wall, of_roof = (f"itu_{meant(text)}" if meant(text) else MATERIAL for text in stated)
+        material_tags = [tags[number].get(f"{part}:material", "") for part in ("building", "roof")]
+        of_wall, of_roof = (f"itu_{meant(text)}" if meant(text) else MATERIAL for text in material_tags)
         flat_roof, faces = triangulated(outline)
         surfaces.append(
             Surface(roof, "ceiling", np.insert(flat_roof, 2, floor_m + top[number], axis=1), faces, of_roof)
@@ -121,5 +121,5 @@ def _without_whole(buildings: Buildings) -> tuple[Any, list[Mapping[str, str]]]:
     is_part = np.array(["building:part" in tags for tags in buildings.tags])
     parts = shapely.union_all(outlines[is_part])
     covered = shapely.area(shapely.intersection(outlines, parts)) >= PARTS_SHARE * shapely.area(outlines)
-    kept = np.flatnonzero(is_part | ~covered).tolist()
-    return outlines[kept], [buildings.tags[number] for number in kept]
+    numbers = np.flatnonzero(is_part | ~covered).tolist()
+    return outlines[numbers], [buildings.tags[number] for number in numbers]

@@ -56,8 +56,8 @@ def read_dxf(path: Path, units: str | None = None, layers: Sequence[str] = ()) -
         document = ezdxf.readfile(path)
     except (OSError, ezdxf.DXFError, ValueError, UnicodeError) as error:
         raise InputError(f"{path}: not a DXF that can be read ({one_line(error)}); export it anew") from None
-    stated = INSERT_UNITS.get(document.header.get("$INSUNITS", 0))
-    if (unit := units or stated) not in UNITS_M:
+    document_unit = INSERT_UNITS.get(document.header.get("$INSUNITS", 0))
+    if (unit := units or document_unit) not in UNITS_M:
         raise InputError(f"{path}: does not state the unit of its lines; give it by --units ({', '.join(UNITS_M)})")
     drawn: dict[str, list[FloatArray]] = {}
     try:
@@ -88,16 +88,16 @@ def _curves(entities: Any, layer: str, sag: float) -> Iterator[tuple[str, FloatA
     from ezdxf import path as paths
 
     for entity in entities:
-        own = layer if entity.dxf.layer == "0" else entity.dxf.layer
+        entity_layer = layer if entity.dxf.layer == "0" else entity.dxf.layer
         if entity.dxftype() == "INSERT":
             for block in entity.multi_insert() if entity.mcount > 1 else (entity,):
-                yield from _curves(block.virtual_entities(), own, sag)
+                yield from _curves(block.virtual_entities(), entity_layer, sag)
         elif entity.dxftype() == "POLYLINE" and not (entity.is_2d_polyline or entity.is_3d_polyline):
             continue
         elif entity.dxftype() in ("LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"):
             points = np.array([(point.x, point.y) for point in paths.make_path(entity).flattening(sag)])
             if len(points) > 1 and np.isfinite(points).all():
-                yield own, points
+                yield entity_layer, points
 
 
 def _role(layer: str) -> str | None:
@@ -105,32 +105,32 @@ def _role(layer: str) -> str | None:
     words = re.findall(r"[a-z]+", ascii_name(layer).lower())
     if any(word.startswith(tuple(ANNOTATION.split())) for word in words):
         return None
-    found = [
+    roles = [
         role
         for role, beginnings in BEGINNINGS.items()
         if any(word.startswith(tuple(beginnings.split())) for word in words)
     ]
-    if not found:
+    if not roles:
         return None
     material = meant(layer)
-    return f"itu_{material}" if found[0] == WALL and material else found[0]
+    return f"itu_{material}" if roles[0] == WALL and material else roles[0]
 
 
-def _roles(path: Path, drawn: dict[str, list[FloatArray]], stated: Sequence[str]) -> dict[str, list[str]]:
+def _roles(path: Path, drawn: dict[str, list[FloatArray]], patterns: Sequence[str]) -> dict[str, list[str]]:
     """Layers of walls by their materials, of windows and of doors."""
     roles: dict[str, list[str]] = {}
     for layer in drawn:
         role = _role(layer)
-        if stated and any(fnmatchcase(layer, pattern) for pattern in stated):
+        if patterns and any(fnmatchcase(layer, pattern) for pattern in patterns):
             role = role or WALL
-        elif stated and role not in (DOOR, GLASS):
+        elif patterns and role not in (DOOR, GLASS):
             role = None
         if role is not None:
             roles.setdefault(role, []).append(layer)
     if set(roles) <= {DOOR, GLASS}:
         lengths = {layer: sum(shapely.linestrings(curve).length for curve in drawn[layer]) for layer in drawn}
         names = [f"{name!r} ({lengths[name]:.0f} m)" for name in sorted(lengths, key=lambda name: -lengths[name])]
-        text = f"no layer {', '.join(stated)}" if stated else "no layer is named as one of walls"
+        text = f"no layer {', '.join(patterns)}" if patterns else "no layer is named as one of walls"
         raise InputError(f"{path}: {text}; state those of walls by --layers NAME,NAME, of {listed(names) or 'none'}")
     return roles
 

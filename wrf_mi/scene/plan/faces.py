@@ -50,7 +50,7 @@ def middle_lines(pieces_m: FloatArray, layer_m: float = LAYER_M) -> tuple[FloatA
     """
     # Columns: lower and upper offset, start, end; directions are lists, since each has its own axes.
     directions = [(axes, _strips(pieces_m[rows] @ axes.T, layer_m)) for axes, rows in _directions(pieces_m)]
-    strips = [(axes, *strip) for axes, found in directions for strip in found]
+    strips = [(axes, *strip) for axes, of_direction in directions for strip in of_direction]
     lengths = np.array([end - start for *_, start, end in strips])
     thick = np.array([high - low for _, low, high, *_ in strips])
     # Two faces are one strip.
@@ -72,9 +72,9 @@ def middle_lines(pieces_m: FloatArray, layer_m: float = LAYER_M) -> tuple[FloatA
     beside = np.zeros(len(strips))
     np.maximum.at(beside, line, thick[solid[wall]])
     # Ends of walls, and stretches of a face that another wall meets or that go round a corner.
-    kept = (thick > 0) | (lengths > beside + MARGIN_M)
+    is_wall = (thick > 0) | (lengths > beside + MARGIN_M)
     middles = [np.array([[s, (low + high) / 2], [e, (low + high) / 2]]) @ axes for axes, low, high, s, e in strips]
-    return np.array(middles)[kept], thick[kept]
+    return np.array(middles)[is_wall], thick[is_wall]
 
 
 def _directions(pieces_m: FloatArray) -> Iterator[tuple[FloatArray, NDArray[np.intp]]]:
@@ -155,5 +155,5 @@ def without_openings(walls_m: FloatArray, openings_m: FloatArray) -> tuple[Float
         if sine < PARALLEL_RAD * np.linalg.norm(along[wall]) * np.linalg.norm(across[opening]) + 1e-12:
             lines[wall] = shapely.difference(lines[wall], bands[opening])
     parts, number = shapely.get_parts(lines, return_index=True)
-    whole = ~shapely.is_empty(parts)
-    return shapely.get_coordinates(parts[whole]).reshape(-1, 2, 2), number[whole]
+    nonempty = ~shapely.is_empty(parts)
+    return shapely.get_coordinates(parts[nonempty]).reshape(-1, 2, 2), number[nonempty]

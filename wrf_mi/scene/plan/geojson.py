@@ -103,8 +103,8 @@ def _polygons(geometry: Any) -> list[Any]:
 
 
 def _is_building(tags: Mapping[str, str]) -> bool:
-    stated = [tags.get(key, "no") for key in ("building", "building:part")]
-    return "indoor" not in tags and any(value not in ("no", "None") for value in stated)
+    values = [tags.get(key, "no") for key in ("building", "building:part")]
+    return "indoor" not in tags and any(value not in ("no", "None") for value in values)
 
 
 def _levels(tags: Mapping[str, str]) -> list[str]:
@@ -145,10 +145,10 @@ def _rooms(path: Path, features: list[Feature], extent_m: Extent | None) -> Plan
         if shapely.distance(each, every) <= SAME_M
     ]
     openings = shapely.union_all(discs)
-    pieces, taken = {DOOR: _straight(shapely.intersection(every, openings))}, shapely.GeometryCollection()
+    pieces, covered = {DOOR: _straight(shapely.intersection(every, openings))}, shapely.GeometryCollection()
     for role, line in drawn.items():
-        pieces[role] = _straight(shapely.difference(shapely.difference(line, taken, grid_size=SAME_M), openings))
-        taken = shapely.union(taken, line, grid_size=SAME_M)
+        pieces[role] = _straight(shapely.difference(shapely.difference(line, covered, grid_size=SAME_M), openings))
+        covered = shapely.union(covered, line, grid_size=SAME_M)
     return PlanLines({role: part for role, part in pieces.items() if len(part)})
 
 
@@ -172,13 +172,13 @@ def _in_metres(path: Path, outlines: Any, extent_m: Extent | None, largest_m: fl
     if not 0 < size.min() <= size.max() <= largest_m:
         text = f"{size[0] / 1000:.4g} km x {size[1] / 1000:.4g} km as degrees are no building"
         raise InputError(f"{path}: {text}; {REMEDY}, of one building")
-    stated = _stated_extent(path, extent_m, size)
-    if stated is None:
+    stated_size_m = _stated_extent(path, extent_m, size)
+    if stated_size_m is None:
         text = (
             "%s: metres east and north of longitude %.8g, latitude %.8g; give --extent for the frame of a stated extent"
         )
         logger.warning(text, path, west, south)
-    scale = 1 if stated is None else stated / size
+    scale = 1 if stated_size_m is None else stated_size_m / size
     return shapely.transform(outlines, lambda xy: (xy - corner) * scale)
 
 
@@ -187,8 +187,8 @@ def _stated_extent(path: Path, extent_m: Extent | None, size_m: FloatArray) -> F
     source, beside = "--extent", path.with_name(EXTENT_FILE)
     if extent_m is None and beside.is_file():
         with readable(beside, "", 'give {"map_info": {"width": METRES, "height": METRES}}, or --extent'):
-            stated = json.loads(beside.read_text(encoding="utf-8-sig"))["map_info"]
-            source, extent_m = EXTENT_FILE, (float(stated["width"]), float(stated["height"]))
+            map_info = json.loads(beside.read_text(encoding="utf-8-sig"))["map_info"]
+            source, extent_m = EXTENT_FILE, (float(map_info["width"]), float(map_info["height"]))
     if extent_m is None:
         return None
     extent = np.asarray(extent_m, float)

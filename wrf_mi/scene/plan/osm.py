@@ -62,11 +62,11 @@ def _line(way: Element, places: Mapping[int, tuple[float, float]]) -> Any:
     """Line of a way, of its ``nodes`` or of its ``geometry`` (``out geom``); None for one that is cut."""
     if way.get("geometry"):
         points = [(point["lon"], point["lat"]) for point in way["geometry"] if point]
-        whole = len(points) == len(way["geometry"])
+        complete = len(points) == len(way["geometry"])
     else:
         points = [places[node] for node in way.get("nodes", ()) if node in places]
-        whole = len(points) == len(way.get("nodes", ()))
-    return shapely.LineString(points) if whole and len(set(points)) > 1 else None
+        complete = len(points) == len(way.get("nodes", ()))
+    return shapely.LineString(points) if complete and len(set(points)) > 1 else None
 
 
 def _area(relation: Element, ways: Mapping[int, Any]) -> Any:

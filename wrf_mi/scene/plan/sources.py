@@ -242,12 +242,12 @@ def _grid_of_arrays(
     return grid_from_probability(values, resolution_m, row_0, origin, str(path))
 
 
-def _stated_side(path: Path, stated: NDArray[Any] | None) -> Row0:
+def _stated_side(path: Path, row_0: NDArray[Any] | None) -> Row0:
     """Side of the plan where the first row of an NPZ grid lies, as the file states it."""
-    if stated is None:
+    if row_0 is None:
         way = "store row_0 in the file, or give --row-0: top if the first row is the largest y, else bottom"
         raise InputError(f"{path}: does not state which side of the plan the first row is; {way}")
-    word = str(stated.astype(str).reshape(-1)[0]) if stated.size == 1 else str(stated.tolist())
+    word = str(row_0.astype(str).reshape(-1)[0]) if row_0.size == 1 else str(row_0.tolist())
     if (side := word.strip().lower()) in get_args(Row0):
         return cast(Row0, side)
     raise InputError(f"{path}: row_0 is {one_line(word)[:40]!r}; give top (largest y) or bottom (smallest y)")

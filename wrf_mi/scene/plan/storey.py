@@ -158,7 +158,7 @@ def drawn_walls(lines: PlanLines) -> dict[str, FloatArray]:
     walls = {role: middles[[each == role for each in roles]] for role in parts}
     if DOOR in lines.pieces_m:
         walls[DOOR] = _between_jambs(lines.pieces_m[DOOR], ends)
-    return {role: kept for role, part in walls.items() if len(kept := part[_lengths(part) > EDGE_M])}
+    return {role: long_parts for role, part in walls.items() if len(long_parts := part[_lengths(part) > EDGE_M])}
 
 
 def _lengths(lines_m: FloatArray) -> FloatArray:

@@ -147,8 +147,8 @@ def write_corrected_scene(
     corrected = slabs.fitted(parameters)
     fitted, exponent = corrected.table, corrected.exponent
     # As stated, or as parameters state it: metal has a permittivity of 1, of whose logarithm less one there is none.
-    stated = [slabs.table, slabs.fitted(slabs.parameters(QUANTITIES)).table]
-    differs = [np.any(np.abs(fitted - start) > UNCHANGED * np.abs(start), axis=1) for start in stated]
+    start_tables = [slabs.table, slabs.fitted(slabs.parameters(QUANTITIES)).table]
+    differs = [np.any(np.abs(fitted - start) > UNCHANGED * np.abs(start), axis=1) for start in start_tables]
     changed: NDArray[np.bool_] = np.all(differs, axis=0)
     carrier_hz = float(scene.frequency[0])
     parts, thickness = list[Surface](), dict[str, float]()
@@ -202,15 +202,15 @@ def write_corrected_scene(
 def _facets(surfaces: Surfaces, slab_of_face: IntArray, count: int) -> NDArray[np.bool_]:
     """Mask of ``count`` surfaces that are facets: small, or with a neighbour in their object that bends little."""
     # Curved things have many faces that bend little towards each other, which a cabinet's sides do not.
-    known, area = slab_of_face >= 0, trimesh.triangles.area(surfaces.triangles)
-    facets: NDArray[np.bool_] = np.bincount(slab_of_face[known], area[known], count) < FACET_M2
+    in_slab, area = slab_of_face >= 0, trimesh.triangles.area(surfaces.triangles)
+    facets: NDArray[np.bool_] = np.bincount(slab_of_face[in_slab], area[in_slab], count) < FACET_M2
     corners = np.round(surfaces.triangles.reshape(-1, 3) / SAME_CORNER_M)
     vertices, same = np.unique(corners, axis=0, return_inverse=True)
     pairs = trimesh.Trimesh(vertices, same.reshape(-1, 3), process=False).face_adjacency
     plane, object_index = surfaces.plane[pairs], surfaces.object_of(pairs)
     bend = np.abs(np.einsum("ij,ij->i", *surfaces.normal[plane].swapaxes(0, 1)))
     smooth = (plane[:, 0] != plane[:, 1]) & (object_index[:, 0] == object_index[:, 1]) & (bend > CREASE_COS)
-    smooth &= known[pairs].all(axis=1)
+    smooth &= in_slab[pairs].all(axis=1)
     facets[slab_of_face[pairs[smooth]]] = True
     return facets
 

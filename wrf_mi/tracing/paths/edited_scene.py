@@ -75,14 +75,14 @@ def _moved_discs(
     face = np.array([_face_of(before, disc) for disc in discs.T], np.int64)
     later = np.full(len(before.plane), -1)
     later[earlier] = np.arange(len(earlier))
-    kept = later[face] >= 0
-    discs, old, new = discs[:, kept], before.triangles[face[kept]], after.triangles[later[face[kept]]]
+    remaining = later[face] >= 0
+    discs, old, new = discs[:, remaining], before.triangles[face[remaining]], after.triangles[later[face[remaining]]]
     # Barycentric coordinates, which may lie outside of the face, hold in its plane wherever this moves.
     share = trimesh.triangles.points_to_barycentric(old, discs[:3].T)
     shift = np.einsum("gc,gcx->gx", share, new - old)
     normal = np.where((new == old).all(axis=(1, 2)), discs[3:], _normals(new).T)
     values = np.concatenate([discs[:3] + shift.T, normal]).astype(np.float32)
-    return {DISC: values, FACTOR: params[FACTOR][:, kept]}
+    return {DISC: values, FACTOR: params[FACTOR][:, remaining]}
 
 
 def _face_of(surfaces: Surfaces, disc: FloatArray) -> int:

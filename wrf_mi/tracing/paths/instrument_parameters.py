@@ -65,8 +65,8 @@ def receiver_pose(receiver: Receiver, parameters: Mapping[str, Any], float_type:
     moved, turned = (correction(name) for name in pose_names(receiver))
     position = [float(x) + t for x, t in zip(receiver.position_m, moved, strict=True)]
     columns = principal_axes([*(0.5 * r for r in turned), float_type(1)])
-    stated = receiver.to_world
-    to_world = [[sum(float(stated[i, k]) * columns[j][k] for k in range(3)) for j in range(3)] for i in range(3)]
+    rotation = receiver.to_world
+    to_world = [[sum(float(rotation[i, k]) * columns[j][k] for k in range(3)) for j in range(3)] for i in range(3)]
     return Pose(position, to_world)
 
 

@@ -67,8 +67,10 @@ class TraceResult:
     def path_carriers_hz(self) -> FloatArray:
         """Carrier of each path's gain [p], Hz: that of its receiver if stated, else that of its transmitter."""
         rows = np.full(self.paths.n_tx, self.frequency_hz) if self.carriers_hz is None else self.carriers_hz
-        own = np.array([np.nan if rx.frequency_hz is None else rx.frequency_hz for rx in self.receivers])[self.paths.rx]
-        return np.where(np.isnan(own), rows[self.paths.tx], own)
+        receiver_hz = np.array([np.nan if rx.frequency_hz is None else rx.frequency_hz for rx in self.receivers])[
+            self.paths.rx
+        ]
+        return np.where(np.isnan(receiver_hz), rows[self.paths.tx], receiver_hz)
 
     def select(self, which: NDArray[Any]) -> TraceResult:
         """The paths of a mask or of ascending indices ``which`` [p], of the same devices."""
@@ -81,9 +83,9 @@ class TraceResult:
 
         `InputError`: no path has a gain.
         """
-        kept = paths_with_gain(gain)
-        result = replace(self, paths=replace(self.paths, gain=gain), lost=self.lost + len(gain) - len(kept))
-        return result if len(kept) == len(gain) else result.select(kept)
+        finite_paths = paths_with_gain(gain)
+        result = replace(self, paths=replace(self.paths, gain=gain), lost=self.lost + len(gain) - len(finite_paths))
+        return result if len(finite_paths) == len(gain) else result.select(finite_paths)
 
     def unabsorbed(self, scene: Any) -> TraceResult:
         """The paths without gain zero: no absorber of the ``sionna.rt.Scene``, no mirror where all is scattered."""
@@ -155,12 +157,12 @@ def paths_with_gain(gain: NDArray[np.inexact[Any]]) -> IntArray:
 
     `InputError`: no path has a gain.
     """
-    kept = np.flatnonzero(np.isfinite(gain))
-    if len(gain) and not len(kept):
+    finite_paths = np.flatnonzero(np.isfinite(gain))
+    if len(gain) and not len(finite_paths):
         raise InputError("gains that are not numbers: give materials constants that single precision can hold")
-    if lost := len(gain) - len(kept):
+    if lost := len(gain) - len(finite_paths):
         logger.warning("%d of %d paths are left out: their gains are not numbers", lost, len(gain))
-    return kept
+    return finite_paths
 
 
 def gains_of_receivers(

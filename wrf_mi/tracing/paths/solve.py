@@ -54,34 +54,34 @@ class Prepared:
         """Refuse antennas inside solids and warn of those near surfaces (`check_devices`), each position once."""
         transmitters, receiver_names = _names(len(tx_pos_m), receivers, first_row)
         sides = (transmitters, tx_pos_m), (receiver_names, np.stack([receiver.position_m for receiver in receivers]))
-        for names, stated in sides:
-            new = np.array([row for row in range(len(names)) if stated[row].tobytes() not in self._checked], int)
-            traced = from_behind(self.surfaces, stated[new])
-            if len(moved := new[(stated[new] != traced).any(axis=1)]):
+        for names, antennas_m in sides:
+            new = np.array([row for row in range(len(names)) if antennas_m[row].tobytes() not in self._checked], int)
+            traced = from_behind(self.surfaces, antennas_m[new])
+            if len(moved := new[(antennas_m[new] != traced).any(axis=1)]):
                 text = "%d of %d antennas lie up to 1 cm behind a surface (first: %s): traced from 0.1 mm before it"
                 logger.warning(text, len(moved), len(new), names[moved[0]])
             check_devices(self.surfaces, before_surfaces(self.surfaces, traced), [names[row] for row in new])
-            self._checked.update(stated[row].tobytes() for row in new)
+            self._checked.update(antennas_m[row].tobytes() for row in new)
 
     def report_scattering(self, options: TraceOptions) -> None:
         """Log once what options of scattering replace in the scene's materials, or that none scatters."""
-        stated = options.scattering_coefficient
-        if not options.scattering or stated in self._checked:
+        coefficient = options.scattering_coefficient
+        if not options.scattering or coefficient in self._checked:
             return
-        self._checked.add(stated)
-        others = {name: s for name, s in scattering_coefficients(self.scene).items() if s != stated}
-        if stated is not None and others:
+        self._checked.add(coefficient)
+        others = {name: s for name, s in scattering_coefficients(self.scene).items() if s != coefficient}
+        if coefficient is not None and others:
             names = listed([f"{name} {s:g}" for name, s in others.items()])
-            logger.info("scattering_coefficient %g replaces those of the scene's materials: %s", stated, names)
+            logger.info("scattering_coefficient %g replaces those of the scene's materials: %s", coefficient, names)
         elif not scatters(self.scene, options):
             text = "scattering has no effect: no material of the scene has a scattering_coefficient; state it there"
             logger.warning("%s, or as a setting for all", text)
 
     def placed(self, tx_pos_m: FloatArray, receivers: tuple[Receiver, ...]) -> tuple[FloatArray, tuple[Receiver, ...]]:
         """Transmitters [n, 3] and receivers as they are traced (`wrf_mi.tracing.search.devices.from_behind`)."""
-        stated = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
+        antennas_m = np.concatenate([tx_pos_m, [receiver.position_m for receiver in receivers]])
         # Those on a surface stay: their paths are searched for before it, and have the lengths from the surface.
-        positions, others = np.split(from_behind(self.surfaces, stated), [len(tx_pos_m)])
+        positions, others = np.split(from_behind(self.surfaces, antennas_m), [len(tx_pos_m)])
         return positions, tuple(replace(rx, position_m=at) for rx, at in zip(receivers, others, strict=True))
 
     def tables(self, grouping: MaterialGrouping) -> SceneTables:

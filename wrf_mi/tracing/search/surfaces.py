@@ -110,8 +110,8 @@ class Surfaces:
         The largest coordinate plus 1 m; far from the origin at most `FARTHEST` times the same about the middle.
         """
         about = (self.triangles, self.triangles - self.centre_m)
-        stated, centred = (1.0 + float(np.abs(part).max(initial=0.0)) for part in about)
-        return min(stated, FARTHEST * centred)
+        from_origin, centred = (1.0 + float(np.abs(part).max(initial=0.0)) for part in about)
+        return min(from_origin, FARTHEST * centred)
 
     @cached_property
     def screens(self) -> Any:
@@ -245,15 +245,15 @@ def scene_surfaces(scene: Any) -> Surfaces:
         stated_file = MESH_FILE.search(str(mesh))
         files.append(stated_file[1] if stated_file else "")
     first, every = np.cumsum([len(part) for part in triangles]), np.concatenate(triangles)
-    known, stated = _FOUND.get(scene), (names, tuple(ids), tuple(files))
+    cached, identity = _FOUND.get(scene), (names, tuple(ids), tuple(files))
     if (
-        known is None
-        or (known.names, tuple(known.shape_ids), known.files) != stated
-        or not np.array_equal(known.triangles, every)
+        cached is None
+        or (cached.names, tuple(cached.shape_ids), cached.files) != identity
+        or not np.array_equal(cached.triangles, every)
     ):
-        known = replace(find_planes(names, np.asarray(ids, np.uint32), first, every), files=stated[2])
-        _FOUND[scene] = known
-    return known
+        cached = replace(find_planes(names, np.asarray(ids, np.uint32), first, every), files=identity[2])
+        _FOUND[scene] = cached
+    return cached
 
 
 def shape_id(mesh: Any) -> int:

@@ -64,8 +64,8 @@ def absorbs(material: Any) -> bool:
 def is_standard(material: Any) -> bool:
     """Whether a radio material is, but for its thickness, the one that a scene folder knows by its name."""
     if material.name == PERFECT:
-        stated = float(material.relative_permittivity[0]), float(material.conductivity[0])
-        return stated == (1.0, float(np.float32(PERFECT_CONDUCTIVITY)))
+        constants = float(material.relative_permittivity[0]), float(material.conductivity[0])
+        return constants == (1.0, float(np.float32(PERFECT_CONDUCTIVITY)))
     return bool(material.name == f"itu_{getattr(material, 'itu_type', '')}")
 
 
@@ -126,7 +126,7 @@ def at_frequency(scene: Any, frequency_hz: float) -> Iterator[None]:
     if float(stated_hz[0]) == np.float32(frequency_hz):
         yield
         return
-    stated = [
+    constants = [
         (material, {name: getattr(material, name) for name in names if hasattr(material, name)})
         for material in scene.radio_materials.values()
     ]
@@ -135,7 +135,7 @@ def at_frequency(scene: Any, frequency_hz: float) -> Iterator[None]:
         yield
     finally:
         scene._frequency = stated_hz  # the setter would compute the constants anew
-        for material, values in stated:
+        for material, values in constants:
             for name, value in values.items():
                 setattr(material, name, value)
 

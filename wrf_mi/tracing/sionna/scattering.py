@@ -27,8 +27,8 @@ def scattering_coefficients(scene: Any) -> dict[str, float]:
 
 def scatters(scene: Any, options: TraceOptions) -> bool:
     """Whether any surface of a ``sionna.rt.Scene`` scatters in a trace with scattering."""
-    stated = options.scattering_coefficient
-    return any(scattering_coefficients(scene).values()) if stated is None else stated > 0
+    coefficient = options.scattering_coefficient
+    return any(scattering_coefficients(scene).values()) if coefficient is None else coefficient > 0
 
 
 def scattering_of(material: Any) -> dict[str, Any]:
@@ -77,11 +77,11 @@ def scattering_materials(scene: Any, options: TraceOptions) -> Iterator[None]:
     backend.init()
     with vars(scene).setdefault("wrf_mi_lock", RLock()):
         replaced = options.scattering and options.scattering_coefficient is not None
-        stated = scattering_coefficients(scene) if replaced else {}
-        for name in stated:
+        coefficients = scattering_coefficients(scene) if replaced else {}
+        for name in coefficients:
             scene.radio_materials[name].scattering_coefficient = options.scattering_coefficient
         try:
             yield
         finally:
-            for name, coefficient in stated.items():
+            for name, coefficient in coefficients.items():
                 scene.radio_materials[name].scattering_coefficient = coefficient

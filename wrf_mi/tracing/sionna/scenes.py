@@ -91,8 +91,8 @@ def replace_shapes(root: Element, path: Path, folder: Path) -> None:
         if content is None:
             continue
         # Mitsuba describes a shape by the name of its file, by which messages name the object.
-        stated = next((text for text in shape.findall("string") if text.get("name") in FILES), None)
-        text = SubElement(shape, "string", name="filename", value=plugin) if stated is None else stated
+        file_element = next((text for text in shape.findall("string") if text.get("name") in FILES), None)
+        text = SubElement(shape, "string", name="filename", value=plugin) if file_element is None else file_element
         place = folder / str(number) / Path(text.get("value", "")).name
         place.parent.mkdir()
         place.write_bytes(content)
@@ -184,8 +184,8 @@ def placed_mesh(shape: Element, version: str) -> trimesh.Trimesh | None:
         return None
     # Mitsuba reads the parameters: its to_world then holds centre, radius and ends, too, and it names unknown ones.
     alone = Element("scene", version=version)
-    stated = SubElement(alone, "shape", type=plugin)
-    stated.extend([child for child in shape if child.tag in VALUES])
+    shape_copy = SubElement(alone, "shape", type=plugin)
+    shape_copy.extend([child for child in shape if child.tag in VALUES])
     try:
         with quiet_mitsuba():
             loaded: Any = mi.load_string(ElementTree.tostring(alone, encoding="unicode"))
@@ -271,8 +271,8 @@ def load_checked(root: Element, path: Path, folder: Path) -> Any:
             fault, name = error, f"{names[id(shapes[0])]}: " if shapes else ""
             break
     if "ITU material" in str(fault):
-        known = ", ".join(THICKNESS_M)
-        raise InputError(f"{path}: {name}{reason(fault)}; known are {known}, and constants of your own")
+        choices = ", ".join(THICKNESS_M)
+        raise InputError(f"{path}: {name}{reason(fault)}; known are {choices}, and constants of your own")
     raise InputError(f"{path}: {name}cannot be opened ({reason(fault)}); correct the scene")
 
 
@@ -331,11 +331,11 @@ def load_scene(
     Returns a ``sionna.rt.Scene``, and thicknesses and laws of its materials as `set_frequency` takes them.
     """
     backend.init()
-    path, stated = Path(source), Materials()
-    if not path.exists() and (known := scenes().get(str(source))):
-        path, stated = known.xml, Materials(thickness_m=known.thickness_m)
+    path, materials = Path(source), Materials()
+    if not path.exists() and (named_scene := scenes().get(str(source))):
+        path, materials = named_scene.xml, Materials(thickness_m=named_scene.thickness_m)
     elif path.is_dir():
-        path, stated = _folder(path)
+        path, materials = _folder(path)
     if not path.is_file():
         ways = f"a name ({', '.join(scenes())}), a scene folder, a Mitsuba XML or a mesh ({', '.join(MESHES)})"
         raise InputError(f"{source}: no such scene file; give {ways}")
@@ -348,8 +348,8 @@ def load_scene(
         scene = _checked(path, source, material)
     except InputError as error:
         raise InputError(f"{error} (wrf-mi check {source} names every fault)") from None
-    set_scattering(scene, stated.scattering)
-    return scene, dict(stated.thickness_m), stated.laws
+    set_scattering(scene, materials.scattering)
+    return scene, dict(materials.thickness_m), materials.laws
 
 
 def _checked(path: Path, source: str | Path, material: str | None) -> Any:
@@ -398,8 +398,8 @@ def _from_mesh(path: Path, material: str) -> Any:
     else:
         name = f"itu_{material.removeprefix('itu_')}"
         if name not in THICKNESS_M:
-            known = ", ".join(itu.removeprefix("itu_") for itu in THICKNESS_M)
-            raise InputError(f"material {material!r}: unknown; give {PERFECT} or one of ITU-R P.2040: {known}")
+            choices = ", ".join(itu.removeprefix("itu_") for itu in THICKNESS_M)
+            raise InputError(f"material {material!r}: unknown; give {PERFECT} or one of ITU-R P.2040: {choices}")
         kind = name.removeprefix("itu_")
         radio_material = rt.ITURadioMaterial(name, kind, THICKNESS_M[name])
     parts, scene = mesh_parts(path), rt.load_scene()
