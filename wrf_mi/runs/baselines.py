@@ -48,11 +48,11 @@ def constant_scores(record: Record, split: Split, truth: NDArray[Any]) -> dict[s
     tested: dict[str, list[FloatArray]] = {}
     predicted: dict[str, list[NDArray[Any]]] = {}
     centres: list[NDArray[Any]] = []
-    for values, known, expected in zip(observed, received, truth, strict=True):
-        seen = values[known] if known.any() else observed[received]
-        centres.append(np.broadcast_to(seen.mean(axis=0), expected.shape))
-        sample = seen[evenly_spaced(len(seen), CHOSEN_BY)] if task.image else seen
-        for words, constant in task.constants(seen).items():
+    for values, is_received, expected in zip(observed, received, truth, strict=True):
+        training_values = values[is_received] if is_received.any() else observed[received]
+        centres.append(np.broadcast_to(training_values.mean(axis=0), expected.shape))
+        sample = training_values[evenly_spaced(len(training_values), CHOSEN_BY)] if task.image else training_values
+        for words, constant in task.constants(training_values).items():
             for scores, rows_of in ((trained, sample), (tested, expected)):
                 prediction = np.broadcast_to(constant, rows_of.shape)
                 scores.setdefault(words, []).append(task.of_rows(prediction[None], rows_of[None])[0])

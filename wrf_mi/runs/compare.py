@@ -81,7 +81,7 @@ def compare(run_dirs: Sequence[str | Path], out: str | Path, on_progress: OnProg
             on_progress("comparing", done / len(groups))
             shown = pictures(slug, runs)
             drawn += shown
-            files = [(folder / name, title, seen) for name, title, seen, _ in shown]
+            files = [(folder / name, title, description) for name, title, description, _ in shown]
             sections.append(Section(slug, runs, score_rows(runs), method_rows(runs), differences(runs), files))
 
         # Tables, pictures, and the page that holds both.
@@ -138,7 +138,7 @@ def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
         ("scene", "Mesh, traced paths and the strongest Gaussians of the field", _scene(runs)),
         ("training", "Training", _training(runs)),
     ]
-    seen = {
+    descriptions = {
         "cdf": f"a curve for each run, the share of test rows up to a score; medians: {medians}",
         "samples": "measured beside each run's prediction, a line for each of three test rows",
         "time": f"a point for each run, median score over times of prediction and training; medians: {medians}",
@@ -149,7 +149,9 @@ def pictures(slug: str, runs: Sequence[Results]) -> list[Picture]:
         "training": "scores on validation rows over the time of training, a curve for each run",
     }
     shown = [(name, heading, figure) for name, heading, figure in drawn if figure is not None]
-    return [(f"{slug}-{name}.png", heading, f"{heading}: {seen[name]}", figure) for name, heading, figure in shown]
+    return [
+        (f"{slug}-{name}.png", heading, f"{heading}: {descriptions[name]}", figure) for name, heading, figure in shown
+    ]
 
 
 def _times(runs: Sequence[Results]) -> Figure:
@@ -197,8 +199,8 @@ def _error_maps(runs: Sequence[Results]) -> list[tuple[str, str, Figure | None]]
 
 def _score_at(run: Results, where: np.ndarray) -> FloatArray:
     """Mean score over receivers at the given columns; NaN where that is -1 or nothing was received."""
-    known = np.isfinite(run.score[:, where]) & (where >= 0)
-    total, count = np.where(known, run.score[:, where], 0).sum(axis=0), known.sum(axis=0)
+    scored = np.isfinite(run.score[:, where]) & (where >= 0)
+    total, count = np.where(scored, run.score[:, where], 0).sum(axis=0), scored.sum(axis=0)
     return np.asarray(np.divide(total, count, out=np.full(len(where), np.nan), where=count > 0))
 
 

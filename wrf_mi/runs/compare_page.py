@@ -88,7 +88,7 @@ def _section(section: Section) -> str:
     gains = sorted_table(
         DIFFERENCES, difference_rows(listed), frozenset(("rows", "blocks", "difference", "low", "high"))
     )
-    images = "\n".join(picture(path.read_bytes(), title, seen) for path, title, seen in section.pictures)
+    images = "\n".join(picture(path.read_bytes(), title, description) for path, title, description in section.pictures)
     best = best_run(section.runs).name
     lines = [_command(run) for run in section.runs]
     others = f" and the best run by mean score on common rows, {best}; then all other pairs"
@@ -128,8 +128,8 @@ def _result(runs: Sequence[Results]) -> str:
     lines = []
     for run in ranked[:MOST_RUNS]:
         # Earlier versions store no constant, or no gains.
-        whole = CONSTANT in run.metrics and all("gain" in block for block in run.metrics["reference"].values())
-        words = verdicts(run.metrics) if whole else [f"median {score(run):.4g}"]
+        has_gains = CONSTANT in run.metrics and all("gain" in block for block in run.metrics["reference"].values())
+        words = verdicts(run.metrics) if has_gains else [f"median {score(run):.4g}"]
         lines.append(f"<li><b>{escaped(run.name)}</b>: {escaped('. '.join(words))}</li>")
     more = f"<p>{len(runs) - MOST_RUNS} more below.</p>" if len(runs) > MOST_RUNS else ""
     return f"<ol>{''.join(lines)}</ol>{more}"
@@ -159,7 +159,7 @@ def _better(run: Results) -> str:
 
 def _facts(runs: Sequence[Results]) -> str:
     first, task = runs[0], TASKS[runs[0].task]
-    origins = {known.name: f" ({known.licence}; {known.origin})" for known in KNOWN}
+    origins = {data_set.name: f" ({data_set.licence}; {data_set.origin})" for data_set in KNOWN}
     origin = (first.dataset or "unknown") + origins.get(first.dataset, "")
     receivers = f"{len(first.receivers)} receiver{'s' if len(first.receivers) > 1 else ''}"
     facts = {"data": origin, "task": f"{task.heading}, {receivers}"}
@@ -213,22 +213,22 @@ def _versions(runs: Sequence[Results]) -> str:
 def changed_settings(config: RunConfig) -> dict[str, Any]:
     """Settings, by dotted name, that differ from the model's defaults for these data; not arguments of `train`."""
     entry = config.entry
-    stated = {"model": config.model, "seed": config.seed, "deterministic": config.deterministic}
-    standard = dict(flat(asdict(default_settings(entry, (), stated))))
+    arguments = {"model": config.model, "seed": config.seed, "deterministic": config.deterministic}
+    standard = dict(flat(asdict(default_settings(entry, (), arguments))))
     settings = {name: value for name, value in flat(asdict(config.settings)) if name not in entry.train_arguments}
     return {name: value for name, value in settings.items() if value != standard[name]}
 
 
 def _preset(config: RunConfig) -> str | None:
     """The preset that gave values to settings that are not stated, the one with most of them; None: no preset did."""
-    entry, values, found = config.entry, dict(flat(asdict(config.settings))), dict[str, int]()
+    entry, values, counts = config.entry, dict(flat(asdict(config.settings))), dict[str, int]()
     standard = dict(flat(asdict(default_settings(entry, (), {"model": config.model}))))
     for name, texts in entry.presets.items() if config.stated is not None else ():
         preset = dict(flat(asdict(default_settings(entry, texts, {"model": config.model}))))
-        given = [key for key in preset.keys() - {*(config.stated or ())} if preset[key] != standard[key]]
-        if given and all(values[key] == preset[key] for key in given):
-            found[name] = len(given)
-    return max(found, key=lambda name: found[name], default=None)
+        changed = [key for key in preset.keys() - {*(config.stated or ())} if preset[key] != standard[key]]
+        if changed and all(values[key] == preset[key] for key in changed):
+            counts[name] = len(changed)
+    return max(counts, key=lambda name: counts[name], default=None)
 
 
 def _options(config: RunConfig) -> dict[str, Any]:
@@ -249,9 +249,9 @@ def _command(run: Results) -> str:
         return command(config, run.path)
     if PREDICTED not in metrics:
         return f"# {run.name}: {CONFIG} is missing, or of a model that this version lacks"
-    stated = read_yaml(run.path / CONFIG) if (run.path / CONFIG).exists() else {}
+    content = read_yaml(run.path / CONFIG) if (run.path / CONFIG).exists() else {}
     options = {"predictions": metrics[PREDICTED], "dataset": metrics["dataset"], "name": metrics["model"]}
-    options |= {"split": metrics["split"], "n-train": stated.get("n_train"), "seed": run.seed or None}
+    options |= {"split": metrics["split"], "n-train": content.get("n_train"), "seed": run.seed or None}
     words = [word for key, value in options.items() if value is not None for word in (f"--{key}", str(value))]
     return shlex.join(["wrf-mi", "evaluate", *words, "--out", str(run.path)])
 

@@ -146,7 +146,7 @@ def _of_pair(run: Results, other: Results, is_method: bool) -> Difference:
     keys = common([run, other])
     rows = [row for _, row in keys]
     trained = [(run.training_digests.get(key), other.training_digests.get(key)) for key in keys]
-    if is_method and any(one != another or one is None for one, another in trained):
+    if is_method and any(digest != another or digest is None for digest, another in trained):
         unknown = any(None in pair for pair in trained)
         return Difference(run.name, other.name, len(set(rows)), UNKNOWN_ROWS if unknown else OTHER_ROWS)
     change = [run.score[run.scored[key]] - other.score[other.scored[key]] for key in keys]
@@ -155,9 +155,9 @@ def _of_pair(run: Results, other: Results, is_method: bool) -> Difference:
 
 def _to_reference(run: Results) -> Difference:
     """Difference of a run and its reference, which has the same training rows."""
-    known = np.argwhere(np.isfinite(run.score) & np.isfinite(run.reference_score))
-    change = [run.score[r, m] - run.reference_score[r, m] for r, m in known]
-    return _of_rows(run, run.reference_name, run.row[known[:, 1]].tolist(), change)
+    pairs = np.argwhere(np.isfinite(run.score) & np.isfinite(run.reference_score))
+    change = [run.score[r, m] - run.reference_score[r, m] for r, m in pairs]
+    return _of_rows(run, run.reference_name, run.row[pairs[:, 1]].tolist(), change)
 
 
 def _of_rows(run: Results, against: str, row: Sequence[int], change: Sequence[Any]) -> Difference:
@@ -172,8 +172,8 @@ def _of_rows(run: Results, against: str, row: Sequence[int], change: Sequence[An
     blocks = row_blocks(tx_pos_m)
     interval = block_bootstrap(means if TASKS[run.task].higher_is_better else -means, blocks)
     verdict = BETTER if interval.low > 0 else WORSE if interval.high < 0 else TIE
-    stated = interval.value, interval.low, interval.high, len(np.unique(blocks))
-    return Difference(run.name, against, len(rows), verdict, *stated)
+    figures = interval.value, interval.low, interval.high, len(np.unique(blocks))
+    return Difference(run.name, against, len(rows), verdict, *figures)
 
 
 def row_blocks(tx_pos_m: FloatArray) -> IntArray:
@@ -225,9 +225,9 @@ def method_rows(runs: Sequence[Results]) -> list[dict[str, Any]]:
     for k in order:
         group = groups[k]
         # Of splits that a seed draws, methods are compared by the same seeds alone.
-        one, best = (_trained(runs, keys) for runs in (group, groups[order[0]]))
+        digests, best = (_trained(runs, keys) for runs in (group, groups[order[0]]))
         gain = Difference(group[0].name, "", len({row for _, row in keys}), OTHER_ROWS)
-        if one == best and not any(None in rows for rows in one):
+        if digests == best and not any(None in rows for rows in digests):
             gain = _of_rows(group[0], "", [row for _, row in keys], of_group[k] - of_group[order[0]])
         row: dict[str, Any] = {"method": ", ".join(run.name for run in group), "seeds": len(group)}
         for name in ("median", "mean"):
@@ -296,8 +296,8 @@ def references(runs: Sequence[Results]) -> dict[str, tuple[Results, str]]:
     by_name: dict[str, tuple[Results, str]] = {}
     for run in runs:
         for key, scores in run.reference_scores.items():
-            known = (r.reference_scores[key] for r, k in by_name.values() if k == key)
-            if any(np.array_equal(scores, other, equal_nan=True) for other in known):
+            earlier_scores = (r.reference_scores[key] for r, k in by_name.values() if k == key)
+            if any(np.array_equal(scores, other, equal_nan=True) for other in earlier_scores):
                 continue
             name = f"{run.words_of(key)}, {run.metrics['split']}"
             by_name[f"{name} of {run.name}" if name in by_name else name] = run, key

@@ -108,9 +108,9 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
     rows = split.test
     truth, broken, scored = _truth(record, split)
     predicted = (predict(rows, receiver) for receiver in scored)
-    stated = [p if isinstance(p, Prediction) else Prediction(p) for p in predicted]
-    prediction = np.full((len(truth), *stated[0].mean.shape), np.nan, truth.dtype)
-    prediction[scored] = [p.mean for p in stated]
+    predictions = [p if isinstance(p, Prediction) else Prediction(p) for p in predicted]
+    prediction = np.full((len(truth), *predictions[0].mean.shape), np.nan, truth.dtype)
+    prediction[scored] = [p.mean for p in predictions]
     arrays = {
         "row": rows,
         "prediction": prediction,
@@ -122,17 +122,17 @@ def evaluate(record: Record, split: Split, predict: Predict, single: Predict | N
         **constant_scores(record, split, truth),
         "receiver_name": np.asarray([r.name for r in record.receivers]),
     }
-    if stated[0].std is not None:
+    if predictions[0].std is not None:
         arrays["std"] = np.full(prediction.shape, np.nan, np.float32)
-        arrays["std"][scored] = [p.stated_std for p in stated]
-    of_mean = [p.std_mean for p in stated if p.std_mean is not None]
-    if len(of_mean) == len(stated):
+        arrays["std"][scored] = [p.stated_std for p in predictions]
+    of_mean = [p.std_mean for p in predictions if p.std_mean is not None]
+    if len(of_mean) == len(predictions):
         arrays[STD_MEAN] = np.full(prediction.shape, np.nan, np.float32)
         arrays[STD_MEAN][scored] = of_mean
     if record.truth is not None:
         arrays[NOISE_FREE] = np.ones(len(rows), bool)
-    if stated[0].reception is not None:
-        arrays |= reception_arrays(record, split, truth, dict(zip(scored, stated, strict=True)))
+    if predictions[0].reception is not None:
+        arrays |= reception_arrays(record, split, truth, dict(zip(scored, predictions, strict=True)))
     metrics = score(arrays, record.task.name) | {
         NOT_SCORED: broken,
         **_few_rows(record, split),
@@ -181,16 +181,16 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
 
     def blocks(chosen: Any) -> dict[str, Any]:
         reference = {key: block(values, reference_key(key), chosen) for key, values in references.items()}
-        stated = block(scores, "prediction", chosen)
+        of_prediction = block(scores, "prediction", chosen)
         meaning = {"metric": scorer.block, "higher_is_better": scorer.higher_is_better}
-        return {"score": meaning | stated, scorer.block: stated, "reference": reference}
+        return {"score": meaning | of_prediction, scorer.block: of_prediction, "reference": reference}
 
     metrics: dict[str, Any] = {"task": task, **blocks(slice(None)), "n_test": len(arrays["row"])}
     for key, simple in references.items():
         metrics["reference"][key] |= against(scorer, scores, simple)
         if scorer.in_decibel:
-            stated = arrays["prediction"], arrays[reference_key(key)], arrays["truth"]
-            metrics["reference"][key] |= against_rmse(*stated)
+            compared = arrays["prediction"], arrays[reference_key(key)], arrays["truth"]
+            metrics["reference"][key] |= against_rmse(*compared)
     if COUNT in arrays:
         metrics["reference"][IDW][NEIGHBOURS] = np.unique(arrays[COUNT]).tolist()
     if len(scores) > 1:
@@ -203,8 +203,8 @@ def score(arrays: dict[str, Any], task: str) -> dict[str, Any]:
     if "std" in arrays:
         # Truth without noise lies in intervals of the mean, readings in their own.
         std = STD_MEAN if NOISE_FREE in arrays and STD_MEAN in arrays else "std"
-        stated = arrays["prediction"], arrays[std], arrays["truth"]
-        metrics["inside_90"], metrics["crps"] = inside_interval(*stated), crps(*stated)
+        compared = arrays["prediction"], arrays[std], arrays["truth"]
+        metrics["inside_90"], metrics["crps"] = inside_interval(*compared), crps(*compared)
         metrics[INTERVALS_OF] = "reading" if std == "std" else "mean"
     if RECEPTION in arrays:
         metrics["reception"] = reception_block(arrays)
@@ -329,14 +329,14 @@ def _stage_scores(record: Record, part: FittedPart, metrics: dict[str, Any], arr
 
 
 def _header(folder: Path, config: RunConfig, parts: Sequence[FittedPart]) -> dict[str, Any]:
-    known: dict[str, Any] = {key: getattr(config, key) for key in ("model", "dataset", "split", "seed")}
-    known |= {} if config.scene is None else {"scene": config.scene}
-    known |= {LEFT_OUT: dict(config.left_out)} if config.left_out else {}
-    known |= {PLACES: places} if (places := stored_places(folder)) else {}
+    header: dict[str, Any] = {key: getattr(config, key) for key in ("model", "dataset", "split", "seed")}
+    header |= {} if config.scene is None else {"scene": config.scene}
+    header |= {LEFT_OUT: dict(config.left_out)} if config.left_out else {}
+    header |= {PLACES: places} if (places := stored_places(folder)) else {}
     # The peak of the fit, if it is stored already.
     memory_mb = stored_metrics(folder).get("peak_memory_mb", peak_memory_mb())
     seconds = sum(part.seconds for part in parts)
-    return {**known, "train_seconds": seconds, "peak_memory_mb": memory_mb, **parts[0].fitted.facts()}
+    return {**header, "train_seconds": seconds, "peak_memory_mb": memory_mb, **parts[0].fitted.facts()}
 
 
 def write_results(folder: Path, metrics: dict[str, Any], arrays: dict[str, Any]) -> None:

@@ -136,23 +136,23 @@ def read_config(folder: Path) -> RunConfig:
             raise InputError(f"{path}: not readable (no settings in it); restore it")
         check_format(folder)
         needed = ("model", "dataset", "task", "split", "n_train", "seed", "scene", "material", "antennas")
-        stated = {name: content[name] for name in needed}
-        stated |= {name: content.get(name) or False for name in ("deterministic", "intervals")}
-        stated |= {"left_out": content.get("left_out") or {}, "stated": content.get("stated")}
-        stated |= {name: _from_here(stated[name], content.get(PLACE)) for name in ("dataset", "scene")}
-        config = settings_from(RunConfig, {**stated, "settings": None}, str(path))
+        entries = {name: content[name] for name in needed}
+        entries |= {name: content.get(name) or False for name in ("deterministic", "intervals")}
+        entries |= {"left_out": content.get("left_out") or {}, "stated": content.get("stated")}
+        entries |= {name: _from_here(entries[name], content.get(PLACE)) for name in ("dataset", "scene")}
+        config = settings_from(RunConfig, {**entries, "settings": None}, str(path))
         if config.task not in TASKS or config.seed < 0:
             raise InputError(f"{path}: task {shown(config.task)} with seed {config.seed}: not known; restore it")
         kind: Any = config.entry.settings
         return replace(config, settings=settings_from(kind, content["settings"], str(path)))
 
 
-def _from_here(stated: Any, place: Any) -> Any:
+def _from_here(stated_path: Any, place: Any) -> Any:
     """A path that was stated in a folder, as it is called here: a run is opened from anywhere, also from a copy."""
-    if not isinstance(stated, str) or not isinstance(place, str) or Path(place) == Path.cwd():
-        return stated
-    there = Path(place, stated)
-    return str(there) if there.exists() else stated
+    if not isinstance(stated_path, str) or not isinstance(place, str) or Path(place) == Path.cwd():
+        return stated_path
+    joined = Path(place, stated_path)
+    return str(joined) if joined.exists() else stated_path
 
 
 def known_config(folder: Path) -> RunConfig | None:
@@ -177,8 +177,8 @@ def check_format(folder: Path) -> None:
     content: dict[Any, Any] = {}
     with suppress(InputError):
         content = read_yaml(folder / CONFIG)
-    if content and (stated := content.get("format")) != FORMAT:
-        text = f"format {stated or 'not stated'}, this version reads {FORMAT}"
+    if content and (stored_format := content.get("format")) != FORMAT:
+        text = f"format {stored_format or 'not stated'}, this version reads {FORMAT}"
         raise InputError(f"{folder / CONFIG}: {text}; train it anew, or use the version that wrote it")
 
 
@@ -268,8 +268,8 @@ def start_run(folder: Path, config: RunConfig, splits: Sequence[Split]) -> None:
 def write_configs(folder: Path, config: RunConfig, splits: Sequence[Split]) -> None:
     """Write ``config.yaml`` of a run and of its folds."""
     of_folds = [(part, replace(config, split=rows.name)) for part, rows in _folders(folder, splits) if part != folder]
-    for part, stated in [*of_folds, (folder, config)]:  # last: a folder with a configuration has all its splits
-        content = {"format": FORMAT, **asdict(stated), PLACE: str(Path.cwd()), "versions": versions()}
+    for part, part_config in [*of_folds, (folder, config)]:  # last: a folder with a configuration has all its splits
+        content = {"format": FORMAT, **asdict(part_config), PLACE: str(Path.cwd()), "versions": versions()}
         plain = json.loads(json.dumps(content))  # YAML has no tuples
         write_atomically(part / CONFIG, yaml.safe_dump(plain, sort_keys=False))
 

@@ -121,5 +121,5 @@ def _carriers_hz(record: Record, rows: IntArray) -> FloatArray:
         return np.broadcast_to(record.carriers_hz[rows], shape)
     if record.frequencies_hz is None:
         raise InputError(f"{record.name}: carrier frequency unknown; state {record.task.carrier_stated_in}")
-    stated = [receiver.frequency_hz or float(record.frequencies_hz[0]) for receiver in record.receivers]
-    return np.broadcast_to(np.array(stated)[:, None], shape)
+    carriers_hz = [receiver.frequency_hz or float(record.frequencies_hz[0]) for receiver in record.receivers]
+    return np.broadcast_to(np.array(carriers_hz)[:, None], shape)

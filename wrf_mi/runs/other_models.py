@@ -80,15 +80,15 @@ def score_predictions(
 
     def predict(rows: IntArray, receiver: int) -> Prediction:
         at = place[rows]
-        stated = {name: arrays[name][receiver, at] for name in ("std", STD_MEAN) if name in arrays}
-        return Prediction(arrays["prediction"][receiver, at], **stated)
+        deviations = {name: arrays[name][receiver, at] for name in ("std", STD_MEAN) if name in arrays}
+        return Prediction(arrays["prediction"][receiver, at], **deviations)
 
     scores: list[Scores] = [evaluate(record, part, predict) for part in splits]
     metrics, scored = scores[0] if len(scores) == 1 else pool(scores)
     costs = {key: float(arrays.get(key, np.nan)) for key in COSTS}
     source = str(data) if not isinstance(data, Record) else record.source or record.name
-    stated: tuple[Any, ...] = (None, None, AntennaOptions(), False, False, {})
-    config = RunConfig(name, source, record.task.name, split, n_train, seed, *stated)
+    config_defaults: tuple[Any, ...] = (None, None, AntennaOptions(), False, False, {})
+    config = RunConfig(name, source, record.task.name, split, n_train, seed, *config_defaults)
     header = {"model": name, "dataset": source, "split": split, "seed": seed, "predictions": str(path)}
     with new_run_folder(folder, overwrite):
         start_run(folder, config, splits)

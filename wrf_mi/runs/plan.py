@@ -48,7 +48,7 @@ def plan_run(
     record = dataset if isinstance(dataset, Record) else load_record(str(dataset), progress=progress)
     model = _serving_model(record, request)
     _check_scene(model, record, scene, request)
-    settings, stated = _settings_of(model, request)
+    settings, stated_settings = _settings_of(model, request)
     seed, deterministic = request.seed, request.deterministic
     if "seed" in model.train_arguments:
         seed, deterministic = settings.seed, settings.deterministic
@@ -60,12 +60,12 @@ def plan_run(
     for rows in splits:
         check_held_receivers(record, rows, model, MODELS.values())
         check_observations(record, rows, model.complete, may_be_silent=record.task.may_be_silent)
-    problem = Problem(record, settings, seed, scene, request.material, request.antennas, stated=stated)
+    problem = Problem(record, settings, seed, scene, request.material, request.antennas, stated=stated_settings)
     check_placeable(problem, splits)
     source = (record.source or record.name) if isinstance(dataset, Record) else str(dataset)
     name = split.name if isinstance(split, Split) else split
     options = (seed, scene, request.material, request.antennas, deterministic, request.intervals, settings, left_out)
-    names = None if stated is None else tuple(sorted(stated))
+    names = None if stated_settings is None else tuple(sorted(stated_settings))
     config = RunConfig(request.model, source, record.task.name, name, request.n_train, *options, names)
     placed = placed_problem(problem.seen(splits[-1]), splits[-1], config.entry, on_progress)
     config.entry.check(placed, splits)
@@ -110,27 +110,30 @@ def _split_of(record: Record, request: RunRequest) -> str | Split:
 def _settings_of(model: Model, request: RunRequest) -> tuple[Any, frozenset[str] | None]:
     """Settings, and the names of those that are stated; None: those of a dataclass that differ from its defaults."""
     kind: Any = model.settings
-    stated, names = request.settings, None
-    if is_dataclass(stated) and not isinstance(stated, type):
+    requested, names = request.settings, None
+    if is_dataclass(requested) and not isinstance(requested, type):
         if request.preset is not None:
             raise InputError(f"preset {request.preset}: the settings state all values; give one of both")
         if request.loss is not None:
             raise InputError(f"loss {request.loss}: the settings state all values; state it as loss.name there")
-        if not issubclass(kind, type(stated)):
-            raise InputError(f"settings of {model.name}: {type(stated).__name__}; give {kind.__name__}")
-        settings: Any = kind(**{field.name: getattr(stated, field.name) for field in fields(stated)})
+        if not issubclass(kind, type(requested)):
+            raise InputError(f"settings of {model.name}: {type(requested).__name__}; give {kind.__name__}")
+        settings: Any = kind(**{field.name: getattr(requested, field.name) for field in fields(requested)})
     else:
-        assert isinstance(stated, Iterable)
-        texts = [*(setting_texts(stated) if isinstance(stated, Mapping) else stated), *_loss_text(model, request.loss)]
-        preset, given = _preset(model, request.preset), {name: getattr(request, name) for name in GIVEN}
-        settings = default_settings(model, [*preset, *texts], given)
+        assert isinstance(requested, Iterable)
+        texts = [
+            *(setting_texts(requested) if isinstance(requested, Mapping) else requested),
+            *_loss_text(model, request.loss),
+        ]
+        preset, arguments = _preset(model, request.preset), {name: getattr(request, name) for name in GIVEN}
+        settings = default_settings(model, [*preset, *texts], arguments)
         names = frozenset(stated_values(settings, texts))
         if preset and stated_values(settings, preset).keys() <= names:
             raise InputError(f"preset {request.preset}: the settings state all that it does; omit one of them")
         for name in names.intersection(model.train_arguments) - {"model"}:
             value = getattr(settings, name)
-            if given[name] not in (None, type(value)(), value):
-                raise InputError(f"setting {name}: {value}, where the argument is {given[name]}; give one of both")
+            if arguments[name] not in (None, type(value)(), value):
+                raise InputError(f"setting {name}: {value}, where the argument is {arguments[name]}; give one of both")
     if "model" in model.train_arguments and settings.model != model.name:
         raise InputError(f"setting model: {settings.model}, where the model is {model.name}; choose it with --model")
     return settings, names
@@ -148,8 +151,8 @@ def _loss_text(model: Model, name: str | None) -> list[str]:
 
 def _preset(model: Model, name: str | None) -> tuple[str, ...]:
     if name is not None and name not in model.presets:
-        known = f"has the presets {', '.join(model.presets)}" if model.presets else "has no presets; use --set"
-        raise InputError(f"--preset {name}: {model.name} for such data {known}")
+        presets = f"has the presets {', '.join(model.presets)}" if model.presets else "has no presets; use --set"
+        raise InputError(f"--preset {name}: {model.name} for such data {presets}")
     return () if name is None else model.presets[name]
 
 

@@ -72,8 +72,8 @@ def write_run_predictions(
     shape, arrays = (len(run.receivers), len(inputs)), dict[str, NDArray[Any]]()
 
     def collect(rows: slice, receiver: int, chunk: Prediction) -> None:
-        stated = ("prediction", chunk.mean), ("std", chunk.std), (STD_MEAN, chunk.std_mean)
-        for name, values in (*stated, (RECEPTION, chunk.reception)):
+        named_arrays = ("prediction", chunk.mean), ("std", chunk.std), (STD_MEAN, chunk.std_mean)
+        for name, values in (*named_arrays, (RECEPTION, chunk.reception)):
             if values is not None:
                 values = values if name == "prediction" else values.astype(np.float32)
                 if name not in arrays:

@@ -149,7 +149,7 @@ def write_prediction_file(
         The arrays as an ``.npz`` file has them.
     """
     optional = ((HEADING, inputs.tx_heading_rad), (FREQUENCY, inputs.carriers_hz))
-    stated = [(name, values) for name, values in optional if values is not None]
+    input_columns = [(name, values) for name, values in optional if values is not None]
     arrays: dict[str, Any] = {"row": np.arange(len(inputs)), "tx_pos": inputs.tx_pos_m}
     arrays["receiver_name"] = np.asarray(receivers)
     if inputs.carriers_hz is not None:
@@ -157,7 +157,7 @@ def write_prediction_file(
     if out.suffix.lower() == NPZ:
         return write_predictions(out, arrays | observations)
     # A list, as receivers may have equal names.
-    columns: list[tuple[str, Any]] = [*zip("xyz", inputs.tx_pos_m.T, strict=True), *stated]
+    columns: list[tuple[str, Any]] = [*zip("xyz", inputs.tx_pos_m.T, strict=True), *input_columns]
     deviations = ("std", "std_db"), (STD_MEAN, f"{STD_MEAN}_db")
     for key, suffix in (("prediction", "dbm"), *deviations, (RECEPTION, "received")):
         if key in observations:

@@ -26,11 +26,11 @@ def reception_arrays(
     arrays = {key: np.full(truth.shape, np.nan, np.float32) for key in (RECEPTION, *REFERENCES)}
     for receiver, prediction in stated.items():
         near = shares.near(record.tx_pos_m[rows], receiver)[0]
-        known = np.isfinite(truth[receiver]) | np.isnan(record.scored[receiver, rows])
+        is_scored = np.isfinite(truth[receiver]) | np.isnan(record.scored[receiver, rows])
         for values, probability in zip(
             arrays.values(), (prediction.reception, shares.rate[receiver], near), strict=True
         ):
-            values[receiver] = np.where(known, probability, np.nan)
+            values[receiver] = np.where(is_scored, probability, np.nan)
     return arrays
 
 
@@ -39,11 +39,11 @@ def reception_block(arrays: Mapping[str, Any]) -> dict[str, Any]:
 
     Where test rows are of several runs of the measurement, ``runs`` has the same scores of each.
     """
-    known = np.isfinite(arrays[RECEPTION])
-    block = _scores(arrays, known)
-    runs = arrays.get(RUN, np.zeros(known.shape[1], str))
+    is_scored = np.isfinite(arrays[RECEPTION])
+    block = _scores(arrays, is_scored)
+    runs = arrays.get(RUN, np.zeros(is_scored.shape[1], str))
     if len(names := np.unique(runs)) > 1:
-        of_runs = {str(name): known & (runs == name) for name in names}
+        of_runs = {str(name): is_scored & (runs == name) for name in names}
         block["runs"] = {name: _scores(arrays, pairs) for name, pairs in of_runs.items() if pairs.any()}
     return block
 

@@ -64,8 +64,8 @@ def _interpolated(record: Record, split: Split) -> tuple[dict[str, NDArray[Any]]
     inputs = inputs_of(record, split.test)
     predictions = {key: of_all(inputs)}
     if record.carriers_hz is not None and inputs.carriers_hz is not None:
-        known = np.unique(record.carriers_hz[split.all_train])
-        nearest = known[np.abs(np.log(inputs.carriers_hz[:, None] / known)).argmin(axis=1)]
+        trained_hz = np.unique(record.carriers_hz[split.all_train])
+        nearest = trained_hz[np.abs(np.log(inputs.carriers_hz[:, None] / trained_hz)).argmin(axis=1)]
         if (nearest != inputs.carriers_hz).any():
             predictions[CARRIER] = of_all(replace(inputs, carriers_hz=nearest))
     return predictions, fitted.facts()

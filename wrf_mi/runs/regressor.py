@@ -157,13 +157,15 @@ class WrfRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
     def _known_receivers(self, count: int) -> tuple[Receiver, ...]:
         """Receivers of the columns of ``y``."""
-        stated: Any = np.full((count, 3), np.nan) if self.receivers is None else self.receivers
-        if len(stated) != count or not all(isinstance(each, Receiver) or np.shape(each) == (3,) for each in stated):
-            text = f"receivers: {len(stated)} for {count} columns of y"
+        receivers: Any = np.full((count, 3), np.nan) if self.receivers is None else self.receivers
+        if len(receivers) != count or not all(
+            isinstance(each, Receiver) or np.shape(each) == (3,) for each in receivers
+        ):
+            text = f"receivers: {len(receivers)} for {count} columns of y"
             raise InputError(f"{text}; give a position x, y, z in metres of each column, or None for unknown places")
         return tuple(
             each if isinstance(each, Receiver) else Receiver(f"receiver{k}", np.array(each, float), np.array(UPRIGHT))
-            for k, each in enumerate(stated)
+            for k, each in enumerate(receivers)
         )
 
     def _as_targets(self, values: NDArray[Any]) -> FloatArray:

@@ -120,12 +120,12 @@ def _read_spectra(folder: Path, record: Record, test: IntArray) -> dict[str, NDA
         raise InputError(f"{folder}: no pictures 0.png, 1.png, ...; give pred_spectrum, or of WRF-GS+ a folder in it")
     # The scripts count test rows from 0; the data set's names are its rows from 1, in five digits.
     named = any(file.stem[0] == "0" and len(file.stem) > 1 for file in files)
-    known = np.arange(len(record)) if named else test
+    candidate_rows = np.arange(len(record)) if named else test
     numbers = np.array([int(file.stem) - named for file in files])
-    for wrong in np.flatnonzero((numbers < 0) | (numbers >= len(known))):
-        text = f"no row belongs to it, {record.name} has {len(known)} {'' if named else 'test '}rows"
+    for wrong in np.flatnonzero((numbers < 0) | (numbers >= len(candidate_rows))):
+        text = f"no row belongs to it, {record.name} has {len(candidate_rows)} {'' if named else 'test '}rows"
         raise InputError(f"{files[wrong]}: {text}; {REMEDY}")
-    rows, height, width = known[numbers], *record.observation.shape[2:]
+    rows, height, width = candidate_rows[numbers], *record.observation.shape[2:]
     prediction, drawn = np.zeros((len(rows), height, width), np.float32), False
     for k, (file, row) in enumerate(zip(files, rows, strict=True)):
         plots = _plots(file, height, width)

@@ -82,8 +82,8 @@ class Results:
     @cached_property
     def scored(self) -> dict[tuple[str, int], tuple[int, int]]:
         """Receiver and column in `score` of each observation that is scored, by the receiver's name and the row."""
-        known = np.argwhere(np.isfinite(self.score))
-        return {(self.receivers[r], int(self.row[m])): (int(r), int(m)) for r, m in known}
+        pairs = np.argwhere(np.isfinite(self.score))
+        return {(self.receivers[r], int(self.row[m])): (int(r), int(m)) for r, m in pairs}
 
     @cached_property
     def truth_digests(self) -> dict[tuple[str, int], int]:

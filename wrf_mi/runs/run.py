@@ -92,8 +92,10 @@ class Run:
         config = self.config
         scene = (config.scene, config.material) if self.scene is None else (str(self.scene), None)
         data, left_out = self.record or config.dataset, tuple(config.left_out)
-        stated = None if config.stated is None else frozenset(config.stated)
-        problem = Problem(data, config.settings, config.seed, *scene, config.antennas, self.operator, left_out, stated)
+        stated_settings = None if config.stated is None else frozenset(config.stated)
+        problem = Problem(
+            data, config.settings, config.seed, *scene, config.antennas, self.operator, left_out, stated_settings
+        )
         return stored_problem(problem, self.folder)
 
     @cached_property
@@ -132,8 +134,8 @@ class Run:
             InputError: a run of another task or of several carriers, or arrays of other shapes.
         """
         with self._named():
-            own = checked_readings(tx_pos_m, power_dbm, self.problem.record, len(self.receivers))
-        run = replace(self, own=own)
+            readings = checked_readings(tx_pos_m, power_dbm, self.problem.record, len(self.receivers))
+        run = replace(self, own=readings)
         vars(run)["of_any_device"] = self.of_any_device  # whose data and model are open already
         return run
 
@@ -207,12 +209,12 @@ class Run:
                 receiver.
         """
         inputs = known_inputs(ordered(tx_pos_m, "row", "axis"), tx_heading_rad, uplink, carriers_hz)
-        known = self.receivers
-        of_one = receiver is not None or len(known) == 1
-        numbers = [receiver_index(known, receiver or 0)] if of_one else range(len(known))
+        receivers = self.receivers
+        of_one = receiver is not None or len(receivers) == 1
+        numbers = [receiver_index(receivers, receiver or 0)] if of_one else range(len(receivers))
         every = [self.predict_inputs(inputs, number) for number in numbers]
         joined = _joined(every, np.concatenate if of_one else np.stack)
-        names = tuple(known[number].name for number in numbers)
+        names = tuple(receivers[number].name for number in numbers)
         places: dict[str, Any] = {"tx_pos_m": inputs.tx_pos_m, "receiver_names": names}
         return LabelledPrediction(**joined, **places, task=self.config.task, of_one=of_one)
 
@@ -326,14 +328,14 @@ class Run:
             check_inputs(inputs, self.problem.record, model)
 
     def _check_carriers(self, inputs: Inputs) -> None:
-        stated = self.fitted.carriers_hz
-        known = self.problem.record.carriers_hz if stated is None else stated if stated.size else None
+        fitted_hz = self.fitted.carriers_hz
+        carriers_hz = self.problem.record.carriers_hz if fitted_hz is None else fitted_hz if fitted_hz.size else None
         if inputs.carriers_hz is not None:
-            if known is None:
+            if carriers_hz is None:
                 raise InputError(f"{self.folder}: its data have one carrier; omit {FREQUENCY}")
             self._check_numbers(inputs, inputs.carriers_hz, "carriers", f"positive {FREQUENCY}", 0.0)
-        elif known is not None:
-            text = f"its data have {carriers_text(known)}; give {FREQUENCY} for each position"
+        elif carriers_hz is not None:
+            text = f"its data have {carriers_text(carriers_hz)}; give {FREQUENCY} for each position"
             raise InputError(f"{self.folder}: {text}")
 
     def _check_numbers(

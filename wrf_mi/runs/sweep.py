@@ -116,10 +116,10 @@ def plan_sweep(
         name = ",".join(map("=".join, zip(choices, words, strict=True)))
         if name in runs:
             raise InputError(f"sweep: two runs would be named {name}; choose values that differ in letters or digits")
-        stated = {**options, **varied}
+        run_options = {**options, **varied}
         if with_presets and "preset" in options and varied.get("model") not in with_presets:
-            del stated["preset"]
-        runs[name] = SweepRun(Path(out) / name, varied, _arguments(stated, settings, flags))
+            del run_options["preset"]
+        runs[name] = SweepRun(Path(out) / name, varied, _arguments(run_options, settings, flags))
     shared = {"vary": sorted(choices), "options": dict(options), "settings": list(settings), "flags": list(flags)}
     return Sweep(Path(out), shared, tuple(runs.values()))
 
@@ -145,10 +145,10 @@ def _choices(vary: Sequence[str], fixed: Collection[str]) -> dict[str, list[str]
     return choices
 
 
-def _arguments(stated: Mapping[str, str], settings: Sequence[str], flags: Sequence[str]) -> tuple[str, ...]:
+def _arguments(run_options: Mapping[str, str], settings: Sequence[str], flags: Sequence[str]) -> tuple[str, ...]:
     """Arguments of ``wrf-mi`` that state the options, flags and settings of a run, besides those of all runs."""
     dataset, options, switched, changed = [], [], list(flags), list(settings)
-    for key, value in stated.items():
+    for key, value in run_options.items():
         if key == "dataset":
             dataset = [value]
         elif key in OPTIONS:
@@ -223,12 +223,12 @@ def _with_stored(sweep: Sweep, path: Path, current: dict[str, dict[str, str]]) -
         raise InputError(f"{sweep.folder}: holds a sweep with other settings than this one; choose another --out")
     merged: dict[str, dict[str, str]] = {}
     for key, text in (("versions", "by other versions of"), ("content", "with other content of")):
-        known, now = before.get(key, {}), current[key]
-        changed = [name for name in now if known.get(name, now[name]) != now[name]]
+        stored, now = before.get(key, {}), current[key]
+        changed = [name for name in now if stored.get(name, now[name]) != now[name]]
         changed += [] if key in before else ["what it does not state"]
         if changed:
             raise InputError(f"{sweep.folder}: holds a sweep {text} {listed(changed)}; choose another --out")
-        merged[key] = known | now
+        merged[key] = stored | now
     return merged
 
 
@@ -263,10 +263,10 @@ def scene_files(scene: str | Path) -> list[Path]:
     if path.suffix.lower() != ".xml":
         return [path]
     try:
-        stated = [node.get("value", "") for node in parse(path, forbid_dtd=True).iter("string")]
+        values = [node.get("value", "") for node in parse(path, forbid_dtd=True).iter("string")]
     except (ElementTree.ParseError, DefusedXmlException, OSError) as error:
         raise InputError(f"{path}: not readable as XML ({one_line(error)}); correct the scene") from None
-    return [path, *(file for value in stated if value and (file := path.parent / value).is_file())]
+    return [path, *(file for value in values if value and (file := path.parent / value).is_file())]
 
 
 def _run(run: SweepRun) -> dict[str, Any]:
