@@ -100,15 +100,15 @@ def measured(record: Record, count: int | None) -> dict[str, Any]:
         "held_out": partial(errors, record, fold, fold.test),
         "test": partial(errors, record, split, split.test),
     }
-    rows, whole = list[dict[str, Any]](), dict[str, FloatArray]()
+    rows, all_rows_error = list[dict[str, Any]](), dict[str, FloatArray]()
     for name, mechanism in MECHANISMS.items():
         if name == "headings" and record.tx_heading_rad is None:
             continue
         begun, row = time.perf_counter(), {"mechanism": name, "lines": mechanism.lines}
         for part, of in parts.items():
             error = of(mechanism)
-            whole.setdefault(part, error)
-            gain = bootstrap(error - whole[part], statistic=np.mean)
+            all_rows_error.setdefault(part, error)
+            gain = bootstrap(error - all_rows_error[part], statistic=np.mean)
             row |= {f"{part}_db": float(error.mean()), part: gain.value, f"{part}_low": gain.low}
             row[f"{part}_high"] = gain.high
         rows.append({**row, "seconds": time.perf_counter() - begun})

@@ -254,8 +254,8 @@ def _check(name: str, folder: Path) -> dict[str, Any]:
         figures = json.loads(stored.read_text())
         measured = {"wall_seconds": time.perf_counter() - start, **provenance(*modules_of(name)), "figures": figures}
         write_atomically(stored, json.dumps(measured, indent=1))
-    known = {"case": name, "title": CHECKS[name].title, "command": f"wrf-mi bench {name}"}
-    return known | json.loads(stored.read_text())
+    header = {"case": name, "title": CHECKS[name].title, "command": f"wrf-mi bench {name}"}
+    return header | json.loads(stored.read_text())
 
 
 def provenance(*modules: str) -> dict[str, Any]:
@@ -263,11 +263,11 @@ def provenance(*modules: str) -> dict[str, Any]:
 
     ``modules`` made the result; what they import counts too.
     """
-    count, known = worker_threads(), versions()
-    machine = {"processor": known["device"], "cores": os.cpu_count()}
+    count, installed_versions = worker_threads(), versions()
+    machine = {"processor": installed_versions["device"], "cores": os.cpu_count()}
     machine["memory_gb"] = round(psutil.virtual_memory().total / 1e9)
     machine["system"] = f"{platform.system()} {platform.machine()}"
-    facts = {"date": time.strftime("%Y-%m-%d"), "machine": machine, "versions": known}
+    facts = {"date": time.strftime("%Y-%m-%d"), "machine": machine, "versions": installed_versions}
     return facts | {SOURCE: source_digests(*modules)} | ({} if count is None else {"worker_threads": count})
 
 

@@ -155,8 +155,8 @@ def _calibrated(run: Run, record: Record, count: int, added_db: float = 0.0) -> 
     """
     assert record.runs is not None
     assert record.official is not None
-    kept = [receiver.name for receiver in record.receivers]
-    numbers = [kept.index(receiver.name) for receiver in run.receivers]
+    receiver_names = [receiver.name for receiver in record.receivers]
+    numbers = [receiver_names.index(receiver.name) for receiver in run.receivers]
     observed, test = np.asarray(record.observation[numbers], float) + added_db, record.official[1]
     error, inside, offset, std = list[FloatArray](), list[FloatArray](), list[float](), list[float]()
     for walk in np.unique(record.runs[test]):
@@ -164,8 +164,8 @@ def _calibrated(run: Run, record: Record, count: int, added_db: float = 0.0) -> 
         rows = rows[np.isfinite(observed[:, rows]).any(axis=0)]
         if len(rows) <= 2 * OWN[-1]:
             continue
-        own, scored = rows[:count], rows[OWN[-1] :]
-        device = run.with_readings(record.tx_pos_m[own], observed[:, own]) if count else run
+        device_rows, scored = rows[:count], rows[OWN[-1] :]
+        device = run.with_readings(record.tx_pos_m[device_rows], observed[:, device_rows]) if count else run
         predicted = device.predict(record.tx_pos_m[scored])
         left = observed[:, scored] - predicted.mean
         received = np.isfinite(left)

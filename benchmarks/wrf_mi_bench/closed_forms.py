@@ -126,9 +126,9 @@ def free_space_errors() -> Iterator[Errors]:
         at_carrier(scene, hz, MIRROR)
         truth, amplitude, channel = free_space(distance_m, hz), {}, {}
         for way in WAYS:
-            found = arrivals(way, scene, tx_m, np.array([1.0, 0, 0]), replace(SPECULAR, depth=0))
-            amplitude[way] = np.abs(np.abs(found.gain / truth) - 1)
-            channel[way] = np.abs(found.channel(len(truth), hz) / truth - 1)
+            traced = arrivals(way, scene, tx_m, np.array([1.0, 0, 0]), replace(SPECULAR, depth=0))
+            amplitude[way] = np.abs(np.abs(traced.gain / truth) - 1)
+            channel[way] = np.abs(traced.channel(len(truth), hz) / truth - 1)
         yield "free space, amplitude", "", hz, ROUNDING, amplitude
         yield "free space, channel with its phase", "", hz, ROUNDING, channel
 
@@ -145,8 +145,8 @@ def two_ray_errors() -> Iterator[Errors]:
             truth = SIGN[polarization] * (free_space(direct_m, hz) + share * free_space(reflected_m, hz))
             errors = {}
             for way in WAYS:
-                found = arrivals(way, scene, tx_m, np.array([0.0, 0, 1.5]), SPECULAR, polarization)
-                errors[way] = np.abs((found.channel(len(tx_m), hz) - truth) / free_space(direct_m, hz))
+                traced = arrivals(way, scene, tx_m, np.array([0.0, 0, 1.5]), SPECULAR, polarization)
+                errors[way] = np.abs((traced.channel(len(tx_m), hz) - truth) / free_space(direct_m, hz))
             yield f"two rays over ground, {polarization}", "", hz, ROUNDING, errors
 
 
@@ -166,8 +166,8 @@ def wall_errors() -> Iterator[Errors]:
                 tx_m = np.stack([np.full_like(along_m, side * rx_m[0]), along_m, 0 * along_m], axis=1)
                 errors = {}
                 for way in WAYS:
-                    found = arrivals(way, scene, tx_m, rx_m, SPECULAR, polarization).last()
-                    errors[way] = np.abs(found.gain / truth - 1)
+                    traced = arrivals(way, scene, tx_m, rx_m, SPECULAR, polarization).last()
+                    errors[way] = np.abs(traced.gain / truth - 1)
                 kind, bound = ("mirror", ROUNDING) if constants is MIRROR else ("slab", SLAB)
                 yield f"{kind}, {what}, {name}", "", hz, bound, errors
 
@@ -185,9 +185,9 @@ def screen() -> Any:
 
 def edge_field(way: str, scene: Any, tx_m: FloatArray, rx_m: FloatArray, hz: float, polarization: str) -> ComplexArray:
     """Channels [n] by all paths but those by the other edges of `screen`."""
-    found = arrivals(way, scene, tx_m, rx_m, DIFFRACTED, polarization)
-    other = (np.abs(found.point_m[:, 2]) > 1) | (found.point_m[:, 1] < -29)
-    return SIGN[polarization] * found.select(~other).channel(len(tx_m), hz)
+    traced = arrivals(way, scene, tx_m, rx_m, DIFFRACTED, polarization)
+    other = (np.abs(traced.point_m[:, 2]) > 1) | (traced.point_m[:, 1] < -29)
+    return SIGN[polarization] * traced.select(~other).channel(len(tx_m), hz)
 
 
 def knife_edge_errors() -> Iterator[Errors]:
@@ -235,8 +235,8 @@ def wedge_errors() -> Iterator[Errors]:
         k, scale, errors = 2 * np.pi * hz / speed_of_light, speed_of_light / hz / (4 * np.pi), {}
         for polarization, truth in zip("VH", wedge(1.5, k, NEAR_M, FAR_M, INCIDENCE, angle), strict=True):
             for way in (TRACED, SIONNA):
-                found = arrivals(way, scene, tx_m, rx_m, options, polarization)
-                edge = found.select(np.linalg.norm(found.point_m, axis=1) < 0.01)
+                traced = arrivals(way, scene, tx_m, rx_m, options, polarization)
+                edge = traced.select(np.linalg.norm(traced.point_m, axis=1) < 0.01)
                 field = SIGN[polarization] * edge.channel(len(tx_m), hz)
                 errors[way] = np.abs(field - scale * truth) / np.abs(free_space(NEAR_M + FAR_M, hz))
             name = "along" if polarization == "V" else "across"
@@ -255,8 +255,8 @@ def scattering_errors() -> Iterator[Errors]:
         truth, errors = np.array([lambertian_power(tx, rx_m, *size, share, hz) for tx in tx_m]), {}
         for way in (TRACED, SIONNA):
             with scattering_materials(scene, options):
-                found = arrivals(way, scene, tx_m, rx_m, options)
-            power = np.bincount(found.row, np.abs(found.gain) ** 2, len(tx_m))
+                traced = arrivals(way, scene, tx_m, rx_m, options)
+            power = np.bincount(traced.row, np.abs(traced.gain) ** 2, len(tx_m))
             errors[way] = np.abs(power / truth - 1)
         yield "wall that scatters, power", "", hz, SAMPLED, errors
 
@@ -299,9 +299,9 @@ def channel_matrix(
     receivers = [Receiver(f"rx{number}", place, np.array(UPRIGHT)) for number, place in enumerate(rx_m)]
     paths = trace_paths(scene, tx_m, receivers, options, check=False).paths
     pair, shape = paths.rx * len(tx_m) + paths.tx, (len(rx_m), len(tx_m))
-    found = Arrivals(pair, paths.gain, paths.length_m, np.full((len(paths), 3), np.nan))
-    amplitudes = np.asarray(np.bincount(pair, np.abs(found.gain), shape[0] * shape[1]), float)
-    return found.channel(len(amplitudes), float(scene.frequency[0])).reshape(shape), amplitudes.reshape(shape)
+    path_arrivals = Arrivals(pair, paths.gain, paths.length_m, np.full((len(paths), 3), np.nan))
+    amplitudes = np.asarray(np.bincount(pair, np.abs(path_arrivals.gain), shape[0] * shape[1]), float)
+    return path_arrivals.channel(len(amplitudes), float(scene.frequency[0])).reshape(shape), amplitudes.reshape(shape)
 
 
 CASES = (

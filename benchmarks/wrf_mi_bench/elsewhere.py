@@ -58,11 +58,11 @@ def variants(threads: Sequence[int] = THREADS) -> Iterator[Variant]:
     same = {LLVM_VARIABLE: used.llvm_path or ""}
     for count in threads:
         yield Variant("threads", threads=count, environment=same)
-    known = {used.llvm_version}
+    listed_versions = {used.llvm_version}
     for library in find_llvm(ignore_variable=True):
         verdict = try_llvm(library)
-        if verdict.usable and verdict.version not in known:
-            known.add(verdict.version)
+        if verdict.usable and verdict.version not in listed_versions:
+            listed_versions.add(verdict.version)
             yield Variant("llvm", environment={LLVM_VARIABLE: str(library.path)})
     for folder in filter(None, os.environ.get(NUMPY_FOLDERS, "").split(os.pathsep)):
         yield Variant("numpy", environment={**same, "PYTHONPATH": folder})

@@ -19,7 +19,7 @@ def main(file: str, backend: str, threads: str, small: str) -> None:
 
     A deterministic training, with one thread, is only made on ``llvm``.
     """
-    known = init(backend, int(threads))
+    backend_info = init(backend, int(threads))
     import drjit as dr
     import mitsuba as mi
 
@@ -63,7 +63,7 @@ def main(file: str, backend: str, threads: str, small: str) -> None:
             words = [*SETTINGS, f"initial.gaussians={gaussians}", f"steps={steps}"]
             score = train(spectra, "wrf-gs+", out=Path(folder) / "run", settings=words).metrics["ssim"]
         arrays["metrics"] = np.array([score[name] for name in ("median", "mean", "p10", "p90")])
-    versions = {"numpy": np.__version__, "llvm": known.llvm_version or "", "device": known.device}
+    versions = {"numpy": np.__version__, "llvm": backend_info.llvm_version or "", "device": backend_info.device}
     np.savez(file, versions=json.dumps(versions), **arrays)
 
 

@@ -36,11 +36,11 @@ def write_entries(results: Path) -> None:
 
 def stored_entries(results: Path) -> Iterator[Entry]:
     """Entries of the stored parts of the benchmarks; of a method, data and rows those of the first of them."""
-    known = {row.name for row in plan()}
+    listed = {row.name for row in plan()}
     for entry in (*_stages(results), *_buildings(results), *_unmeasured(results)):
         # Runs of IDW by themselves are entries with the constant and the best simple models (`wrf-mi table add`).
-        if entry.name not in known and (entry.method != "idw" or entry.dataset == CHANNELS or entry.seed is None):
-            known.add(entry.name)
+        if entry.name not in listed and (entry.method != "idw" or entry.dataset == CHANNELS or entry.seed is None):
+            listed.add(entry.name)
             yield entry
 
 

@@ -140,8 +140,8 @@ def toy_record(channels: Complex, frequencies_hz: FloatArray) -> tuple[Record, S
         truth=truth[None].astype(np.complex64),
     )
     rows: IntArray = np.arange(len(truth))
-    known = rows < FITTED.stop * READINGS
-    return record, Split("third-receiver", 0, rows[known], rows[:0], rows[~known])
+    is_training = rows < FITTED.stop * READINGS
+    return record, Split("third-receiver", 0, rows[is_training], rows[:0], rows[~is_training])
 
 
 def scene_of(model: Path, folder: Path, constants: Mapping[str, float]) -> Path:
@@ -151,9 +151,9 @@ def scene_of(model: Path, folder: Path, constants: Mapping[str, float]) -> Path:
         (mesh,) = mesh_parts(model / "meshes" / f"{name}.ply")
         surfaces.append(Surface(name, "other", np.asarray(mesh.vertices), np.asarray(mesh.faces)))
     materials = {WALLS[0]: "upper", WALLS[1]: "lower", "blocker": "perfect"}
-    stated = Materials(surfaces=materials, constants={"upper": constants, "lower": constants})
+    scene_materials = Materials(surfaces=materials, constants={"upper": constants, "lower": constants})
     return write_scene(
-        folder, surfaces, frame="that of the data set", source=str(model), materials=stated, replace=True
+        folder, surfaces, frame="that of the data set", source=str(model), materials=scene_materials, replace=True
     )
 
 
@@ -226,7 +226,7 @@ def main() -> dict[str, Any]:
     if not (data / OUTPUT).is_file():
         raise InputError(f"{data / OUTPUT}: not on this machine; put the files of {SOURCE} there")
     wide = measured_channels(data / OUTPUT, WIDE_HZ)
-    known, split = toy_record(wide, WIDE_HZ)
+    record, split = toy_record(wide, WIDE_HZ)
     rows = list[dict[str, Any]]()
 
     def add(what: str, predicted: tuple[Complex, FloatArray], **more: Any) -> None:
@@ -239,18 +239,18 @@ def main() -> dict[str, Any]:
         place, kinds = Path(folder), ("ground_truth", "dt_model")
         true, model = (data / f"toy_example_maxwell_{kind}" for kind in kinds)
         truth = scene_of(true, place / "truth", CONCRETE)
-        add("true scene", traced(truth, known))
-        add("true scene, with diffraction", traced(truth, known, DIFFRACTED))
-        add("twin, true materials", traced(scene_of(model, place / "twin", CONCRETE), known))
+        add("true scene", traced(truth, record))
+        add("true scene, with diffraction", traced(truth, record, DIFFRACTED))
+        add("twin, true materials", traced(scene_of(model, place / "twin", CONCRETE), record))
         brick = scene_of(model, place / "brick", BRICK)
-        add("twin, brick", traced(brick, known))
+        add("twin, brick", traced(brick, record))
         for band, hz in BANDS.items():
             fitted = toy_record(measured_channels(data / OUTPUT, hz), hz)
             for what, scene, more in _corrections(brick, model, place, *fitted):
-                add(f"{what}, {band}", traced(scene, known), band=band, **more)
+                add(f"{what}, {band}", traced(scene, record), band=band, **more)
         for what, (named, settings) in TRAINED.items():
-            run = wrf_mi.train(known, named, brick, split=split, settings=settings)
-            channels = np.asarray(run.predict(known.tx_pos_m[::READINGS]).mean, complex).reshape(wide.shape)
+            run = wrf_mi.train(record, named, brick, split=split, settings=settings)
+            channels = np.asarray(run.predict(record.tx_pos_m[::READINGS]).mean, complex).reshape(wide.shape)
             power_db = 10 * np.log10(np.square(np.abs(channels)).mean(axis=1))
             add(f"{what}, 2 GHz", (channels, power_db), band="2 GHz", seconds=run.metrics["train_seconds"])
     return {"rows": rows}

@@ -32,7 +32,7 @@ FEW_STEPS = "steps=60"  # of the models that predict: speed does not depend on h
 
 def job(file: str, backend: str, threads: str = "0") -> None:
     """Measure axes, predictions and kernels of steps with a backend, on threads of the CPU (0: all); write JSON."""
-    known = init(backend, threads=int(threads) or None)
+    backend_info = init(backend, threads=int(threads) or None)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     from threadpoolctl import threadpool_limits
 
@@ -46,7 +46,7 @@ def job(file: str, backend: str, threads: str = "0") -> None:
     with threadpool_limits(1, "blas"):
         measured = [scale(axis, most_s=MOST_S, call_s=CALL_S) for axis in axes]
         kernels = {title: kernels_of(step(model, STEP_SIZES[0])) for model, title in STEPS_OF.items()}
-    result = {"device": known.device, "axes": measured, "kernels": kernels, "predictions": predictions()}
+    result = {"device": backend_info.device, "axes": measured, "kernels": kernels, "predictions": predictions()}
     Path(file).write_text(json.dumps(result))
 
 

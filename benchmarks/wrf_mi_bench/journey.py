@@ -92,10 +92,12 @@ def picture(place: Path) -> Figure:
     deviations = drawing.shades(0, float(np.nanmax(std_db)))
 
     figure = Figure(figsize=(10.5, 8), layout="constrained", facecolor="white")
-    (given, predicted), (spread, phone) = panels = figure.subplots(2, 2, sharex=True, sharey=True)
-    given.plot(*record.tx_pos_m[rows][~heard, :2].T, ".", color="0.7", markersize=2)
-    drawing.draw_values(given, record.tx_pos_m[rows][heard], levels[heard], powers, s=12)
-    given.set_title(f"Given: plan, and walks with readings of {len(record.receivers)} access points, one of them shown")
+    (plan_axes, predicted), (spread, phone) = panels = figure.subplots(2, 2, sharex=True, sharey=True)
+    plan_axes.plot(*record.tx_pos_m[rows][~heard, :2].T, ".", color="0.7", markersize=2)
+    drawing.draw_values(plan_axes, record.tx_pos_m[rows][heard], levels[heard], powers, s=12)
+    plan_axes.set_title(
+        f"Given: plan, and walks with readings of {len(record.receivers)} access points, one of them shown"
+    )
     drawing.draw_layer(predicted, shown["x"].values, shown["y"].values, power, powers)
     predicted.set_title("Predicted power of this access point")
     drawing.draw_layer(spread, shown["x"].values, shown["y"].values, std_db, deviations)

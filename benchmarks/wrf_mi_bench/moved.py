@@ -77,7 +77,7 @@ def displacements(room: RandomRoom, seed: int) -> dict[str, FloatArray]:
             first = rng.uniform(GAP_M, np.array(room.size_m[:2]) - GAP_M - (box[1] - box[0])[:2])
             shift = np.append(first - box[0, :2], 0.0)
             low, high = box + shift
-            apart = all(((low > one[1] + GAP_M) | (one[0] > high + GAP_M))[:2].any() for one in others)
+            apart = all(((low > bounds[1] + GAP_M) | (bounds[0] > high + GAP_M))[:2].any() for bounds in others)
             near = ((station_m > low - FROM_FURNITURE_M) & (station_m < high + FROM_FURNITURE_M)).all()
             if apart and not near and np.linalg.norm(shift) > AT_LEAST_M:
                 boxes[name], shifts[name] = box + shift, shift
@@ -118,13 +118,13 @@ def furnished(seed: int, folder: Path) -> Room:
 
 def edited(scene: Path, room: Room, out: Path) -> Path:
     """A scene of the room with the parts of the moved pieces at their new places."""
-    moves, known = list[Move](), set[str]()
+    moves, moved_parts = list[Move](), set[str]()
     for name, shift_m in room.shifts_m.items():
         low, high = room.room.parts[name][1].bounds
         parts = {part for part in parts_within(scene, low - NEAR_M, high + NEAR_M) if not part.startswith(SHELL)}
-        if parts := parts - known:
+        if parts := parts - moved_parts:
             moves.append(Move(tuple(sorted(parts)), (float(shift_m[0]), float(shift_m[1]), 0.0)))
-            known |= parts
+            moved_parts |= parts
     return edit_scene(scene, out, moves) if moves else scene
 
 
@@ -157,9 +157,9 @@ def measure(seed: int, place: Path) -> dict[str, Any]:
             score(f"{TRACED}, its edited scene", tracer(scene)(places_m)[0])
     score(f"{KRIGING} from before", fit(KRIGING, room.before, KRIGING).predict(places_m).mean)
     for name, counts in ANEW.items():
-        given = {"scene": scan, "preset": MODELS[name][1]} if name in MODELS else {}
+        options = {"scene": scan, "preset": MODELS[name][1]} if name in MODELS else {}
         for count in counts:
-            run = fit(f"{name} {count}", room.after, name, n_train=count, **given)
+            run = fit(f"{name} {count}", room.after, name, n_train=count, **options)
             score(anew(name, count), run.predict(places_m).mean)
     size = " x ".join(f"{side:.1f}" for side in room.room.size_m)
     return {"room": f"{size} m, {len(room.shifts_m)} of {len(room.room.parts) - 6} pieces moved", "ssim": scores}

@@ -123,9 +123,9 @@ def home(seed: int, flat: bool) -> Home:
     furniture, clutter, mirrors, free = [], [], [], []
     doors = shapely.union_all([opening.footprint for opening in openings if opening.kind != "window"])
     for room in rooms:
-        pieces, taken = _furniture(room, doors, height, rng)
+        pieces, occupied = _furniture(room, doors, height, rng)
         furniture += pieces
-        left = shapely.difference(room, shapely.union_all([shapely.buffer(area, CLEAR_M) for area in taken]))
+        left = shapely.difference(room, shapely.union_all([shapely.buffer(area, CLEAR_M) for area in occupied]))
         for _ in range(int(rng.integers(1, 4))):
             if (place := _drawn(shapely.buffer(left, -0.5), rng)) is not None:
                 ball = trimesh.creation.icosphere(2, 1.0)
@@ -228,11 +228,11 @@ def _levels(rooms: Sequence[Any], at: float) -> Mesh:
 
 def _furniture(room: Any, doors: Any, height: float, rng: np.random.Generator) -> tuple[list[Mesh], list[Any]]:
     """Pieces along the walls and a table, and their areas in plan (shapely)."""
-    pieces, taken = list[Mesh](), list[Any]()
+    pieces, occupied = list[Mesh](), list[Any]()
     edges = [edge for edge in _edges(room) if np.ptp(edge[2]) > 1.0]
     wanted = max(3, int(room.area / 2.5))
     for _ in range(60):
-        if len(pieces) == wanted or sum(area.area for area in taken) > 0.35 * room.area:
+        if len(pieces) == wanted or sum(area.area for area in occupied) > 0.35 * room.area:
             break
         long, deep, top = rng.choice(
             [(1.2, 0.6, 2.1), (0.8, 0.35, 1.9), (2.0, 1.5, 0.5), (1.9, 0.85, 0.45), (1.4, 0.7, 0.74), (1.2, 0.4, 0.9)]
@@ -244,15 +244,15 @@ def _furniture(room: Any, doors: Any, height: float, rng: np.random.Generator) -
         ends = sorted((at - sign * 0.01, at - sign * (0.01 + deep)))
         x, y = (ends, [begin, begin + long]) if axis == 0 else ([begin, begin + long], ends)
         area = shapely.box(x[0], y[0], x[1], y[1])
-        blocked = any(area.distance(other) < 0.15 for other in taken) or area.intersects(doors)
+        blocked = any(area.distance(other) < 0.15 for other in occupied) or area.intersects(doors)
         if blocked or not room.contains(area):
             continue
-        taken.append(area)
+        occupied.append(area)
         if 0.6 < top < 0.8:
             pieces.append(table((x[0], x[1]), (y[0], y[1]), top))
         else:
             pieces.append(box((x[0], y[0], 0.02), (x[1], y[1], min(top, height - 0.15))))
-    return pieces, taken
+    return pieces, occupied
 
 
 def _drawn(area: Any, rng: np.random.Generator) -> FloatArray | None:

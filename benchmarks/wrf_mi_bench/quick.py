@@ -137,13 +137,13 @@ def _alone() -> tuple[Call, Call]:
     Gaussians a step should cost at most 1.05 times as much.
     """
     receivers, carrier = (replace(RECEIVER, array_m=planar_array(4, 4, SPACING_M)),), np.array([FREQUENCY_HZ])
-    known, split = record(20, receivers=receivers, frequencies_hz=carrier), make_splits(record(20), "random")[0]
+    room_record, split = record(20, receivers=receivers, frequencies_hz=carrier), make_splits(record(20), "random")[0]
     config = with_settings(
-        calibration_config(["gain", "materials"], known.task.settings_of_paths), ["steps=100000", *ONLY_STEPS]
+        calibration_config(["gain", "materials"], room_record.task.settings_of_paths), ["steps=100000", *ONLY_STEPS]
     )
-    trainer = Trainer(known, split, config, scene=open_scene("laboratory", FREQUENCY_HZ))
+    trainer = Trainer(room_record, split, config, scene=open_scene("laboratory", FREQUENCY_HZ))
     graph, targets, batch = trainer.graph, trainer.plan.targets, trainer.schedule.rows[0]
-    side = graph.trace(known.tx_pos_m, 0)[0]
+    side = graph.trace(room_record.tx_pos_m, 0)[0]
     assert side is not None
     adam = Adam(lr=0.05, params={name: to_tensor(value) for name, value in trainer.state.params().items()})
     names, model, size = list(adam), graph.models[0], targets.observed.shape[2:]
@@ -268,7 +268,7 @@ def read_stored(file: Path) -> dict[str, dict[str, float]]:
 
 def ratio_table(ratios: Mapping[str, Mapping[str, float]]) -> str:
     """Markdown table of ratios by the names of their pairs."""
-    titles = {known.name: known.title for known in PAIRS}
+    titles = {ratio_pair.name: ratio_pair.title for ratio_pair in PAIRS}
     line = "| {title} | **{value:.2g}** ({low:.2g} to {high:.2g}) | {ours_ms:.3g} ms, {theirs_ms:.3g} ms |"
     rows = [{"title": titles[name], **pair} for name, pair in ratios.items()]
     return lined("| ratio | measured (95 % interval) | medians |", line)(rows)

@@ -92,8 +92,8 @@ def measure(cell: Cell, model: str, place: Path) -> dict[str, Any]:
     ]
     gains = [bootstrap(other - loss[0], statistic=np.mean) for other in loss[1:]]
     figures = {"gain": [[gain.value, gain.low, gain.high] for gain in gains], "score": run.metrics["abs_error_db"]}
-    known = {key: run.metrics[key] for key in ("reception", "train_seconds", "inside_90")}
-    return {**known, **figures, "sensitivity": run.metrics.get("sensitivity")}
+    facts = {key: run.metrics[key] for key in ("reception", "train_seconds", "inside_90")}
+    return {**facts, **figures, "sensitivity": run.metrics.get("sensitivity")}
 
 
 def row_of(cell: Cell, model: str, part: Mapping[str, Any]) -> dict[str, Any]:
@@ -102,8 +102,8 @@ def row_of(cell: Cell, model: str, part: Mapping[str, Any]) -> dict[str, Any]:
     scores = {key: [block[key], *(block["reference"][name][key] for name in REFERENCES)] for key in SCORES}
     values = "log loss {:.3f}, rate {:.3f}, nearest rows {:.3f}".format(*scores["log_loss"])
     row = line(f"{cell.title}: {model}", values, f"at most {WORSE} above either")
-    known = {"cell": cell.title, "model": model, "received": block["received"], "gain": part["gain"]}
-    return {**row, **known, **scores, "error_db": part["score"]["median"]}
+    header = {"cell": cell.title, "model": model, "received": block["received"], "gain": part["gain"]}
+    return {**row, **header, **scores, "error_db": part["score"]["median"]}
 
 
 def main() -> dict[str, Any]:

@@ -132,8 +132,8 @@ def _trace(kind: str, triangles: int) -> Call:
 
 
 def _planes(kind: str, triangles: int) -> Call:
-    known = scene_surfaces(opened_room(triangles, kind))
-    return lambda: len(find_planes(known.names, known.shape_ids, known.first_face, known.triangles).normal)
+    surfaces = scene_surfaces(opened_room(triangles, kind))
+    return lambda: len(find_planes(surfaces.names, surfaces.shape_ids, surfaces.first_face, surfaces.triangles).normal)
 
 
 def _fit(rows: int = 200, receivers: int = 4) -> Call:

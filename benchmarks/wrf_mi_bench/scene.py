@@ -87,8 +87,8 @@ def path_agreement(
         end = Receiver("fixed end", fixed, np.array([0.0, 0.0, 0.0, 1.0]))
         truth, ours = (trace_paths(scene, moving, end, options).paths for scene in (original, made))
         for total, paths, which in zip(sums.values(), (truth, ours), match(truth, ours), strict=True):
-            for row, some in ((0, which), (2, slice(None))):
-                depth, power = paths.bounces[some], paths.length_m[some] ** -2.0
+            for row, selected in ((0, which), (2, slice(None))):
+                depth, power = paths.bounces[selected], paths.length_m[selected] ** -2.0
                 total[row] += np.bincount(depth, power, options.depth + 1)
                 total[row + 1] += np.bincount(depth, minlength=options.depth + 1)
     shares = {
@@ -100,8 +100,8 @@ def path_agreement(
     return {**numbers, **shares, "recall_by_reflections": by_reflections}
 
 
-def _share(part: float, whole: float) -> float:
-    return float(part / whole) if whole else 0.0
+def _share(part: float, total: float) -> float:
+    return float(part / total) if total else 0.0
 
 
 def match(truth: Paths, ours: Paths) -> tuple[IntArray, IntArray]:

@@ -127,8 +127,10 @@ def _stress() -> Group:
 
         return [worst for _, _, worst, _ in stages(quick_rows())]
 
-    known = stages(_stored("stress")["figures"]["rows"])
-    figures = [Figure(f"stress, {name}: worst error", worst, 0.0, bound, False) for name, _, worst, bound in known]
+    stress_stages = stages(_stored("stress")["figures"]["rows"])
+    figures = [
+        Figure(f"stress, {name}: worst error", worst, 0.0, bound, False) for name, _, worst, bound in stress_stages
+    ]
     return Group("stress", tuple(figures), again)
 
 
@@ -178,14 +180,14 @@ def main() -> dict[str, Any]:
     Rows have, of each figure, ``what``, ``stored``, ``low``, ``high``, ``measured`` (or None), ``verdict``, and
     ``date`` and ``seconds`` of its group; ``failed`` is a line, where a figure got worse or was not measured.
     """
-    known = groups()
+    sentinel_groups = groups()
     place = RUNS / fit_key(source_files())
     place.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
     begun = time.perf_counter()
-    for count, group in enumerate(known, 1):
+    for count, group in enumerate(sentinel_groups, 1):
         minutes = (time.perf_counter() - begun) / 60
-        say("sentinels", f"{count} of {len(known)} after {minutes:.0f} min: {group.name}")
+        say("sentinels", f"{count} of {len(sentinel_groups)} after {minutes:.0f} min: {group.name}")
         group_rows = _rows(group, place)
         rows += group_rows
         for row in group_rows:

@@ -34,8 +34,11 @@ def sionna_paths(
 
     assert isinstance(options.rays, int), "a number of rays, not auto"
     rays = options.rays
-    one: dict[str, Any] = {"num_rows": 1, "num_cols": 1, "polarization": polarization}
-    scene.tx_array, scene.rx_array = rt.PlanarArray(pattern="iso", **one), rt.PlanarArray(pattern=pattern, **one)
+    array_options: dict[str, Any] = {"num_rows": 1, "num_cols": 1, "polarization": polarization}
+    scene.tx_array, scene.rx_array = (
+        rt.PlanarArray(pattern="iso", **array_options),
+        rt.PlanarArray(pattern=pattern, **array_options),
+    )
     places = np.atleast_2d(np.asarray(tx_m, float))
     names = [f"tx{row}" for row in range(len(places))]
     rx, turn = (mi.Point3f(*np.asarray(values, float).tolist()) for values in (rx_m, turn_rad))
@@ -58,9 +61,9 @@ def sionna_paths(
         )
     finally:
         scene.remove([*names, "rx"])
-    found = as_paths(paths)
-    point = found.vertices_m[:, 0] if options.depth else np.full((len(found), 3), np.nan)
-    return found.tx, found.gain, found.length_m, point
+    traced = as_paths(paths)
+    point = traced.vertices_m[:, 0] if options.depth else np.full((len(traced), 3), np.nan)
+    return traced.tx, traced.gain, traced.length_m, point
 
 
 def as_paths(solved: Any) -> Paths:

@@ -61,8 +61,8 @@ def modules_of_benchmark(module: str) -> tuple[str, ...]:
 
 def modules_of_command(words: Iterable[str]) -> tuple[str, ...]:
     """Modules of the command, models and scenes that words of ``wrf-mi`` name."""
-    known = {**COMMANDS, **{name: (MODELS.module(name),) for name in MODELS}}
-    return tuple(module for word in words for module in known.get(word, ()))
+    modules = {**COMMANDS, **{name: (MODELS.module(name),) for name in MODELS}}
+    return tuple(module for word in words for module in modules.get(word, ()))
 
 
 def _sha(text: str) -> str:

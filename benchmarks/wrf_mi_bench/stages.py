@@ -199,8 +199,10 @@ def _mean(draws: Sequence[Any]) -> Any:
     if isinstance(first, Mapping):
         return {key: _mean([draw[key] for draw in draws]) for key in first}
     if isinstance(first, list):  # stages, whose names differ from draw to draw
-        kept = [stage["stage"] for draw in draws for stage in draw if stage["kept"]]
-        return [{"stage": name, "kept": True, "draws": kept.count(name)} for name in STAGES if name in kept]
+        kept_stages = [stage["stage"] for draw in draws for stage in draw if stage["kept"]]
+        return [
+            {"stage": name, "kept": True, "draws": kept_stages.count(name)} for name in STAGES if name in kept_stages
+        ]
     return float(np.mean(draws)) if isinstance(first, (int, float)) else first
 
 
@@ -267,8 +269,10 @@ def _with_best_part(row: Mapping[str, Any], parts: Sequence[Mapping[str, Any]]) 
     best = min(parts, key=lambda part: part["gain"])
     inside = "" if row["inside_90"] is None else f"{row['inside_90']:.0%}"
     draws = [f" ({stage['draws']} of {DRAWS})" if stage.get("draws", DRAWS) < DRAWS else "" for stage in row["stages"]]
-    kept = ", ".join(stage["stage"] + of for stage, of in zip(row["stages"], draws, strict=True) if stage["kept"])
-    return {"title": row["what"].rpartition(":")[0], "row": row, "best": best, "inside": inside, "kept": kept}
+    kept_stages = ", ".join(
+        stage["stage"] + of for stage, of in zip(row["stages"], draws, strict=True) if stage["kept"]
+    )
+    return {"title": row["what"].rpartition(":")[0], "row": row, "best": best, "inside": inside, "kept": kept_stages}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

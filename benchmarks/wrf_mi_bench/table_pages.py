@@ -24,17 +24,17 @@ from .table_plan import MADE_HERE, PARTS, SHARES, TablePart, plan
 
 def write_tables(place: Path, quick: bool = False) -> None:
     """Write tables in Markdown to ``README.md`` and a picture of the score distributions of each part."""
-    stored, stated = read_entries(place), published(place)
+    stored, published_figures = read_entries(place), published(place)
     text = ["# Every method, task by task", NOTE]
     for name, heading in OVERVIEWS.items():
-        if shown := overview(name, stored, stated, quick):
+        if shown := overview(name, stored, published_figures, quick):
             text += [f"## {heading.capitalize()}: medians", shown]
     for part in PARTS:
         groups = grouped(part, stored, quick)
         if not groups:
             continue
         title = f"{TASKS[part.task].heading.capitalize()}: {part.dataset}, split {part.split}"
-        text += [f"## {title}", part_table(part, groups, stated)]
+        text += [f"## {title}", part_table(part, groups, published_figures)]
         most = max(share for share, _ in groups)
         first = {method: rows[0] for (share, method), rows in groups.items() if share == most}
         picture = f"{part.task}-{part.dataset}-{part.split}.png"
@@ -83,7 +83,7 @@ def published(place: Path) -> Published:
     """Figures of papers for the methods of the overviews, from the file beside the entries; empty without it."""
     path = place / PUBLISHED
     figures = read_yaml(path)["figures"] if path.exists() else []
-    return {(stated["table"], stated["key"]): stated["figure"] for stated in figures}
+    return {(published_row["table"], published_row["key"]): published_row["figure"] for published_row in figures}
 
 
 def grouped(part: TablePart, stored: Mapping[str, Entry], quick: bool = False) -> Groups:

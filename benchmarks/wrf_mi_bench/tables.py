@@ -89,10 +89,10 @@ def meshed_scan(dataset: str, folder: Path) -> Path:
 
 def corrected_scene(row: Row, folder: Path) -> Path:
     """Scene of a row in ``folder``, corrected by its training rows."""
-    stated = scene_of(row.part, folder)
-    scene = folder / f"corrected-{row.part.dataset}-{fit_key(row.rows, source_files(), scene_files(stated))}"
+    original_scene = scene_of(row.part, folder)
+    scene = folder / f"corrected-{row.part.dataset}-{fit_key(row.rows, source_files(), scene_files(original_scene))}"
     if not scene.exists():
-        run_command(["correct", row.part.dataset, "--scene", str(stated), *row.rows], scene, resumes=False)
+        run_command(["correct", row.part.dataset, "--scene", str(original_scene), *row.rows], scene, resumes=False)
     return scene
 
 

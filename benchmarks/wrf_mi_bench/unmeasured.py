@@ -90,8 +90,8 @@ def _scores(run: Results, prediction: Observations | None = None) -> list[float]
 
 def _facts(hybrid: Results) -> dict[str, Any]:
     """Intervals and task of the hybrid; names of the receivers and rows of all scores, in their order."""
-    known = np.isfinite(np.asarray(hybrid.score, float)[:, np.argsort(hybrid.row)])
-    pairs = [[hybrid.receivers[r], int(np.sort(hybrid.row)[i])] for r, i in np.argwhere(known)]
+    scored = np.isfinite(np.asarray(hybrid.score, float)[:, np.argsort(hybrid.row)])
+    pairs = [[hybrid.receivers[r], int(np.sort(hybrid.row)[i])] for r, i in np.argwhere(scored)]
     return {PAIRS: pairs, **{key: hybrid.metrics[key] for key in FACTS[1:-1]}}
 
 

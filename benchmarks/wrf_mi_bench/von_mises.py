@@ -91,8 +91,10 @@ def calibrated(
         ]
         prior = prior_concentration(posteriors)
 
-        def energy(trial: FloatArray, known: list[Complex] = posteriors, concentration: float = prior) -> float:
-            of_rows = zip(waves_of(trial), rows, known, strict=True)
+        def energy(
+            trial: FloatArray, row_posteriors: list[Complex] = posteriors, concentration: float = prior
+        ) -> float:
+            of_rows = zip(waves_of(trial), rows, row_posteriors, strict=True)
             return sum(free_energy(w, h, post, concentration, s2) for w, (h, s2), post in of_rows)
 
         parameters = minimize(energy, parameters, method="Nelder-Mead", options={"maxiter": 40}).x

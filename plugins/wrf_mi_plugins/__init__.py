@@ -32,9 +32,9 @@ def register_all() -> None:
     mitsuba = sys.modules.get("mitsuba")
     variant = None if mitsuba is None else mitsuba.variant()
     if variant not in VARIANTS.values():
-        known = " or ".join(f'mi.set_variant("{name}")' for name in VARIANTS.values())
-        found = "Mitsuba has no variant set" if variant is None else f"Mitsuba's variant is {variant}"
-        raise BackendError(f"register_all: {found}; call wrf_mi.backend.init(), or {known}, first")
+        choices = " or ".join(f'mi.set_variant("{name}")' for name in VARIANTS.values())
+        problem = "Mitsuba has no variant set" if variant is None else f"Mitsuba's variant is {variant}"
+        raise BackendError(f"register_all: {problem}; call wrf_mi.backend.init(), or {choices}, first")
     init()
     if variant in _registered:
         return

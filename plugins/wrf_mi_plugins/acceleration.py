@@ -89,13 +89,13 @@ def traced_lists(gaussians: Gaussians, footprints: RayFootprints, pose: Pose, bu
     ellipsoids = _scaled(hulls(gaussians, pose, bundles.margin_rad), order)
     widest = dr.maximum(dr.maximum(*ellipsoids.radius[:2]), ellipsoids.radius[2]) / _distance(ellipsoids)
     narrow, wide = (mi.UInt32(dr.compress(m)) for m in (widest <= WIDEST, widest > WIDEST))
-    found = []
+    key_arrays = []
     if dr.width(wide) > 0:
         bundle = dr.repeat(dr.arange(mi.UInt32, lists), dr.width(wide))
-        found.append(key_type(bundle) * count + key_type(dr.tile(wide, lists)))
+        key_arrays.append(key_type(bundle) * count + key_type(dr.tile(wide, lists)))
     if dr.width(narrow) > 0:
-        found.append(_hits(ellipsoids, narrow, pose, bundles, count))
-    keys = dr.sort(dr.concat(found))
+        key_arrays.append(_hits(ellipsoids, narrow, pose, bundles, count))
+    keys = dr.sort(dr.concat(key_arrays))
     number = dr.arange(mi.UInt32, dr.width(keys))
     first = (number == 0) | (keys != dr.gather(key_type, keys, dr.maximum(number, 1) - 1))
     distinct: Any = dr.compress(first)

@@ -124,7 +124,7 @@ def _derivatives(
     """One Gaussian's derivatives, summed over the lane's rays; whether any sees it; the state; those of the walls."""
     sent, blending = record[RAY_FIELDS : RAY_FIELDS + 2], record[RAY_FIELDS + 2 :]
     total: list[Any] = [0 for _ in record]
-    after, factors, seen = ReverseState([], []), [], False
+    after, factors, visible = ReverseState([], []), [], False
     for k, ray in enumerate(rays.bundles.ray):
         u = rays.bundles.direction[k]
         parts = response(record, u)
@@ -139,8 +139,8 @@ def _derivatives(
         total = [a + b for a, b in zip(total, by_record, strict=True)]
         after.t.append(t)
         after.q.append(q)
-        seen |= parts[0] > 0
-    return total, seen, after, factors
+        visible |= parts[0] > 0
+    return total, visible, after, factors
 
 
 @dr.syntax
@@ -155,12 +155,12 @@ def _backward(rays: _Rays, total: tuple[Any, Any], gradient: tuple[Any, Any]) ->
     while j < end:
         i = dr.gather(index_type, rays.lists.index, j)
         record, depth = rays.record(i)
-        values, seen, state, factors = _derivatives(record, depth, state, slopes, rays)
+        values, visible, state, factors = _derivatives(record, depth, state, slopes, rays)
         for k in range(len(values)):
-            dr.scatter_reduce(dr.ReduceOp.Add, out, values[k], i * RECORD + k, seen, mode=dr.ReduceMode.Local)
+            dr.scatter_reduce(dr.ReduceOp.Add, out, values[k], i * RECORD + k, visible, mode=dr.ReduceMode.Local)
         for slot, d_re, d_im in factors:
-            dr.scatter_add(out_factor[0], d_re, slot, seen)
-            dr.scatter_add(out_factor[1], d_im, slot, seen)
+            dr.scatter_add(out_factor[0], d_re, slot, visible)
+            dr.scatter_add(out_factor[1], d_im, slot, visible)
         j += 1
     return out, out_factor
 

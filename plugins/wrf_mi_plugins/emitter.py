@@ -144,13 +144,13 @@ def gaussian_emitter(
 
 def _shape_of_emitter(props: mi.Properties) -> mi.Shape:
     """The plugin `wrf_gaussians`: the built-in ``ellipsoids`` shape with the Gaussians of the emitter given to it."""
-    given = {key: props[key] for key in props if isinstance(props[key], mi.Object)}
-    emitters = [value for value in given.values() if isinstance(value, GaussianEmitter)]
+    members = {key: props[key] for key in props if isinstance(props[key], mi.Object)}
+    emitters = [value for value in members.values() if isinstance(value, GaussianEmitter)]
     if len(emitters) != 1:
         raise InputError(f"wrf_gaussians: {len(emitters)} wrf_gaussian_emitter in it; give one, or a reference to one")
     (emitter,) = emitters
     entry = gaussian_shape(emitter.gaussians) | {"id": props.id(), emitter.id() or "emitter": emitter}
-    others = {key: value for key, value in given.items() if value is not emitter}
+    others = {key: value for key, value in members.items() if value is not emitter}
     if not any(isinstance(value, mi.BSDF) for value in others.values()):
         entry["bsdf"] = {"type": "null"}
     # Mitsuba may be loading a scene in parallel, and parallel tasks do not nest.

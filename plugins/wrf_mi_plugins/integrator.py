@@ -100,8 +100,8 @@ class TracedField(ADIntegrator):
         super().__init__(props)
         self.with_walls = bool(props.get("walls", True))
         self.frequency_hz = mi.Float(float(props.get("frequency_hz", 0.0)))
-        stated = props.get("polarization")
-        self.polarization = None if stated is None else [float(c) for c in stated]
+        polarization = props.get("polarization")
+        self.polarization = None if polarization is None else [float(c) for c in polarization]
         self.thickness_m = {n.removeprefix(THICKNESS): float(props[n]) for n in props if n.startswith(THICKNESS)}
         if self.polarization is not None and not (np.isfinite(self.polarization).all() and np.any(self.polarization)):
             raise InputError(f"{props.plugin_name()}: polarization {self.polarization} is no direction")

@@ -163,8 +163,8 @@ def _gaussians_given(props: Any) -> tuple[GaussianEmitter | None, FieldSource | 
     for key, values in arrays.items():
         width, valid, fault = _ARRAYS[key]
         if dr.width(values) != count * width or count == 0:
-            given, wanted_shape = list(values.shape), [count, width]
-            raise InputError(f"wrf_gaussian_medium: {key} has shape {given}; with these centers give {wanted_shape}")
+            shape, wanted_shape = list(values.shape), [count, width]
+            raise InputError(f"wrf_gaussian_medium: {key} has shape {shape}; with these centers give {wanted_shape}")
         bad = np.flatnonzero(~valid(values.numpy().reshape(count, -1)))
         if len(bad):
             raise InputError(f"wrf_gaussian_medium: {key}, row {bad[0]} (from 0), is {fault}; correct or remove it")

@@ -120,9 +120,9 @@ def ray_footprints(gaussians: Gaussians, pose: Pose) -> RayFootprints:
         [m * dr.rsqrt(scale * scale + low) for m in pose.to_local(axis)]
         for scale, axis in zip(scales, principal_axes(rotation), strict=True)
     ]
-    seen = [dot(row, safe) for row in whiten]
-    length = dr.sqrt(dot(seen, seen))
-    third = [s / length for s in seen]
+    whitened = [dot(row, safe) for row in whiten]
+    length = dr.sqrt(dot(whitened, whitened))
+    third = [s / length for s in whitened]
     first, second = tangent_basis(third)
     a, b = _perpendicular(*([c * distance for c in _combine(row, whiten)] for row in (first, second)))
     g3 = [c / length for c in _combine(third, whiten)]

@@ -122,8 +122,8 @@ def gaussian_shape_of(scene: Any) -> Any:
     """
     shapes = [s for s in scene.shapes() if s.is_ellipsoids() and SIGNAL in mi.traverse(s)]
     if len(shapes) != 1:
-        found = "no ellipsoids shape with a signal attribute" if not shapes else f"{len(shapes)} shapes of Gaussians"
-        raise InputError(f"scene: {found}; give it one made by wrf_mi_plugins.shape.gaussian_shape")
+        problem = "no ellipsoids shape with a signal attribute" if not shapes else f"{len(shapes)} shapes of Gaussians"
+        raise InputError(f"scene: {problem}; give it one made by wrf_mi_plugins.shape.gaussian_shape")
     return shapes[0]
 
 
@@ -141,8 +141,8 @@ def read_gaussians(shape: Any) -> Gaussians:
         raise InputError(f"shape {shape.id()}: needs one of opacity and attenuation, has {what}; remove or add one")
     for name, width in ((SIGNAL, 2), (OPACITY, 1), (ATTENUATION, 2)):
         if name in parameters and dr.width(parameters[name]) != width * count:
-            given = dr.width(parameters[name])
-            raise InputError(f"shape {shape.id()}: {name} has {given} numbers, {count} Gaussians need {width * count}")
+            size = dr.width(parameters[name])
+            raise InputError(f"shape {shape.id()}: {name} has {size} numbers, {count} Gaussians need {width * count}")
     data = deinterleave(parameters["data"], count)
     return Gaussians(
         position=data[0:3],

@@ -83,7 +83,7 @@ def find_crossings(
     origin = mi.Point3f(*(dr.detach(x) for x in pose.position))
     ray, active, distance = mi.Ray3f(origin, d), mi.Bool(True), mi.Float(0)
     dr.eval(ray, field, number)
-    found = Crossings([], [], [], [])
+    crossings = Crossings([], [], [], [])
     while True:
         si = scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=True, active=active)
         active = active & si.is_valid()
@@ -98,10 +98,10 @@ def find_crossings(
         ray = dr.select(active, si.spawn_ray(d), ray)
         dr.eval(active, distance, cosine, across, wall, ray)
         if not dr.any(active):
-            return found
-        if len(found.distance) == MOST_CROSSINGS:
+            return crossings
+        if len(crossings.distance) == MOST_CROSSINGS:
             raise InputError(f"scene: a ray crosses more than {MOST_CROSSINGS} walls; simplify its meshes")
-        for values, value in zip(vars(found).values(), (distance, cosine, across, wall), strict=True):
+        for values, value in zip(vars(crossings).values(), (distance, cosine, across, wall), strict=True):
             values.append(value)
 
 
@@ -132,8 +132,8 @@ def walls_of(
         permittivity, conductivity, thickness = (dr.gather(mi.Float, column, wall) for column in columns)
         c = slab(cosine, permittivity, conductivity, thickness, frequency_hz)
         t = c.transmitted_te * across + c.transmitted_tm * (1 - across)
-        there = dr.isfinite(distance)
-        t_re, t_im = dr.select(there, t.real, 1), dr.select(there, t.imag, 0)
+        crossed = dr.isfinite(distance)
+        t_re, t_im = dr.select(crossed, t.real, 1), dr.select(crossed, t.imag, 0)
         re, im = re * t_re - im * t_im, re * t_im + im * t_re
         passed.append((re, im))
     rays = dr.width(crossings.distance[0])
@@ -170,9 +170,9 @@ def radio_constants(shape: Any, frequency_hz: Any, thickness_m: Mapping[str, flo
     if not name.startswith(ITU_PREFIX):
         what = f"shape {shape.id() or 'without id'}: its BSDF {name or 'without id'} is no radio material"
         raise InputError(f"{what}; name it {ITU_PREFIX}*, use one of Sionna RT, or set the integrator's walls to false")
-    known, kind = itu_constants(frequency), name.removeprefix(ITU_PREFIX)
-    if kind not in known:
+    itu, kind = itu_constants(frequency), name.removeprefix(ITU_PREFIX)
+    if kind not in itu:
         raise InputError(f"{name} at {frequency:g} Hz: no constants of ITU-R P.2040; choose another material")
-    eta_r, sigma, _ = known[kind]
+    eta_r, sigma, _ = itu[kind]
     thickness = thickness_m.get(name.removeprefix("mat-"), DEFAULT_THICKNESS)
     return mi.Float(eta_r), mi.Float(sigma), mi.Float(thickness)

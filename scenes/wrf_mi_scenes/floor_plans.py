@@ -55,16 +55,16 @@ def _shell(length: float, width: float, height: float, windows: Mapping[str, Ite
         "west": (0, 0.0, width),
         "east": (0, length, width),
     }
-    found = {
+    parts = {
         "floor": sheet(2, 0.0, (0, length), (0, width)),
         "ceiling": sheet(2, height, (0, length), (0, width)),
     }
     panes = []
     for name, (axis, at, along) in sides.items():
         openings = list(windows.get(name, ()))
-        found[f"wall_{name}"] = wall(axis, at, (0, along), (0, height), openings)
+        parts[f"wall_{name}"] = wall(axis, at, (0, along), (0, height), openings)
         panes += [sheet(axis, at, *opening) for opening in openings]
-    return {**found, "windows": joined(panes)}
+    return {**parts, "windows": joined(panes)}
 
 
 def _doors(*along: Span) -> list[Opening]:

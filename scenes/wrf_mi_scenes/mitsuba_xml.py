@@ -96,14 +96,14 @@ def scene_xml(
             for all others.
         looks: write the colours of all materials and no radio material, for pictures by Mitsuba alone.
     """
-    known = {} if looks else {PERFECT: PERFECT_CONSTANTS, **constants}
+    material_constants = {} if looks else {PERFECT: PERFECT_CONSTANTS, **constants}
     lines = ['<scene version="3.0.0">', '    <integrator type="path"/>']
     for material in dict.fromkeys(materials.values()):
         colour = COLOURS.get(material, OTHER_COLOUR)
         look = f'<rgb name="color" value="{colour}"/>'
-        if material in known:
+        if material in material_constants:
             kind = "radio-material"
-            content = _floats(known[material])
+            content = _floats(material_constants[material])
         elif material == ABSORBER and not looks:
             kind, content = "absorber-radio-material", [look]
         elif material in slabs and not looks:
@@ -129,8 +129,8 @@ def scene_xml(
 
 
 def _floats(numbers: Mapping[str, float]) -> list[str]:
-    stated = [(name, value) for name, value in numbers.items() if name in (*PERFECT_CONSTANTS, *SCATTERING)]
-    return [f'<float name="{name}" value="{value:.9g}"/>' for name, value in stated]
+    entries = [(name, value) for name, value in numbers.items() if name in (*PERFECT_CONSTANTS, *SCATTERING)]
+    return [f'<float name="{name}" value="{value:.9g}"/>' for name, value in entries]
 
 
 def write_scene(

@@ -125,6 +125,6 @@ def _station(
             axis, side = rng.integers(2, size=2)
             place[axis] = MOUNTED_M if side == 0 else size_m[axis] - MOUNTED_M
         place = np.round(place, 4)
-        near = [((place > one.bounds[0] - CLEAR_M) & (place < one.bounds[1] + CLEAR_M)).all() for one in pieces]
+        near = [((place > piece.bounds[0] - CLEAR_M) & (place < piece.bounds[1] + CLEAR_M)).all() for piece in pieces]
         if not any(near):
             return float(place[0]), float(place[1]), float(place[2])

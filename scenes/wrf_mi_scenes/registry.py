@@ -57,9 +57,9 @@ def content_sha256(folder: Path, xml: str) -> str:
 
 def scenes() -> dict[str, SceneInfo]:
     """The scenes by name: every folder beside this file that holds a ``scene.yml``."""
-    found = {}
+    infos = {}
     for path in sorted(Path(__file__).parent.glob("*/scene.yml")):
         facts = yaml.safe_load(path.read_text(encoding="utf-8"))
         xml = path.parent / facts.pop("xml")
-        found[path.parent.name] = SceneInfo(name=path.parent.name, folder=path.parent, xml=xml, **facts)
-    return found
+        infos[path.parent.name] = SceneInfo(name=path.parent.name, folder=path.parent, xml=xml, **facts)
+    return infos
