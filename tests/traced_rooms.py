@@ -65,12 +65,12 @@ def image_lengths(tx: np.ndarray, rx: np.ndarray, depth: int, size: Any = (LENGT
 
     Source: Allen and Berkley, "Image method for efficiently simulating small-room acoustics" (1979), JASA 65(4).
     """
-    found = []
+    lengths = []
     span = range(-depth, depth + 1)
     for n in np.array(np.meshgrid(span, span, span)).reshape(3, -1).T:
         if np.abs(n).sum() > depth:
             continue
         # After |n| reflections along an axis the image is at n size + x or, for odd n, at (n + 1) size - x.
         image = np.where(n % 2 == 0, n * size + tx, (n + 1) * np.array(size) - tx)
-        found.append(np.linalg.norm(image - rx))
-    return np.sort(found)
+        lengths.append(np.linalg.norm(image - rx))
+    return np.sort(lengths)

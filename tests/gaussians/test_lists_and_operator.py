@@ -145,12 +145,14 @@ def test_faint_gaussians_are_pruned_within_the_bound_of_their_opacities(seed):
     opacity = 10.0 ** np.random.default_rng(seed).uniform(-4, 0, COUNT)
     geometry = {name: np.stack([p.numpy()[:COUNT] for p in getattr(gaussians, name)]) for name in GEOMETRY}
     parameters = geometry | {"log_scale": np.log(geometry["scale"]), "opacity": logit(opacity[None])}
-    kept = adapt(parameters, ones, ones, np.random.default_rng(0), 0.0, COUNT).source
-    pruned = np.setdiff1d(np.arange(COUNT), kept)
+    kept_indices = adapt(parameters, ones, ones, np.random.default_rng(0), 0.0, COUNT).source
+    pruned = np.setdiff1d(np.arange(COUNT), kept_indices)
     assert len(pruned) == (opacity < LEAST_OPACITY).sum()
     strength = np.hypot(*(s.numpy()[:COUNT] for s in gaussians.signal))
     bound = (opacity[pruned] * (strength[pruned] + strength.max())).sum()
-    every, few = (oracle_image(gaussians, RECEIVER, SIZE, n, opacity=opacity[n]) for n in (np.arange(COUNT), kept))
+    every, few = (
+        oracle_image(gaussians, RECEIVER, SIZE, n, opacity=opacity[n]) for n in (np.arange(COUNT), kept_indices)
+    )
     assert 0 < np.abs(every - few).max() <= bound
 
 

@@ -80,9 +80,11 @@ def terms_of(both, model, weight):
     plane, tx_pos = perception_plane(HEIGHT, WIDTH, Float64), Tensor64(np.ascontiguousarray(traced.tx_pos_m.T))
 
     def terms(parameters):
-        own = {name.removeprefix("field."): v for name, v in parameters.items() if name.startswith("field.")}
+        field_parameters = {
+            name.removeprefix("field."): v for name, v in parameters.items() if name.startswith("field.")
+        }
         pose = receiver_pose(traced.receiver, parameters, Float64)
-        learned = learned_field(field.gaussians(own, tx_pos), pose, plane, model.sphere)
+        learned = learned_field(field.gaussians(field_parameters, tx_pos), pose, plane, model.sphere)
         return model(traced(parameters), learned) * weight
 
     return terms

@@ -105,9 +105,11 @@ class Joint:
         """Report [n] of both sides or one, with ``weight`` also derivatives of its weighted sum by name."""
         params = {name: tensor(value, kind) for name, value in (self.values | (values or {})).items()}
         dr.enable_grad(params)
-        own = {name.removeprefix("field."): p for name, p in params.items() if name.startswith("field.")}
+        field_parameters = {name.removeprefix("field."): p for name, p in params.items() if name.startswith("field.")}
         pose, plane = receiver_pose(self.receiver, params, kind), perception_plane(*SIZE, kind)
-        learned = learned_field(self.field.gaussians(own, tensor(self.tx_pos_m.T, kind)), pose, plane, model.sphere)
+        learned = learned_field(
+            self.field.gaussians(field_parameters, tensor(self.tx_pos_m.T, kind)), pose, plane, model.sphere
+        )
         report = model(None if side == "learned" else self.traced(params), None if side == "traced" else learned)
         shown = dr.detach(report).numpy().astype(float)
         if weight is None:

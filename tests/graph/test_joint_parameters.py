@@ -60,24 +60,24 @@ def paths_alone(parts, *settings):
 
 def test_material_gain_and_pose_are_recovered(tmp_path):
     """Channels of an array displaced by 3 cm, turned by 2 degrees, with a gain, between other walls."""
-    stated, shift_m, turn_rad = receiver(), np.array([0.02, -0.015, 0.01]), np.radians([0.5, -1.0, 2.0])
-    turned = (Rotation.from_quat(stated.orientation_xyzw) * Rotation.from_rotvec(turn_rad)).as_quat()
-    moved = replace(stated, position_m=stated.position_m + shift_m, orientation_xyzw=turned)
+    stated_receiver, shift_m, turn_rad = receiver(), np.array([0.02, -0.015, 0.01]), np.radians([0.5, -1.0, 2.0])
+    turned = (Rotation.from_quat(stated_receiver.orientation_xyzw) * Rotation.from_rotvec(turn_rad)).as_quat()
+    moved = replace(stated_receiver, position_m=stated_receiver.position_m + shift_m, orientation_xyzw=turned)
     tx, scene = np.random.default_rng(0).uniform([1, 1, 0.8], [5, 4, 2.4], (20, 3)), room(tmp_path, WALLS)
     record = record_of("csi", scene, (moved,), tx)
     observed = record.observation * np.complex64(40 * np.exp(0.3j))
-    record = replace(record, receivers=(replace(stated, array_m=ARRAY_M),), observation=observed)
+    record = replace(record, receivers=(replace(stated_receiver, array_m=ARRAY_M),), observation=observed)
     scene.radio_materials["itu_concrete"].relative_permittivity = START_PERMITTIVITY
     rates = ("traced.position=2e-3", "traced.turn=5e-3", "traced.material=0.05", "steps=400", "batch=20")
     trainer = Trainer(record, all_of(record), paths_alone("gain,materials,pose", *rates), scene=scene)
     # A gain starts where the paths report what was observed, on average.
     assert trainer.state.params()["receiver.array.gain"][0] == pytest.approx(np.log(40), abs=0.1)
     trainer.run()
-    found = trainer.state.params()
-    np.testing.assert_allclose(found["receiver.array.position"], shift_m, atol=1e-3)
-    np.testing.assert_allclose(found["receiver.array.turn"], turn_rad, atol=1e-3)
-    np.testing.assert_allclose(found["receiver.array.gain"], [np.log(40), 0.3], atol=0.02)
-    assert 1 + np.exp(found[PERMITTIVITY]).item() == pytest.approx(TRUE_PERMITTIVITY, abs=0.1)
+    fitted = trainer.state.params()
+    np.testing.assert_allclose(fitted["receiver.array.position"], shift_m, atol=1e-3)
+    np.testing.assert_allclose(fitted["receiver.array.turn"], turn_rad, atol=1e-3)
+    np.testing.assert_allclose(fitted["receiver.array.gain"], [np.log(40), 0.3], atol=0.02)
+    assert 1 + np.exp(fitted[PERMITTIVITY]).item() == pytest.approx(TRUE_PERMITTIVITY, abs=0.1)
 
 
 @pytest.mark.parametrize("task", ["spectrum", "rssi"])
@@ -111,8 +111,8 @@ def test_patterns_are_recovered(tmp_path):
         trainer = Trainer(record, all_of(record, 60), paths_alone(parts, "steps=250", "batch=30", *degree), scene=scene)
         trainer.run()
         predict = trainer.predictor()
-        found = np.stack([predict.of_rows(record, np.arange(60, 80), r) for r in range(2)])
-        error.append(np.median(np.abs(found - observed[:, 60:])))
+        predicted = np.stack([predict.of_rows(record, np.arange(60, 80), r) for r in range(2)])
+        error.append(np.median(np.abs(predicted - observed[:, 60:])))
     assert error[1] < 0.1 * error[0]
     with pytest.raises(InputError, match="needs headings; give heading_rad"):
         predict(tx[:2])
@@ -121,17 +121,23 @@ def test_patterns_are_recovered(tmp_path):
 @pytest.fixture
 def rooms(tmp_path):
     """A room with a metal ceiling, and its walls alone, with a wrong permittivity of concrete."""
-    known = room(tmp_path / "known", WALLS)
-    known.radio_materials["itu_concrete"].relative_permittivity = START_PERMITTIVITY
-    return room(tmp_path / "whole", {**WALLS, **CEILING}), known
+    known_room = room(tmp_path / "known", WALLS)
+    known_room.radio_materials["itu_concrete"].relative_permittivity = START_PERMITTIVITY
+    return room(tmp_path / "whole", {**WALLS, **CEILING}), known_room
 
 
 def test_permittivity_is_recovered_in_joint_training(rooms):
     """The Gaussians model the reflection at the ceiling, which the mesh lacks."""
     record = record_of("csi", rooms[0], (receiver(),), transmitters(28))
-    own = ("batch=20", "traced.material=0.05", "traced.materials=named", "traced.surface=0", "initial.gaussians=40")
+    extra_settings = (
+        "batch=20",
+        "traced.material=0.05",
+        "traced.materials=named",
+        "traced.surface=0",
+        "initial.gaussians=40",
+    )
     small_field = ("steps=150", "network.width=32", "network.layers=2")
-    config = with_settings(default_config("csi"), [*ONE_REFLECTION, *QUICK, *own, *small_field])
+    config = with_settings(default_config("csi"), [*ONE_REFLECTION, *QUICK, *extra_settings, *small_field])
     trainer = fit_curriculum(FitPlan(record, all_of(record, 20), config, scene=rooms[1]))
     miss = trainer.predictor()(record.tx_pos_m[20:]) - record.observation[0, 20:]
     assert (np.abs(miss) ** 2).sum() < 0.1 * (np.abs(record.observation[0, 20:]) ** 2).sum()
@@ -155,8 +161,8 @@ def test_validation_of_paths_alone_searches_none(rooms, monkeypatch):
     split = Split("parts", 0, np.array([0, 2, 3, 6, 7, 8, 10]), np.array([1, 4, 5, 9, 11]), np.zeros(0, np.int64))
     trainer = Trainer(record, split, part.config, scene=part.graph.scene)
     predict = trainer.predictor()
-    found = np.stack([predict.of_rows(record, split.validation, r) for r in range(2)])
-    expected = np.nanmedian(trainer.plan.task.training_score(found, observed[:, split.validation]))
+    predicted = np.stack([predict.of_rows(record, split.validation, r) for r in range(2)])
+    expected = np.nanmedian(trainer.plan.task.training_score(predicted, observed[:, split.validation]))
     monkeypatch.setattr(trainer.graph, "trace", lambda *_: pytest.fail("searched"))
     assert trainer.validate() == pytest.approx(float(expected), rel=1e-5)
 
@@ -202,18 +208,20 @@ def test_documented_training_runs(capsys):
 
 def test_resumed_fit_keeps_its_paths(rooms):
     """Paths are searched again once a receiver has moved by a quarter of a wavelength, and restored on resumption."""
-    own = ("traced.position=0.05", "optimiser.warm_up=1", "steps=14", "deterministic=true")
-    whole, part = (small(rooms, *own) for _ in range(2))
-    whole.run()
-    stated = np.stack([station.position_m for station in whole.graph.receivers])
-    assert (np.linalg.norm(whole.state.searched_m - stated, axis=1) > 0).any(), "the receivers have hardly moved"
+    extra_settings = ("traced.position=0.05", "optimiser.warm_up=1", "steps=14", "deterministic=true")
+    uninterrupted, part = (small(rooms, *extra_settings) for _ in range(2))
+    uninterrupted.run()
+    stated_positions_m = np.stack([station.position_m for station in uninterrupted.graph.receivers])
+    assert (np.linalg.norm(uninterrupted.state.searched_m - stated_positions_m, axis=1) > 0).any(), (
+        "the receivers have hardly moved"
+    )
     part.run(stop=stop_after(9))
     state = FitState.from_arrays(part.state.arrays())
     resumed = Trainer(part.plan.record, part.plan.split, part.config, scene=part.graph.scene, state=state)
     for side, searched_m in zip(resumed.plan.sides, part.state.searched_m, strict=True):
         np.testing.assert_array_equal(side.searched_at_m, searched_m)
     resumed.run()
-    np.testing.assert_equal(resumed.state.params(), whole.state.params())
+    np.testing.assert_equal(resumed.state.params(), uninterrupted.state.params())
 
 
 SIX_HZ = FREQUENCY_HZ + np.linspace(-10e6, 10e6, 6)
@@ -263,8 +271,8 @@ def thirds(record):
 
 
 def trained(record, scene, *settings):
-    own = {"spectrum": SPECTRA, "csi": CHANNELS}.get(record.task.name, ())
-    config = with_settings(default_config(record.task.name), [*SETTINGS, *own, *settings])
+    task_settings = {"spectrum": SPECTRA, "csi": CHANNELS}.get(record.task.name, ())
+    config = with_settings(default_config(record.task.name), [*SETTINGS, *task_settings, *settings])
     opened = None if scene is None else open_scene(scene, FREQUENCY_HZ)
     return fit_curriculum(FitPlan(record, thirds(record), config, scene=opened))
 
@@ -272,15 +280,17 @@ def trained(record, scene, *settings):
 def score(record, trainer):
     """Median score on the test rows, the higher the better."""
     rows, task = thirds(record).test, record.task
-    found = np.stack([trainer.predictor()(record.tx_pos_m[rows], r) for r in range(2)])
-    value = float(np.median(task.of_rows(found, record.observation[:, rows])))
+    predicted = np.stack([trainer.predictor()(record.tx_pos_m[rows], r) for r in range(2)])
+    value = float(np.median(task.of_rows(predicted, record.observation[:, rows])))
     return value if task.higher_is_better else -value
 
 
 @pytest.mark.parametrize(("task", "antennas"), [("rssi", 1), pytest.param("csi", 2, marks=pytest.mark.slow)])
 def test_joint_training_predicts_better_than_either_side(task, antennas, scenes):
-    record, own = measured(task, scenes["whole"], antennas), ("model=ray-tracing", "traced.surface=0")
-    both, alone, paths = (trained(record, *how) for how in ((scenes["known"],), (None,), (scenes["known"], *own)))
+    record, paths_settings = measured(task, scenes["whole"], antennas), ("model=ray-tracing", "traced.surface=0")
+    both, alone, paths = (
+        trained(record, *how) for how in ((scenes["known"],), (None,), (scenes["known"], *paths_settings))
+    )
     assert score(record, both) > score(record, alone) + ALONE
     assert score(record, both) > score(record, paths) + PATHS[task]
     assert {"level", "position", "receiver.rx0.gain", "material.itu_concrete.permittivity"} <= set(both.state.adam)

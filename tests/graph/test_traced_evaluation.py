@@ -176,27 +176,27 @@ FEW_STEPS = (
 def test_traced_training_scores_like_splatting_and_reuses_kernels():
     """The traced fit's median SSIM lies in the splatted one's 95 % bootstrap interval over the test rows."""
     record, start = made_record()
-    split, known, new = official(record), set[str](), list[int]()
+    split, earlier_kernels, new = official(record), set[str](), list[int]()
     scores: dict[str, np.ndarray] = {}
 
     def count_kernels(progress):
         # A kernel is its code, constants included, whether this process or another one compiled it.
         kernels = {entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT}
-        new.append(len(kernels - known))
-        known.update(kernels)
+        new.append(len(kernels - earlier_kernels))
+        earlier_kernels.update(kernels)
 
     for name, progress in (("splatted", lambda progress: None), ("traced", count_kernels)):
-        own = settings(*FEW_STEPS, f"evaluation={name}", "log_every=10", "validate_every=1000")
-        trainer = Trainer(record, split, own, initial=start)
+        config = settings(*FEW_STEPS, f"evaluation={name}", "log_every=10", "validate_every=1000")
+        trainer = Trainer(record, split, config, initial=start)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, name == "traced"):
             dr.kernel_history_clear()
             trainer.run(progress)
         scores[name] = ssim(trainer.predictor().of_rows(record, split.test, 0), record.observation[0, split.test])
     # A scene whose parameters keep derivatives hands them to whatever is traced in the process later.
     evaluation: Any = trainer.graph.evaluation
-    kept = [scene.params[key] for scene in evaluation._scenes for key in scene.params.keys()]  # noqa: SIM118
-    assert kept
-    assert not dr.grad_enabled(kept)
+    scene_params = [scene.params[key] for scene in evaluation._scenes for key in scene.params.keys()]  # noqa: SIM118
+    assert scene_params
+    assert not dr.grad_enabled(scene_params)
     draws = np.random.default_rng(0).choice(scores["splatted"], (4000, len(split.test)))
     low, high = np.percentile(np.median(draws, axis=1), (2.5, 97.5))
     assert STILL_LEARNS < low <= np.median(scores["traced"]) <= high
@@ -241,10 +241,10 @@ def test_slab_attenuates_traced_gaussians_behind_it(tmp_path):
 def test_traced_derivative_by_wall_materials(tmp_path, materials):
     """Of parameters that the paths have, too: against central differences."""
     graph, values = behind_the_ceiling(tmp_path, materials=materials)
-    own = graph.trace(TX, 0)[0].parameters().items()
-    walls, report = {name: value for name, value in own if name.startswith("material.")}, reported(graph, TX)
+    named_values = graph.trace(TX, 0)[0].parameters().items()
+    walls, report = {name: value for name, value in named_values if name.startswith("material.")}, reported(graph, TX)
     weights = np.random.default_rng(3).uniform(0.5, 1.5, 3 * SIZE[0] * SIZE[1])
-    found = gradients(values | walls, report, weights)
+    derivatives = gradients(values | walls, report, weights)
 
     def total(name, index, step):
         moved = walls[name].copy()
@@ -253,11 +253,11 @@ def test_traced_derivative_by_wall_materials(tmp_path, materials):
         with dr.suspend_grad():
             return float(report(params).numpy().astype(float) @ weights)
 
-    crossed = {name: int(np.abs(found[name]).argmax()) for name in walls if found[name].any()}
+    crossed = {name: int(np.abs(derivatives[name]).argmax()) for name in walls if derivatives[name].any()}
     assert len(crossed) >= 2
     for name, index in crossed.items():
         numeric = (total(name, index, 2e-2) - total(name, index, -2e-2)) / 4e-2
-        assert found[name][index] == pytest.approx(numeric, rel=DIFFERENCE), name
+        assert derivatives[name][index] == pytest.approx(numeric, rel=DIFFERENCE), name
 
 
 def test_traced_run_with_a_scene_reproduces_its_score(tmp_path):

@@ -99,10 +99,10 @@ def test_wall_transmission_matches_sionna_rt(tmp_path):
 
 def test_default_polarisation_is_vertical_for_any_sensor_rotation():
     """A stated polarisation turns with the sensor; the default does not."""
-    stated = CARRIER | {"polarization": mi.ScalarVector3f(0, 1, 0)}
+    polarized = CARRIER | {"polarization": mi.ScalarVector3f(0, 1, 0)}
     upright, turned, turned_with_sensor = (
         images_at_pixels(turn_deg, brick=BRICK, wall=wall(), integrator=integrator)
-        for turn_deg, integrator in ((0, CARRIER), (90, CARRIER), (90, stated))
+        for turn_deg, integrator in ((0, CARRIER), (90, CARRIER), (90, polarized))
     )
     np.testing.assert_allclose(turned, upright, rtol=1e-3, atol=1e-4)  # a rotated sensor in single precision
     assert np.abs(turned_with_sensor / upright - 1).max() > 0.05

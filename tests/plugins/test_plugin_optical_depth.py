@@ -42,8 +42,8 @@ def random_values(n: int, rng: np.random.Generator, scale_m: tuple[float, float]
 def gaussians(values: dict[str, Any], float_type: Any = Float64) -> Gaussians:
     """Without what belongs to the rays; an attenuation takes the place of the opacity."""
     blend = "attenuation" if "attenuation" in values else "opacity"
-    kept = {name: values[name] for name in ("position", "scale", "rotation", blend)}
-    return device_gaussians(float_type, **kept, signal=np.zeros(1, complex))
+    field_values = {name: values[name] for name in ("position", "scale", "rotation", blend)}
+    return device_gaussians(float_type, **field_values, signal=np.zeros(1, complex))
 
 
 def vectors(v: np.ndarray, float_type: Any = Float64) -> list[Any]:

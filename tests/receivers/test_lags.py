@@ -50,11 +50,11 @@ def test_lags_of_a_plane_wave_are_those_of_its_direction():
     """h = exp(+j k p . u): each of the (4 - a)(4 - b) pairs of a lag has the phase k l . u; r_0 is 16."""
     elements, u = planar_array(4, 4, 0.16), pixel_directions(9, 36)[4, 7]
     lags = Lags(elements, FREQUENCY_HZ, 9, 36)
-    found = lags_of(lags, array_response(elements, u, FREQUENCY_HZ))
-    assert found[0] == pytest.approx(16)
+    wave_lags = lags_of(lags, array_response(elements, u, FREQUENCY_HZ))
+    assert wave_lags[0] == pytest.approx(16)
     steps = np.rint(np.abs(lags.lag_m[1:]) / 0.16)
     expected = (4 - steps[:, 0]) * (4 - steps[:, 1]) * array_response(lags.lag_m[1:], u, FREQUENCY_HZ)
-    np.testing.assert_allclose(found[1:25] + 1j * found[25:], np.sqrt(2) * expected, atol=EXACT)
+    np.testing.assert_allclose(wave_lags[1:25] + 1j * wave_lags[25:], np.sqrt(2) * expected, atol=EXACT)
 
 
 def test_residual_is_orthogonal_to_all_squared_spectra():

@@ -210,16 +210,16 @@ def test_power_over_channels_and_without_interference() -> None:
     """The mean over channels of the power of their sums, and the sum of the paths' powers."""
     frequencies = (FREQUENCY_HZ, 1.01 * FREQUENCY_HZ, 1.03 * FREQUENCY_HZ)
     (traced, arrays), (field, signal) = paths(), learned(2, 2 * 6 * 8)
-    whole, powers = whole_sphere(signal), (np.abs(arrays["gain"]) ** 2).sum(axis=1)
+    sphere_signal, powers = whole_sphere(signal), (np.abs(arrays["gain"]) ** 2).sum(axis=1)
     hopping = PowerReceiver(6, 8, frequencies)
     faded = PowerReceiver(6, 8, frequencies, how="power", interference=False)
     # A mean power has no phase: as a complex number it is its root, which the learned side raises or lowers.
     mixed = PowerReceiver(6, 8, frequencies, interference=False)
     for model, addition, expected, atol in (
-        (hopping, field, (np.abs(signals(arrays, ORIGIN, *frequencies) + whole) ** 2).mean(axis=1), DOUBLE),
-        (faded, field, powers + np.abs(whole[:, 0]) ** 2, DOUBLE),
+        (hopping, field, (np.abs(signals(arrays, ORIGIN, *frequencies) + sphere_signal) ** 2).mean(axis=1), DOUBLE),
+        (faded, field, powers + np.abs(sphere_signal[:, 0]) ** 2, DOUBLE),
         (faded, None, powers, 1e-4),
-        (mixed, field, np.abs(np.sqrt(powers) + whole[:, 0]) ** 2, DOUBLE),
+        (mixed, field, np.abs(np.sqrt(powers) + sphere_signal[:, 0]) ** 2, DOUBLE),
     ):
         np.testing.assert_allclose(model(traced, addition).numpy(), 10 * np.log10(expected), atol=atol)
 
@@ -265,11 +265,11 @@ def test_full_sphere_includes_directions_below_the_horizon() -> None:
     directions = np.concatenate([DIRECTIONS, DIRECTIONS * [1, -1, -1]])  # the lower half after half a turn about x
     assert directions[target, 2] < 0
     at = directions[target] * 4
-    zero, one = Float64(0.0), Float64(1.0)
-    shape = {"scale": [Float64(0.2)] * 3, "rotation": [zero, zero, zero, one], "opacity": Float64(0.9)}
+    zero, unit = Float64(0.0), Float64(1.0)
+    shape = {"scale": [Float64(0.2)] * 3, "rotation": [zero, zero, zero, unit], "opacity": Float64(0.9)}
     signal = [Float64(0.8), Float64(-0.3)]
     gaussian = Gaussians(position=[Float64(x) for x in at], signal=signal, attenuation=None, batch=1, **shape)
-    pose = Pose([zero] * 3, [[one if i == j else zero for j in range(3)] for i in range(3)])
+    pose = Pose([zero] * 3, [[unit if i == j else zero for j in range(3)] for i in range(3)])
     plane = perception_plane(HEIGHT, WIDTH, Float64)
     signal = np.array([1, 1j]) @ [part.numpy() for part in learned_field(gaussian, pose, plane, sphere=True)]
     assert np.abs(signal).argmax() == target

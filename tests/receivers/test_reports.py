@@ -26,5 +26,5 @@ def test_scaling_of_numpy_and_drjit_images_agree(shape: tuple[int, int, int]) ->
     images[0] = 1.5  # without contrast
     flat = scaled(mi.Float64(images.ravel()), shape[1] * shape[2]).numpy()
     np.testing.assert_allclose(flat.reshape(shape), minmax_scale(images), atol=EXACT)
-    known = np.array([[[1.0, 3], [2, 5]], [[7, 7], [7, 7]]])
-    np.testing.assert_allclose(minmax_scale(known), [[[0.0, 0.5], [0.25, 1.0]], [[0.0, 0.0], [0.0, 0.0]]])
+    grey_images = np.array([[[1.0, 3], [2, 5]], [[7, 7], [7, 7]]])
+    np.testing.assert_allclose(minmax_scale(grey_images), [[[0.0, 0.5], [0.25, 1.0]], [[0.0, 0.0], [0.0, 0.0]]])

@@ -78,6 +78,6 @@ def test_measured_spectra_are_cut_magnitudes_of_single_snapshots():
     record = load("rfid-lab")
     rows = make_splits(record, "official")[0].all_train[::10]
     lags = Lags(record.receivers[0].array_m, float(record.frequencies_hz[0]), 90, 360)
-    found = unscale(record.observation[0, rows], lags)
-    assert np.sqrt(np.mean(found.residual**2)) == pytest.approx(np.sqrt(np.mean(found.rounding**2)), rel=0.02)
-    assert retrieve_signals(found, lags).explained.all()
+    unscaled = unscale(record.observation[0, rows], lags)
+    assert np.sqrt(np.mean(unscaled.residual**2)) == pytest.approx(np.sqrt(np.mean(unscaled.rounding**2)), rel=0.02)
+    assert retrieve_signals(unscaled, lags).explained.all()

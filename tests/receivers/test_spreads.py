@@ -19,12 +19,12 @@ def statistics(power: list[float], length_m: list[float], azimuth_deg: list[floa
 
 
 def test_spreads_and_k_factor_of_one_to_three_paths() -> None:
-    found = statistics([0.5e-8, 0.5e-8], [10.0, 13.0], [0.0, 90.0])
-    assert found.path_gain_db[0] == pytest.approx(-80, abs=ROUNDING)
-    assert found.delay_spread_s[0] == pytest.approx(1.5 / speed_of_light, rel=ROUNDING)
-    assert found.k_factor_db[0] == pytest.approx(0, abs=ROUNDING)
+    spreads = statistics([0.5e-8, 0.5e-8], [10.0, 13.0], [0.0, 90.0])
+    assert spreads.path_gain_db[0] == pytest.approx(-80, abs=ROUNDING)
+    assert spreads.delay_spread_s[0] == pytest.approx(1.5 / speed_of_light, rel=ROUNDING)
+    assert spreads.k_factor_db[0] == pytest.approx(0, abs=ROUNDING)
     # The mean of two unit vectors at a right angle has length 1 / sqrt(2): sqrt(-2 ln) of it is sqrt(ln 2).
-    assert found.azimuth_spread_deg[0] == pytest.approx(np.degrees(np.sqrt(np.log(2))), rel=ROUNDING)
+    assert spreads.azimuth_spread_deg[0] == pytest.approx(np.degrees(np.sqrt(np.log(2))), rel=ROUNDING)
     three = statistics([8e-9, 1e-9, 1e-9], [5.0, 6.0, 7.0], [0.0, 1.0, 2.0])
     assert three.k_factor_db[0] == pytest.approx(10 * np.log10(4), abs=ROUNDING)
     alone = statistics([1e-9], [7.0], [33.0])
@@ -42,9 +42,9 @@ def test_azimuth_spread_ignores_turns_elevation_and_vertical_paths() -> None:
 
 def test_transmitters_without_paths_are_not_a_number_and_rows_are_placed() -> None:
     rows = np.array([2, 2], np.int64)
-    found = PathStatistics.of_paths(rows, 4, np.array([1e-9, 0.0]), np.array([4.0, 1.0]), np.eye(3)[:2])
-    for values in astuple(found):
+    spreads = PathStatistics.of_paths(rows, 4, np.array([1e-9, 0.0]), np.array([4.0, 1.0]), np.eye(3)[:2])
+    for values in astuple(spreads):
         np.testing.assert_array_equal(np.isnan(values), [True, True, False, True])
-    placed = found.rows(np.array([2, 0])).placed(np.array([3, 1]), 5)
+    placed = spreads.rows(np.array([2, 0])).placed(np.array([3, 1]), 5)
     np.testing.assert_array_equal(np.isnan(placed.path_gain_db), [True, True, True, False, True])
-    assert joined([found, placed]).delay_spread_s.shape == (9,)
+    assert joined([spreads, placed]).delay_spread_s.shape == (9,)

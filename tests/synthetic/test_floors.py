@@ -120,8 +120,8 @@ def test_offsets_noise_and_sensitivity_are_the_stated_ones(traced: TraceResult) 
     all_received = strengths_of(traced, replace(SMALL, sensitivity_dbm=-500.0)).observation
     ordered = np.sort(all_received[np.isfinite(all_received)])
     limit = float(ordered[len(ordered) // 2 :][:2].mean())
-    some = strengths_of(traced, replace(SMALL, sensitivity_dbm=limit)).observation
-    np.testing.assert_array_equal(some, np.where(all_received < limit, np.nan, all_received))
+    limited = strengths_of(traced, replace(SMALL, sensitivity_dbm=limit)).observation
+    np.testing.assert_array_equal(limited, np.where(all_received < limit, np.nan, all_received))
 
 
 def test_specular_paths_are_those_of_a_search_without_scattering(traced: TraceResult, scene_folder: Path) -> None:
@@ -131,8 +131,8 @@ def test_specular_paths_are_those_of_a_search_without_scattering(traced: TraceRe
     np.testing.assert_array_equal(specular.length_m, alone.length_m)
     # A reflection loses the scattered share of its power.
     reflected = (specular.interactions == 1).sum(axis=1)
-    kept = np.sqrt(1 - SMALL.scattering**2) ** reflected
-    np.testing.assert_allclose(np.abs(specular.gain), np.abs(alone.gain) * kept, rtol=1e-4, atol=1e-12)
+    specular_share = np.sqrt(1 - SMALL.scattering**2) ** reflected
+    np.testing.assert_allclose(np.abs(specular.gain), np.abs(alone.gain) * specular_share, rtol=1e-4, atol=1e-12)
 
 
 def test_channels_have_the_same_paths(traced: TraceResult, tmp_path: Path) -> None:
@@ -234,13 +234,15 @@ OPTIONS = TraceOptions(depth=2, rays=1 << 14)
 def test_specular_channels_are_reciprocal(bare_room: tuple) -> None:
     scene, receiver, array_m, users = bare_room
     frequencies = np.concatenate([UPLINK_HZ[::5], DOWNLINK_HZ[::5]])
-    there = trace_paths(scene, users, receiver, OPTIONS).paths
+    forward = trace_paths(scene, users, receiver, OPTIONS).paths
     back = trace_paths(scene, receiver.position_m, ends_of(users), OPTIONS, search_from="transmitters").paths
-    expected = np.stack([antenna_csi(there, receiver, array_m, one)[0, ..., 0] for one in frequencies], axis=-1)
-    found = array_channels(back, receiver, array_m, frequencies)
-    assert np.abs(found - expected).max() < FLOAT64 * np.abs(expected).max()
+    expected = np.stack(
+        [antenna_csi(forward, receiver, array_m, frequency)[0, ..., 0] for frequency in frequencies], axis=-1
+    )
+    computed = array_channels(back, receiver, array_m, frequencies)
+    assert np.abs(computed - expected).max() < FLOAT64 * np.abs(expected).max()
     parts = np.concatenate([array_channels(back, receiver, array_m[k : k + 1], frequencies) for k in range(8)], axis=1)
-    assert np.abs(found - parts).max() < FLOAT64 * np.abs(found).max()
+    assert np.abs(computed - parts).max() < FLOAT64 * np.abs(computed).max()
 
 
 def test_channels_are_those_traced_to_each_element(bare_room: tuple) -> None:
@@ -249,8 +251,8 @@ def test_channels_are_those_traced_to_each_element(bare_room: tuple) -> None:
     places = receiver.position_m + array_m @ receiver.to_world.T
     expected = csi(trace_paths(scene, users, ends_of(places), OPTIONS).paths, frequencies).swapaxes(0, 1)
     back = trace_paths(scene, receiver.position_m, ends_of(users), OPTIONS).paths
-    found = array_channels(back, receiver, array_m, frequencies)
-    assert np.abs(found - expected).max() < MIDDLE * np.abs(expected).max()
+    computed = array_channels(back, receiver, array_m, frequencies)
+    assert np.abs(computed - expected).max() < MIDDLE * np.abs(expected).max()
 
 
 def test_ray_tracing_of_the_same_floor_explains_most_of_the_channel(walked: Record, tmp_path: Path) -> None:

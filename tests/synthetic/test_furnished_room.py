@@ -75,15 +75,15 @@ def test_scattered_waves_come_from_their_last_point(bare: Any) -> None:
     ends = [Receiver("0", np.array([2.0, 3.0, 1.2]), np.array([0.0, 0.0, 0.0, 1.0]))]
     options = TraceOptions(scattering=True, scattering_coefficient=0.3, depth=1, rays=1 << 8)
     paths = trace_paths(bare, RECEIVER.position_m, ends, options).paths
-    one = paths.select(np.flatnonzero((paths.interactions == 2).any(axis=1))[:1])
-    found = array_channels(one, RECEIVER, ARRAY_M, FREQUENCY_HZ)[0, :, 0]
-    point = one.vertices_m[0, 0]
+    path = paths.select(np.flatnonzero((paths.interactions == 2).any(axis=1))[:1])
+    computed = array_channels(path, RECEIVER, ARRAY_M, FREQUENCY_HZ)[0, :, 0]
+    point = path.vertices_m[0, 0]
     elements = RECEIVER.position_m + ARRAY_M @ RECEIVER.to_world.T
     wavenumber = 2 * np.pi * FREQUENCY_HZ / 299792458.0
     near, far = np.linalg.norm(point - elements, axis=1), np.linalg.norm(point - ends[0].position_m)
     origin = np.linalg.norm(point - RECEIVER.position_m)
-    expected = one.gain[0] * origin / near * np.exp(-1j * wavenumber * (near + far))
-    assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()  # vertices are float32
+    expected = path.gain[0] * origin / near * np.exp(-1j * wavenumber * (near + far))
+    assert np.abs(computed - expected).max() < 1e-4 * np.abs(expected).max()  # vertices are float32
 
 
 SIZE: dict[str, Any] = {"carriers_hz": (0.9e9, 5.8e9), "rows": 2, "columns": 3, "height": 9, "width": 36}

@@ -82,11 +82,11 @@ def test_run_states_its_convergence(shoebox_xml, tmp_path):
     record = Record("made-here", "rssi", inside(6), (RX,), power, official=split, frequencies_hz=hz)
     settings = ("target_error_db=8", "target_kinds=")
     folder = train(record, "ray-tracing", out=tmp_path / "run", scene=shoebox_xml, settings=settings).folder
-    stated = json.loads((folder / "convergence.json").read_text())
-    assert stated["target_db"] == 8.0
-    assert stated["error_db"] <= 8.0
-    assert stated["options"].items() <= yaml.safe_load((folder / "config.yaml").read_text())["settings"].items()
-    assert [t["value"] for t in stated["trials"] if t["part"] == "depth"][:2] == [1, 2]
+    convergence = json.loads((folder / "convergence.json").read_text())
+    assert convergence["target_db"] == 8.0
+    assert convergence["error_db"] <= 8.0
+    assert convergence["options"].items() <= yaml.safe_load((folder / "config.yaml").read_text())["settings"].items()
+    assert [t["value"] for t in convergence["trials"] if t["part"] == "depth"][:2] == [1, 2]
 
 
 def test_error_of_spectra_is_within_the_target(shoebox):
@@ -104,9 +104,9 @@ def test_error_of_spectra_is_within_the_target(shoebox):
     error = np.linalg.norm(coarse - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
     assert error.max() <= 10 ** (target_db / 20) - 1
     assert all(trial.change_db >= 20 * np.log10(1 + trial.spectrum) - 1e-12 for trial in choice.trials[1:])
-    stated = json.loads(json.dumps(choice.plain()))
-    assert stated["judged_by"] == ["power", "spectrum"]
-    assert stated["spectrum_error"] == pytest.approx(10 ** (choice.error_db / 20) - 1)
+    convergence = json.loads(json.dumps(choice.plain()))
+    assert convergence["judged_by"] == ["power", "spectrum"]
+    assert convergence["spectrum_error"] == pytest.approx(10 ** (choice.error_db / 20) - 1)
 
 
 IMMEDIATE_S = 5.0  # More than a refusal takes on a busy machine, and less than the shortest search that is refused
@@ -122,9 +122,9 @@ IMMEDIATE_S = 5.0  # More than a refusal takes on a busy machine, and less than 
 def test_estimate_counts_the_hits_of_the_search(options, shoebox, monkeypatch):
     counts, shoot = [0], search._shoot
 
-    def counted(scene, surfaces, directions, source_m, depth, *rest):
+    def counted(scene, surfaces, directions, source_m, depth, *arguments):
         counts[0] += directions.shape[1] * depth
-        return shoot(scene, surfaces, directions, source_m, depth, *rest)
+        return shoot(scene, surfaces, directions, source_m, depth, *arguments)
 
     monkeypatch.setattr(search, "_shoot", counted)
     monkeypatch.setattr(search, "_kept", type(search._kept)())

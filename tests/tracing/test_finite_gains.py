@@ -121,14 +121,14 @@ def building(tmp_path_factory):
 @contextmanager
 def made_of(scene, constants):
     """All surfaces of one slab while the block lasts."""
-    stated = [(m, {name: getattr(m, name) for name in CONSTANTS}) for m in scene.radio_materials.values()]
-    for material, _ in stated:
+    original_constants = [(m, {name: getattr(m, name) for name in CONSTANTS}) for m in scene.radio_materials.values()]
+    for material, _ in original_constants:
         for name, value in zip(CONSTANTS, constants, strict=True):
             setattr(material, name, dr.opaque(mi.Float, value))
     try:
         yield
     finally:
-        for material, values in stated:
+        for material, values in original_constants:
             for name, value in values.items():
                 setattr(material, name, value)
 
@@ -212,12 +212,12 @@ def losing(monkeypatch, lost):
 def test_paths_without_a_gain_are_left_out_and_counted(building, monkeypatch, caplog):
     places, rx = [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]], receiver(ENDS[0])
     options = KINDS["specular"]
-    whole = trace_paths(building, places, rx, options)
+    complete_trace = trace_paths(building, places, rx, options)
     losing(monkeypatch, [0, 3])
     with caplog.at_level(logging.WARNING):
         traced = trace_paths(building, places, rx, options)
-        again = recompute(whole, building)
-    count = len(whole.paths)
+        again = recompute(complete_trace, building)
+    count = len(complete_trace.paths)
     for part in (traced, again):
         assert (part.lost, len(part.paths)) == (2, count - 2)
         assert np.isfinite(part.paths.gain).all()
@@ -234,7 +234,7 @@ def test_trace_without_any_gain_is_refused(building, monkeypatch):
 def test_differentiable_paths_without_a_gain_are_left_out_and_counted(building, faint, monkeypatch, caplog):
     options = TracedOptions(KINDS["specular"], faint=faint)
     of_near = building, [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]], receiver(ENDS[0]), options
-    whole, evaluate = TracedField(*of_near), traced_field_module.evaluate_paths
+    complete_field, evaluate = TracedField(*of_near), traced_field_module.evaluate_paths
 
     def broken(chains, *more):
         """No number for the paths of the first transmitter whose last interaction is a reflection."""
@@ -242,15 +242,19 @@ def test_differentiable_paths_without_a_gain_are_left_out_and_counted(building, 
         lost = chains.levels[-1].reflects & (chains.source_m[0] == 1) & (chains.exists > 0)
         return (dr.select(lost, np.nan, real), imaginary), *other
 
-    reflected = whole.chains.levels[-1].reflects.numpy() & (whole.chains.source_m[0].numpy() == 1) & whole.exists
-    assert 0 < reflected.sum() < whole.exists.sum()
+    reflected = (
+        complete_field.chains.levels[-1].reflects.numpy()
+        & (complete_field.chains.source_m[0].numpy() == 1)
+        & complete_field.exists
+    )
+    assert 0 < reflected.sum() < complete_field.exists.sum()
     monkeypatch.setattr(traced_field_module, "evaluate_paths", broken)
     with caplog.at_level(logging.WARNING):
         traced = TracedField(*of_near)
     lost = int(re.search(r"(\d+) of \d+ paths are left out: their gains are not numbers", caplog.text)[1])
     assert lost >= reflected.sum()
     if not faint:
-        assert (lost, traced.exists.sum()) == (reflected.sum(), whole.exists.sum() - reflected.sum())
+        assert (lost, traced.exists.sum()) == (reflected.sum(), complete_field.exists.sum() - reflected.sum())
     assert np.isfinite([part.numpy() for part in traced({}).gain]).all()
 
 

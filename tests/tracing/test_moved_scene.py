@@ -25,8 +25,8 @@ def scenes(tmp_path_factory):
     """The room as stated, twice, as it is, and the parameters of its planes."""
     folder = tmp_path_factory.mktemp("moved")
     true, shift, tilt = true_scene(folder)
-    stated, copy, moved = (open_scene(place, CARRIER_HZ) for place in (folder / "base", folder / "base", true))
-    return stated, copy, moved, {SHIFT: shift.astype(np.float32), TILT: tilt.astype(np.float32)}
+    base_scene, copy, moved = (open_scene(place, CARRIER_HZ) for place in (folder / "base", folder / "base", true))
+    return base_scene, copy, moved, {SHIFT: shift.astype(np.float32), TILT: tilt.astype(np.float32)}
 
 
 def traced(prepared):
@@ -48,26 +48,26 @@ def shared(one, other):
 
 
 def test_paths_are_those_of_the_scene_with_its_planes_moved(scenes):
-    stated, copy, moved, planes = scenes
-    before = Prepared(stated)
-    found = traced(moved_search(copy, before.surfaces, planes).prepared)
-    assert shared(traced(Prepared(moved)), found) > 1 - AT_EDGES
-    assert shared(traced(before), found) < 0.5
+    base_scene, copy, moved, planes = scenes
+    before = Prepared(base_scene)
+    moved_paths = traced(moved_search(copy, before.surfaces, planes).prepared)
+    assert shared(traced(Prepared(moved)), moved_paths) > 1 - AT_EDGES
+    assert shared(traced(before), moved_paths) < 0.5
 
 
 def test_a_surface_that_is_absent_is_not_met(scenes):
-    stated, copy, _, planes = scenes
-    surfaces = Prepared(stated).surfaces
+    base_scene, copy, _, planes = scenes
+    surfaces = Prepared(base_scene).surfaces
     board = surfaces.names.index("board")
-    slab = slabs_of_faces(stated, surfaces, "surface")[1][surfaces.first_face[board]]
+    slab = slabs_of_faces(base_scene, surfaces, "surface")[1][surfaces.first_face[board]]
     for absent, met in (((), True), ((slab,), False)):
         paths = traced(moved_search(copy, surfaces, planes, absent).prepared).paths
         assert (paths.objects == board).any() == met
 
 
 def test_a_scene_is_moved_from_where_it_was_stated_and_back(scenes):
-    stated, copy, _, planes = scenes
-    before = Prepared(stated)
+    base_scene, copy, _, planes = scenes
+    before = Prepared(base_scene)
     moved_search(copy, before.surfaces, planes, (0,))
     assert shared(traced(before), traced(moved_search(copy, before.surfaces, {}).prepared)) == 1
 

@@ -76,12 +76,12 @@ def assert_same_paths(paths, expected):
 def test_paths_at_moved_planes_are_those_of_a_moved_mesh(tmp_path, shift_m, tilted):
     """Lengths and gains of reflections at a shifted and tilted ceiling, from a mesh of it and from parameters."""
     options, array = TracedOptions(replace(OPTIONS, depth=1)), receiver((30, 20, 10))
-    stated = TracedField(room(tmp_path / "stated", CEILING), transmitters(4), array, options)
+    stated_field = TracedField(room(tmp_path / "stated", CEILING), transmitters(4), array, options)
     moved = TracedField(room(tmp_path / "moved", ceiling(shift_m, tilted)), transmitters(4), array, options)
-    paths = strongest(stated, tensors(moved_values(stated.scene, shift_m, tilted)))
+    paths = strongest(stated_field, tensors(moved_values(stated_field.scene, shift_m, tilted)))
     assert len(paths[0]) == 8
     assert_same_paths(paths, strongest(moved, {}))
-    assert np.abs(paths[0] - strongest(stated, {})[0]).max() > 0.005
+    assert np.abs(paths[0] - strongest(stated_field, {})[0]).max() > 0.005
 
 
 def test_zero_parameters_leave_paths_unchanged(box):
@@ -236,16 +236,19 @@ def test_plain_sionna_rt_opens_a_corrected_scene_below_the_range_of_its_material
     plain = rt.load_scene(str(tmp_path / "corrected" / "scene.xml"), merge_shapes=False)
     plain.frequency = FREQUENCY_HZ  # Sionna RT knows concrete from 1 GHz
     for name, thing in plain.objects.items():
-        stated = box.objects[name].radio_material
+        material = box.objects[name].radio_material
         for quantity in ("relative_permittivity", "conductivity", "thickness"):
-            values = (float(np.ravel(getattr(one, quantity))[0]) for one in (thing.radio_material, stated))
+            values = (
+                float(np.ravel(getattr(radio_material, quantity))[0])
+                for radio_material in (thing.radio_material, material)
+            )
             assert next(values) == pytest.approx(next(values), rel=1e-4), (name, quantity)
 
 
 def test_corrected_scene_has_the_fitted_constants_of_named_materials(box, tmp_path):
     """Training has one number for each quantity of a material, in an array of one."""
     slabs, name = read_materials(box), next(iter(box.objects.values())).radio_material.name
-    stated = slabs.permittivity[slabs.names.index(name)]
-    raised = {f"material.{name}.permittivity": np.log([stated + 1.0])}  # permittivity 1 + exp(x)
+    permittivity = slabs.permittivity[slabs.names.index(name)]
+    raised = {f"material.{name}.permittivity": np.log([permittivity + 1.0])}  # permittivity 1 + exp(x)
     again = open_scene(write_corrected_scene(tmp_path / "corrected", box, raised), FREQUENCY_HZ)
-    assert np.isclose(read_materials(again).permittivity, stated + 2.0, rtol=1e-5).any()
+    assert np.isclose(read_materials(again).permittivity, permittivity + 2.0, rtol=1e-5).any()

@@ -79,8 +79,8 @@ def cache(tmp_path, monkeypatch):
 
 
 def powers(scene, positions=POSITIONS, **changed):
-    given = {"receivers": [receiver(CENTRE)], "options": OPTIONS, "tx_antenna": Antenna(), **changed}
-    return power_map.traced_powers(Prepared(scene), positions, **given)
+    arguments = {"receivers": [receiver(CENTRE)], "options": OPTIONS, "tx_antenna": Antenna(), **changed}
+    return power_map.traced_powers(Prepared(scene), positions, **arguments)
 
 
 def test_kept_powers_are_those_traced(shoebox, cache, monkeypatch):

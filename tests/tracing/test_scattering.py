@@ -279,8 +279,8 @@ def test_check_names_constants_that_the_name_overrules(tmp_path):
 
 @pytest.mark.parametrize("kind", ["radio-material", "itu-radio-material", "diffuse"])
 def test_repaired_scene_keeps_what_is_stated(tmp_path, kind):
-    own = {"type": "brick"} if kind.startswith("itu") else {}
-    file = plane(tmp_path / "stated", "mat-itu_brick", kind, **STATED, **own)
+    itu_type = {"type": "brick"} if kind.startswith("itu") else {}
+    file = plane(tmp_path / "stated", "mat-itu_brick", kind, **STATED, **itu_type)
     repair_scene(file, tmp_path / "out")
     material = open_scene(tmp_path / "out", FREQUENCY_HZ).objects["plane"].radio_material
     assert scattering_of(material) == STATED

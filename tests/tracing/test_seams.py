@@ -246,15 +246,15 @@ def test_paths_at_junctions_are_those_of_the_other_direction(tmp_path, name):
     parts, a, b, least = JUNCTIONS[name]
     scene = room(tmp_path, parts)
     options = TraceOptions(depth=3, reflections=1, transmission=True)
-    there, back = (trace_paths(scene, [x], receiver(y), options).paths for x, y in ((a, b), (b, a)))
-    assert len(there) == len(back) >= least
-    for unit in (there.departure, there.arrival):
+    forward, back = (trace_paths(scene, [x], receiver(y), options).paths for x, y in ((a, b), (b, a)))
+    assert len(forward) == len(back) >= least
+    for unit in (forward.departure, forward.arrival):
         np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1, atol=EXACT_M)
-    passed, passed_back = (np.sort((paths.interactions == TRANSMISSION).sum(axis=1)) for paths in (there, back))
+    passed, passed_back = (np.sort((paths.interactions == TRANSMISSION).sum(axis=1)) for paths in (forward, back))
     np.testing.assert_array_equal(passed, passed_back)
     if "cross" in name:
         assert passed.tolist() == [2]
-    assert power_db(there) == pytest.approx(power_db(back), abs=SLOPE_DB)
+    assert power_db(forward) == pytest.approx(power_db(back), abs=SLOPE_DB)
 
 
 @pytest.mark.parametrize(

@@ -159,10 +159,10 @@ def test_fields_are_those_of_a_search_for_each_carrier(faint, middle, searches):
     """Positions, headings, faint paths left out and lengths; the search is of each distinct position, once."""
     options, (tx, heading, carriers) = TracedOptions(FIELD_OPTIONS, pattern_degree=1, faint=faint), rows()
     pattern = {"pattern.transmitter": Tensor64(np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.3]]))}
-    found = traced_fields(tx, receiver(), options, Prepared(middle), heading, carriers)
+    fields = traced_fields(tx, receiver(), options, Prepared(middle), heading, carriers)
     assert searches == [7]
-    assert [field.frequency_hz for field in found] == list(CARRIERS_HZ)
-    for field, hz in zip(found, CARRIERS_HZ, strict=True):
+    assert [field.frequency_hz for field in fields] == list(CARRIERS_HZ)
+    for field, hz in zip(fields, CARRIERS_HZ, strict=True):
         at = carriers == hz
         alone = TracedField(middle, tx[at], receiver(), options, heading[at], frequency_hz=hz)
         np.testing.assert_array_equal(field.exists, alone.exists)
@@ -181,9 +181,9 @@ def test_fields_are_those_of_scenes_at_each_carrier(box_xml, middle):
 def test_moved_receivers_are_searched_as_by_refresh(middle, searches):
     """Moved by 4 cm, more than a quarter of a wavelength at two carriers: one search from there and one as stated."""
     (tx, _, carriers), moved = rows(), {"receiver.array.position": Tensor64([0.0, 0.04, 0.0])}
-    found = traced_fields(tx, receiver(), FIELD, Prepared(middle), None, carriers, parameters=moved)
+    fields = traced_fields(tx, receiver(), FIELD, Prepared(middle), None, carriers, parameters=moved)
     assert len(searches) == 2
-    for field, hz in zip(found, CARRIERS_HZ, strict=True):
+    for field, hz in zip(fields, CARRIERS_HZ, strict=True):
         alone = TracedField(middle, tx[carriers == hz], receiver(), FIELD, frequency_hz=hz)
         assert alone.refresh(moved) == (hz != LOW_HZ)
         np.testing.assert_array_equal(field.searched_at_m, alone.searched_at_m)

@@ -150,17 +150,19 @@ def test_calibration_learns_a_patch_that_no_surface_has(tmp_path):
     patched = {**WALLS, "ceiling": ("itu_metal", sheet(2, HEIGHT, (0.0, middle), (0.0, WIDTH))), "board": half}
     rng = np.random.default_rng(0)
     tx = np.column_stack([rng.uniform(0.5, 5.5, 120), rng.uniform(0.5, 4.5, 120), rng.uniform(0.8, 1.2, 120)])
-    one, hz = (Receiver("rx", np.array([3.0, 2.4, 0.5]), upright),), FREQUENCY_HZ * np.array([1, 1.02, 1.05])
+    stations, hz = (Receiver("rx", np.array([3.0, 2.4, 0.5]), upright),), FREQUENCY_HZ * np.array([1, 1.02, 1.05])
     options = TraceOptions(depth=1, rays=4096)
-    channel = RayTracer(write_xml(tmp_path / "true", patched), Instrument("csi", one, hz), options)(tx)[0]
+    channel = RayTracer(write_xml(tmp_path / "true", patched), Instrument("csi", stations, hz), options)(tx)[0]
     official = np.arange(90), np.arange(90, 120)
-    record = Record("room", "csi", tx, one, channel[None].astype(np.complex64), official=official, frequencies_hz=hz)
+    record = Record(
+        "room", "csi", tx, stations, channel[None].astype(np.complex64), official=official, frequencies_hz=hz
+    )
     scene = write_xml(tmp_path / "stated", {**WALLS, **CEILING})
-    found = {}
+    scores = {}
     for parts in ("gain,materials", "gain,materials,surface"):
         settings = [f"calibration={parts}", "depth=1", "rays=4096", "transmission=false", "steps=300"]
         run = wrf_mi.train(record, "ray-tracing", out=tmp_path / parts, scene=scene, settings=settings)
         report = run.predict(tx[90:], 0).mean
-        found[parts] = float(np.median(record.task.score(report, record.observation[0, 90:])))
+        scores[parts] = float(np.median(record.task.score(report, record.observation[0, 90:])))
         np.testing.assert_allclose(wrf_mi.open_run(run.folder, record).predict(tx[90:], 0).mean, report, rtol=1e-6)
-    assert found["gain,materials,surface"] > found["gain,materials"] + 3
+    assert scores["gain,materials,surface"] > scores["gain,materials"] + 3

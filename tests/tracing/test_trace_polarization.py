@@ -102,8 +102,8 @@ def test_cross_polarised_data_warn_and_name_the_option(shoebox_xml, turned_folde
     assert "--rx-polarization" not in caplog.text
     # An isotropic antenna's H is along the azimuth's unit vector: vertical at the boresight alone.
     assert max(wrong + 0.1, 0.85) < right < 0.99
-    stated = yaml.safe_load((tmp_path / "right" / "config.yaml").read_text())["antennas"]
-    assert (stated["rx_frame"], stated["rx_polarization"]) == ("array", "H")
+    antennas = yaml.safe_load((tmp_path / "right" / "config.yaml").read_text())["antennas"]
+    assert (antennas["rx_frame"], antennas["rx_polarization"]) == ("array", "H")
     assert load_trace(tmp_path / "right" / "paths.npz").receivers[0].antenna == Antenna("iso", "H", "array")
     command.done(["evaluate", tmp_path / "right"])
     assert median(tmp_path / "right") > 0.85
@@ -116,9 +116,9 @@ def test_only_cross_polarised_receivers_are_found(polar):
     tx = places()
     good, bad = array(0, Antenna()), replace(array(0, Antenna(polarization="H")), name="gateway2")
     traced = trace_paths(polar, tx, [good, bad], TraceOptions(depth=0))
-    found = cross_polarized(traced, polar)
-    assert list(found) == ["gateway2"]
-    assert found["gateway2"] > GAIN_DB
+    crossed = cross_polarized(traced, polar)
+    assert list(crossed) == ["gateway2"]
+    assert crossed["gateway2"] > GAIN_DB
 
 
 def test_a_few_stated_receivers_tell_the_polarisation_of_a_building(polar, caplog):
@@ -158,17 +158,19 @@ def test_run_predicts_with_its_antennas(shoebox_xml, turned_folder, tmp_path):
     """A directional pattern needs a frame."""
 
     def trained(**antennas):
-        stated = AntennaOptions(rx_pattern="tr38901", **antennas)
+        options = AntennaOptions(rx_pattern="tr38901", **antennas)
         run = tmp_path / "run"
-        return train(turned_folder, "ray-tracing", out=run, scene=shoebox_xml, settings=OPTIONS, antennas=stated).folder
+        return train(
+            turned_folder, "ray-tracing", out=run, scene=shoebox_xml, settings=OPTIONS, antennas=options
+        ).folder
 
     with pytest.raises(InputError, match="state frame array"):
         trained()
     assert not (tmp_path / "run").exists()
     out = trained(rx_frame="array", rx_polarization="H", tx_pattern="dipole")
     with np.load(out / "predictions.npz") as stored:
-        found = open_run(out).predict(places()[stored["row"]]).mean
-        np.testing.assert_allclose(found, stored["prediction"], atol=1e-4)
+        predicted = open_run(out).predict(places()[stored["row"]]).mean
+        np.testing.assert_allclose(predicted, stored["prediction"], atol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -185,6 +187,6 @@ def test_joint_training_warns_of_crossed_polarisation(polar, turned_folder, capl
     rows = np.arange(4)
     config = with_settings(TrainConfig(), ["model=wrf-gs+", "traced.depth=1", "traced.rays=4096"])
     for options, warned in ((AntennaOptions(), False), (AntennaOptions(rx_frame="array"), True)):
-        stated = load(turned_folder).with_antennas(options)
-        Trainer(stated, Split("all", 0, rows, rows[:0], rows[:0]), config, scene=polar)
+        polarized = load(turned_folder).with_antennas(options)
+        Trainer(polarized, Split("all", 0, rows, rows[:0], rows[:0]), config, scene=polar)
         assert (WARNING in caplog.text) is warned

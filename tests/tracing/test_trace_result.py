@@ -60,31 +60,31 @@ def test_array_of_an_earlier_version_is_not_read(traced, tmp_path):
 def test_settings_of_every_model_with_a_scene_state_the_same_search():
     """One name and one meaning of depth, reflections, transmission and rays."""
     for kind, transmission in product((TracedConfig, CorrectionOptions, PathSettings, TracingSettings), (True, False)):
-        stated: dict[str, Any] = {"depth": 2, "reflections": 1, "transmission": transmission, "rays": 64}
-        assert kind(**stated).options == TraceOptions(**stated), kind
+        search_options: dict[str, Any] = {"depth": 2, "reflections": 1, "transmission": transmission, "rays": 64}
+        assert kind(**search_options).options == TraceOptions(**search_options), kind
 
 
 def test_former_names_of_depth_and_reflections_are_read():
     """Traces and runs of earlier versions state them, and so do scripts."""
-    stated = {"max_depth": 6, "max_reflections": 2, "transmission": True}
-    as_text = with_settings(TraceOptions(), [f"{name}={value}" for name, value in stated.items()])
+    former = {"max_depth": 6, "max_reflections": 2, "transmission": True}
+    as_text = with_settings(TraceOptions(), [f"{name}={value}" for name, value in former.items()])
     expected = TraceOptions(depth=6, reflections=2, transmission=True)
-    assert settings_from(TraceOptions, stated, "paths.npz") == as_text == expected
+    assert settings_from(TraceOptions, former, "paths.npz") == as_text == expected
 
 
 def test_selected_transmitters_have_the_paths_of_their_own_trace(traced, scene):
     """In the order asked for, repeatedly, at all receivers, of one carrier or several."""
     which = np.array([3, 1, 3])
-    found = replace(traced, carriers_hz=np.arange(5.0)).of_transmitters(which)
+    selected = replace(traced, carriers_hz=np.arange(5.0)).of_transmitters(which)
     expected = trace_paths(scene, inside(5)[which], traced.receivers, OPTIONS)
     for name in ("tx", "rx", "interactions", "objects", "n_tx", "n_rx"):
-        np.testing.assert_array_equal(getattr(found.paths, name), getattr(expected.paths, name))
-    np.testing.assert_array_equal(found.primitives, expected.primitives)
-    np.testing.assert_array_equal(found.tx_pos_m, inside(5)[which])
-    np.testing.assert_array_equal(found.carriers_hz, which)
+        np.testing.assert_array_equal(getattr(selected.paths, name), getattr(expected.paths, name))
+    np.testing.assert_array_equal(selected.primitives, expected.primitives)
+    np.testing.assert_array_equal(selected.tx_pos_m, inside(5)[which])
+    np.testing.assert_array_equal(selected.carriers_hz, which)
     assert not len(traced.of_transmitters(which[:0]).paths)
-    close(found.paths.gain, expected.paths.gain)
-    close(found.paths.length_m, expected.paths.length_m)
+    close(selected.paths.gain, expected.paths.gain)
+    close(selected.paths.length_m, expected.paths.length_m)
 
 
 def test_wrong_files_are_refused(traced, tmp_path):
@@ -199,7 +199,7 @@ def paths_of(surfaces, source, target, depth, reflections, passes):
         if len(vertices) != len(planes) + 1:
             continue
         vertices.insert(0, source)
-        found, points = list[tuple[int, int]](), [source]
+        interactions, points = list[tuple[int, int]](), [source]
         for leg, (start, end) in enumerate(pairwise(vertices)):
             hits = met(surfaces, start, end)
             length = float(np.linalg.norm(end - start))
@@ -209,14 +209,14 @@ def paths_of(surfaces, source, target, depth, reflections, passes):
             if reflecting and hits.pop(planes[leg], None) is None:
                 break
             between = sorted((at, plane) for plane, at in hits.items() if at < length - AT_M)
-            found += [(TRANSMISSION, plane) for _, plane in between]
+            interactions += [(TRANSMISSION, plane) for _, plane in between]
             points += [start + (end - start) * at / length for at, _ in between] + [end]
             if reflecting:
-                found.append((SPECULAR, planes[leg]))
+                interactions.append((SPECULAR, planes[leg]))
         else:
             apart = np.linalg.norm(np.diff(points, axis=0), axis=1).min() > SHORT_M
-            kinds, where = tuple(kind for kind, _ in found), tuple(plane for _, plane in found)
-            if apart and len(found) <= depth and (passes or TRANSMISSION not in kinds):
+            kinds, where = tuple(kind for kind, _ in interactions), tuple(plane for _, plane in interactions)
+            if apart and len(interactions) <= depth and (passes or TRANSMISSION not in kinds):
                 yield kinds, where
 
 
@@ -228,18 +228,18 @@ def test_paths_are_those_of_all_sequences_of_planes(sheets, seed, passes):
     options = TraceOptions(transmission=passes, depth=5, reflections=2, rays=1 << 16)
     prepared = Prepared(sheets)
     traced = trace_paths(sheets, tx, rx, options, prepared=prepared, gains=False)
-    surfaces, paths, found = prepared.surfaces, traced.paths, set[tuple[Any, ...]]()
+    surfaces, paths, sequences = prepared.surfaces, traced.paths, set[tuple[Any, ...]]()
     plane = surfaces.plane[surfaces.first_face[:-1]]  # of each sheet
     for number, kinds in enumerate(paths.interactions):
         count = np.count_nonzero(kinds)
         ends = int(paths.tx[number]), int(paths.rx[number])
-        found.add((*ends, tuple(kinds[:count].tolist()), tuple(plane[paths.objects[number, :count]].tolist())))
+        sequences.add((*ends, tuple(kinds[:count].tolist()), tuple(plane[paths.objects[number, :count]].tolist())))
     expected = {
         (i, k, *path)
         for i, k in product(range(len(tx)), range(len(rx)))
         for path in paths_of(surfaces, tx[i], rx[k].position_m, 5, 2, passes)
     }
-    assert found == expected
-    assert len(found) == len(paths) > 25
+    assert sequences == expected
+    assert len(sequences) == len(paths) > 25
     behind = paths.objects[:, 1] == paths.object_names.index("behind")
     assert (behind & (paths.interactions[:, :3] == [4, 1, 4]).all(axis=1)).any() == passes

@@ -39,8 +39,8 @@ def refused(words, source, frequency_hz=FREQUENCY_HZ, **how):
 
 
 def test_name_opens_an_embedded_scene():
-    for given, thickness_m in ((None, 0.2), ({"itu_brick": 0.05}, 0.05)):
-        scene = open_scene("laboratory", 920e6, given)
+    for thickness_option, thickness_m in ((None, 0.2), ({"itu_brick": 0.05}, 0.05)):
+        scene = open_scene("laboratory", 920e6, thickness_option)
         assert "wall_north" in scene.objects
         assert float(scene.radio_materials["itu_brick"].thickness[0]) == pytest.approx(thickness_m)
 
@@ -169,8 +169,8 @@ def test_number_of_rays_for_an_antenna_behind_its_wall_converges_before_it(tmp_p
     tx, options = np.array([[1.0, 2, 1], [3.0, 4, 2]]), TraceOptions(depth=2, rays="auto")
     carrier_hz = np.array([FREQUENCY_HZ])
     before, behind = (Instrument("power", (receiver([x, 2.5, 1.3]),), carrier_hz) for x in (1e-4, -2e-3))
-    wanted, found = (RayTracer(tmp_path / "scene.xml", side, options).rays(tx) for side in (before, behind))
-    assert found == wanted
+    wanted, rays_behind = (RayTracer(tmp_path / "scene.xml", side, options).rays(tx) for side in (before, behind))
+    assert rays_behind == wanted
 
 
 def test_antennas_outside_the_scene_are_named(tmp_path, caplog):
@@ -208,8 +208,8 @@ def test_solid_is_named_by_its_mesh_file_where_its_id_is_another(tmp_path):
         with pytest.raises(InputError, match=f"^transmitter 1 at .* is inside the solid {called}; move one of them"):
             trace_paths(scene, [[2.2, 2.3, 1.0]], receiver([1, 1, 2]))
 
-    for stated, called in (('id="mesh-elm__3"', "'elm__3'"), ("", r"'no-name-\d+'")):
-        xml.write_text(text.replace('id="column"', stated))
+    for id_attribute, called in (('id="mesh-elm__3"', "'elm__3'"), ("", r"'no-name-\d+'")):
+        xml.write_text(text.replace('id="column"', id_attribute))
         refused_inside(open_scene(xml, FREQUENCY_HZ), called + r" \(column.ply\)")
     column.export(tmp_path / "pillar.stl")
     refused_inside(open_scene(tmp_path / "pillar.stl", FREQUENCY_HZ, material="wood"), "'pillar'")
@@ -235,13 +235,18 @@ def test_coplanar_faces_share_a_plane():
 
 
 def test_fine_and_coarse_walls_give_the_same_paths(shoebox_xml, tmp_path):
-    parts, found = {name: (material, mesh.subdivide().subdivide()) for name, (material, mesh) in SHOEBOX.items()}, []
+    parts, traced_paths = (
+        {name: (material, mesh.subdivide().subdivide()) for name, (material, mesh) in SHOEBOX.items()},
+        [],
+    )
     for xml in (shoebox_xml, write_xml(tmp_path, parts)):
         scene = open_scene(xml, FREQUENCY_HZ)
         assert len(scene_surfaces(scene).normal) == 6
-        found.append(trace_paths(scene, [[1.3, 2, 1]], receiver([4.4, 3.1, 1.7]), TraceOptions()).paths)
-    np.testing.assert_allclose(found[1].length_m, found[0].length_m, atol=1e-9)
-    np.testing.assert_allclose(found[1].gain, found[0].gain, atol=1e-5 * np.abs(found[0].gain).max())
+        traced_paths.append(trace_paths(scene, [[1.3, 2, 1]], receiver([4.4, 3.1, 1.7]), TraceOptions()).paths)
+    np.testing.assert_allclose(traced_paths[1].length_m, traced_paths[0].length_m, atol=1e-9)
+    np.testing.assert_allclose(
+        traced_paths[1].gain, traced_paths[0].gain, atol=1e-5 * np.abs(traced_paths[0].gain).max()
+    )
 
 
 def test_planes_are_found_once_until_an_object_moves(shoebox_xml):
@@ -250,11 +255,13 @@ def test_planes_are_found_once_until_an_object_moves(shoebox_xml):
     assert scene_surfaces(scene) is before
     name = before.names[0]
     scene.objects[name].position = np.asarray(scene.objects[name].position).ravel() + np.array([0, 0, 0.5])
-    after, own = scene_surfaces(scene), before.object_of(np.arange(len(before.triangles))) == 0
+    after, of_object = scene_surfaces(scene), before.object_of(np.arange(len(before.triangles))) == 0
     np.testing.assert_allclose(
-        after.triangles[own] - before.triangles[own], np.broadcast_to([0, 0, 0.5], (own.sum(), 3, 3)), atol=1e-6
+        after.triangles[of_object] - before.triangles[of_object],
+        np.broadcast_to([0, 0, 0.5], (of_object.sum(), 3, 3)),
+        atol=1e-6,
     )
-    np.testing.assert_array_equal(after.triangles[~own], before.triangles[~own])
+    np.testing.assert_array_equal(after.triangles[~of_object], before.triangles[~of_object])
 
 
 def test_planes_near_points_are_those_within_a_margin(monkeypatch):
@@ -273,11 +280,11 @@ def test_planes_near_points_are_those_within_a_margin(monkeypatch):
     away = np.einsum("nc,qc->nq", points_m, surfaces.normal) - surfaces.offset
     along = np.einsum("nc,qac->nqa", points_m, surfaces.axes)
     inside = (np.abs(away) < 0.01) & ((along > surfaces.low) & (along < surfaces.high)).all(axis=2)
-    found = np.zeros_like(inside)
-    found[tuple(np.array(sorted(pairs[0])).T)] = True
+    near = np.zeros_like(inside)
+    near[tuple(np.array(sorted(pairs[0])).T)] = True
     assert inside.any(axis=1).mean() > 0.5
-    assert (found | ~inside).all()
-    assert (np.abs(away[found]) < 0.01).all()
+    assert (near | ~inside).all()
+    assert (np.abs(away[near]) < 0.01).all()
 
 
 BRICK = '<bsdf type="diffuse" id="mat-itu_brick"/>'
@@ -326,12 +333,12 @@ def test_absorbers_stay_in_exported_and_edited_scenes(tmp_path):
 
 def test_correction_leaves_absorbers_alone(tmp_path):
     true = stated_scene(tmp_path / "true", {**TRUE_MATERIALS, "wall_02": ABSORBER})
-    stated = stated_scene(tmp_path / "stated", {"wall_02": ABSORBER})
+    uncorrected_scene = stated_scene(tmp_path / "stated", {"wall_02": ABSORBER})
     csi = channels(true, 70)
     power_db = 10 * np.log10(np.square(np.abs(csi.observation)).mean(axis=2)).astype(np.float32)
     record = replace(csi, task="rssi", observation=power_db, frequencies_hz=csi.frequencies_hz[:1])
     options = replace(default_options(record), rows=40, rays=4096, depth=2)
-    correction = correct_scene(stated, record, make_splits(record, "official")[0], options)
+    correction = correct_scene(uncorrected_scene, record, make_splits(record, "official")[0], options)
     assert correction.kept == "materials+gain"
     fitted = {name.partition("/")[0] for name in correction.misfit.sides[0].slabs.names}
     assert fitted == set(TRUE_MATERIALS) - {"wall_02"}

@@ -162,16 +162,16 @@ def test_paths_are_reciprocal(divided, transmission):
 
 def test_paths_of_a_seed_do_not_depend_on_chunks(divided, monkeypatch):
     ends, options = (inside(6, 5), receivers(2, 6)), {"transmission": True, "depth": 2, "rays": 1 << 12}
-    whole = traced(divided, *ends, **options)
-    equal(traced(divided, *ends, **options), whole)
+    all_paths = traced(divided, *ends, **options)
+    equal(traced(divided, *ends, **options), all_paths)
     monkeypatch.setattr(solve_module, "PAIRS_TOGETHER", 4)
     monkeypatch.setattr(images_module, "CANDIDATES_PER_CHUNK", 37)
     monkeypatch.setattr(search_module, "PAIRS_PER_CHUNK", 100)
     monkeypatch.setattr(search_module, "RAYS_PER_CHUNK", 1000)
     monkeypatch.setattr("wrf_mi.tracing.sionna.path_solver.PATHS_PER_CHUNK", 50)
     parts = traced(divided, *ends, **options)
-    np.testing.assert_allclose(parts.gain, whole.gain, rtol=1e-5)  # other widths of vector instructions
-    equal(replace(parts, gain=whole.gain), whole)
+    np.testing.assert_allclose(parts.gain, all_paths.gain, rtol=1e-5)  # other widths of vector instructions
+    equal(replace(parts, gain=all_paths.gain), all_paths)
 
 
 def test_kinds_that_are_off_are_not_searched(shoebox, empty, monkeypatch):
@@ -226,10 +226,10 @@ def test_distinct_chains_are_those_of_numpy(planes, reflections):
 
 def test_number_of_rays_converges(shoebox):
     ends = inside(5), receiver([1.0, 1.0, 1.0])
-    found = trace_paths(shoebox, *ends, replace(UPRIGHT, rays="auto", depth=2))
-    assert found.rays == solve_module.FIRST_RAYS  # a shoebox is easy
-    assert found.options.rays == "auto"
-    equal(found.paths, traced(shoebox, *ends, rays=found.rays, depth=2))
+    trace_result = trace_paths(shoebox, *ends, replace(UPRIGHT, rays="auto", depth=2))
+    assert trace_result.rays == solve_module.FIRST_RAYS  # a shoebox is easy
+    assert trace_result.options.rays == "auto"
+    equal(trace_result.paths, traced(shoebox, *ends, rays=trace_result.rays, depth=2))
 
 
 def all_found(paths, length, gain, tolerance):
@@ -253,12 +253,12 @@ def test_diffracted_paths_are_those_of_sionna_rt(divided):
     options = replace(UPRIGHT, diffraction=True, rays=30_000)
     with corrected():
         _, gain, length, _ = sionna_paths(divided, tx, rx, options)
-    found = trace_paths(divided, np.array([tx, [2.0, 2.0, 1.0]]), receiver(rx), options)
-    paths = found.paths.select(found.paths.tx == 0)
+    trace_result = trace_paths(divided, np.array([tx, [2.0, 2.0, 1.0]]), receiver(rx), options)
+    paths = trace_result.paths.select(trace_result.paths.tx == 0)
     assert (paths.interactions == 8).any(axis=1).sum() > 10
-    assert not found.from_receivers
+    assert not trace_result.from_receivers
     all_found(paths, length, gain, EDGE_OF_TWO)
-    np.testing.assert_allclose(recompute(found, divided).paths.gain, found.paths.gain, rtol=1e-6)
+    np.testing.assert_allclose(recompute(trace_result, divided).paths.gain, trace_result.paths.gain, rtol=1e-6)
     # The bent wave reaches where nothing else does.
     dark = trace_paths(divided, [[2.9, 1.0, 0.5]], receiver([3.1, 1.0, 0.5]), replace(options, depth=1)).paths
     assert (dark.interactions == 8).any()

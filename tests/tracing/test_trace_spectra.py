@@ -198,11 +198,11 @@ def test_laboratory_is_cached_and_reproducible(laboratory, monkeypatch, tmp_path
     np.testing.assert_array_equal(load_record("laboratory").observation, record.observation)
     assert load_record(folder).name == "laboratory"
     recipe = folder / "traced.yml"
-    kept = recipe.read_text()
-    recipe.write_text(kept.replace("depth: 3", "depth: 2"))
+    recipe_text = recipe.read_text()
+    recipe.write_text(recipe_text.replace("depth: 3", "depth: 2"))
     with pytest.raises(pytest.fail.Exception, match="traced anew"):
         laboratory_record(folder)
-    recipe.write_text(kept)
+    recipe.write_text(recipe_text)
 
 
 def test_embedded_scene_is_intact_and_rebuilt_alike(tmp_path):

@@ -80,8 +80,8 @@ def test_paths_are_those_of_sionna_rt(box, turn, rx, tx):
 
 def test_gains_for_other_materials_are_those_of_sionna_rt(box):
     """With the same values in its scene, which the traced field does not change."""
-    found = trace_paths(box, transmitters(3), receiver(), OPTIONS)
-    traced, concrete = field(box, 3, traced=found), box.radio_materials["itu_concrete"]
+    trace_result = trace_paths(box, transmitters(3), receiver(), OPTIONS)
+    traced, concrete = field(box, 3, traced=trace_result), box.radio_materials["itu_concrete"]
     assert traced.searches == 0
     before = float(concrete.relative_permittivity[0]), float(concrete.conductivity[0])
     constants = {"permittivity": np.log([2.2]), "conductivity": np.log([0.3])}
@@ -89,7 +89,7 @@ def test_gains_for_other_materials_are_those_of_sionna_rt(box):
     gain, _, _ = existing(traced, tensors(traced, **changes, **{"receiver.array.gain": [np.log(7.0), 0.4]}))
     try:
         concrete.relative_permittivity, concrete.conductivity = 3.2, 0.3
-        expected = recompute(found, box).paths.gain * 7 * np.exp(0.4j)
+        expected = recompute(trace_result, box).paths.gain * 7 * np.exp(0.4j)
     finally:
         concrete.relative_permittivity, concrete.conductivity = before
     np.testing.assert_allclose(gain, expected, atol=SINGLE * np.abs(expected).max())
@@ -98,11 +98,11 @@ def test_gains_for_other_materials_are_those_of_sionna_rt(box):
 def test_gains_at_another_carrier_are_those_of_sionna_rt(box_xml):
     """Conductivities follow the laws of ITU-R P.2040, with materials of names and of surfaces."""
     low, high = (open_scene(box_xml, hz, THICKNESS_M) for hz in (1.8e9, 3.5e9))
-    found = trace_paths(low, transmitters(3), receiver(), OPTIONS)
-    expected = recompute(found, high).paths.gain
-    assert np.abs(expected - found.paths.gain).max() > 0.1 * np.abs(expected).max()
+    trace_result = trace_paths(low, transmitters(3), receiver(), OPTIONS)
+    expected = recompute(trace_result, high).paths.gain
+    assert np.abs(expected - trace_result.paths.gain).max() > 0.1 * np.abs(expected).max()
     for options in (TracedOptions(OPTIONS), TracedOptions(OPTIONS, materials="surface", constants=QUANTITIES)):
-        traced = TracedField(low, transmitters(3), receiver(), options, traced=found, frequency_hz=3.5e9)
+        traced = TracedField(low, transmitters(3), receiver(), options, traced=trace_result, frequency_hz=3.5e9)
         gain, _, _ = existing(traced, tensors(traced))
         np.testing.assert_allclose(gain, expected, atol=SINGLE * np.abs(expected).max())
 
@@ -139,22 +139,22 @@ def test_slab_of_single_precision_is_that_of_double_down_to_grazing_incidence():
 @pytest.mark.gradcheck
 def test_derivatives_by_materials_are_those_of_sionna_rt(box):
     """Its field calculator in the differentiable mode, over the same paths."""
-    found = trace_paths(box, transmitters(3), receiver((0, 20, 0)), OPTIONS)
-    weight = np.random.default_rng(1).standard_normal((2, len(found.paths)))
+    trace_result = trace_paths(box, transmitters(3), receiver((0, 20, 0)), OPTIONS)
+    weight = np.random.default_rng(1).standard_normal((2, len(trace_result.paths)))
     concrete, surfaces = box.radio_materials["itu_concrete"], scene_surfaces(box)
     constants = [mi.Float(5.1), mi.Float(0.06)]
     before = concrete.relative_permittivity, concrete.conductivity
     dr.enable_grad(constants)
     try:
         concrete.relative_permittivity, concrete.conductivity = constants
-        buffer = to_buffer(found.legs(surfaces), surfaces)
-        gain = field_of(box, buffer, found.ends(), found.rays, loop_mode="evaluated")
+        buffer = to_buffer(trace_result.legs(surfaces), surfaces)
+        gain = field_of(box, buffer, trace_result.ends(), trace_result.rays, loop_mode="evaluated")
         dr.backward(dr.sum(gain[0] * mi.Float(weight[0]) + gain[1] * mi.Float(weight[1])))
         theirs = [float(dr.grad(constant)[0]) for constant in constants]
     finally:
         concrete.relative_permittivity, concrete.conductivity = before
 
-    traced = field(box, 3, receiver((0, 20, 0)), found)
+    traced = field(box, 3, receiver((0, 20, 0)), trace_result)
     names = [f"material.itu_concrete.{quantity}" for quantity in ("permittivity", "conductivity")]
     logs = dict(zip(names, (Tensor64(np.log([4.1])), Tensor64(np.log([0.06]))), strict=True))
     dr.enable_grad(logs)
@@ -167,12 +167,12 @@ def test_derivatives_by_materials_are_those_of_sionna_rt(box):
 
 def test_paths_follow_a_moved_receiver_until_searched_again(box):
     """Moved paths are those of a new search, as long as it finds the same ones."""
-    stated = receiver((10, 5, 0))
-    traced = field(box, 3, stated)
+    start = receiver((10, 5, 0))
+    traced = field(box, 3, start)
     assert traced.searches == 1
 
     def searched(shift_m):
-        return trace_paths(box, transmitters(3), replace(stated, position_m=stated.position_m + shift_m), OPTIONS).paths
+        return trace_paths(box, transmitters(3), replace(start, position_m=start.position_m + shift_m), OPTIONS).paths
 
     shift, turn = np.array([0.03, -0.02, 0.04]), np.array([0.02, -0.03, 0.3])
     moved = tensors(traced, **{"receiver.array.position": shift, "receiver.array.turn": turn})
@@ -197,9 +197,9 @@ def test_pattern_of_a_transmitter_turns_with_its_heading(box):
     changed, _, _ = existing(traced, tensors(traced, **{"pattern.transmitter": table}))
     reference = trace_paths(box, both, receiver(), OPTIONS).paths
     azimuth, (x, y, _) = heading[reference.tx], reference.departure.T
-    own = np.stack([np.cos(azimuth) * x + np.sin(azimuth) * y, np.cos(azimuth) * y - np.sin(azimuth) * x])
+    local = np.stack([np.cos(azimuth) * x + np.sin(azimuth) * y, np.cos(azimuth) * y - np.sin(azimuth) * x])
     # Real harmonics of degree 1, orders -1, 0, 1: -y, z, -x times sqrt(3 / 4 pi).
-    expected = np.exp(-np.sqrt(3 / (4 * np.pi)) * (0.2 * own[1] + 0.5 * own[0]))
+    expected = np.exp(-np.sqrt(3 / (4 * np.pi)) * (0.2 * local[1] + 0.5 * local[0]))
     strong = np.abs(plain) > 1e-9
     np.testing.assert_allclose((changed / np.where(strong, plain, 1))[strong], expected[strong], rtol=1e-6)
 
@@ -224,10 +224,10 @@ def test_pattern_factors_have_the_harmonics_of_scipy(degree):
 
 def test_batch_has_the_paths_of_its_rows(box):
     traced = field(box, 4)
-    everything, some = traced(tensors(traced)), traced(tensors(traced), mi.UInt32([3, 1, 3]))
-    assert (some.batch, some.each) == (3, everything.each)
+    everything, batch = traced(tensors(traced)), traced(tensors(traced), mi.UInt32([3, 1, 3]))
+    assert (batch.batch, batch.each) == (3, everything.each)
     length = everything.length_m.numpy().reshape(4, -1)
-    np.testing.assert_array_equal(some.length_m.numpy().reshape(3, -1), length[[3, 1, 3]])
+    np.testing.assert_array_equal(batch.length_m.numpy().reshape(3, -1), length[[3, 1, 3]])
 
 
 @given(share=st.floats(1e-4, 0.5), seed=st.integers(0, 99))
@@ -273,12 +273,12 @@ def test_transmitter_without_a_path_has_no_gain_and_finite_derivatives(tmp_path)
 def test_known_paths_of_antennas_behind_outer_walls_are_taken(box):
     """The tracer moves such antennas before the wall; lengths are those of the stated positions."""
     behind, array = np.array([[-0.003, 2.0, 1.0], [2.0, 2.0, 1.0]]), receiver(position=(4.2, 5.004, 0.4))
-    found = trace_paths(box, behind, array, OPTIONS)
-    assert (found.tx_pos_m != behind).any()
-    assert (found.receivers[0].position_m != array.position_m).any()
-    known = TracedField(box, behind, array, TracedOptions(OPTIONS), traced=found)
+    trace_result = trace_paths(box, behind, array, OPTIONS)
+    assert (trace_result.tx_pos_m != behind).any()
+    assert (trace_result.receivers[0].position_m != array.position_m).any()
+    reused = TracedField(box, behind, array, TracedOptions(OPTIONS), traced=trace_result)
     searched = TracedField(box, behind, array, TracedOptions(OPTIONS))
-    for ours, theirs in zip(existing(known, {}), existing(searched, {}), strict=True):
+    for ours, theirs in zip(existing(reused, {}), existing(searched, {}), strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 

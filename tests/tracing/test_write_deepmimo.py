@@ -30,9 +30,9 @@ def traced(divided_xml):
     """All kinds of path from five users to two base stations."""
     options = TraceOptions(diffraction=True, scattering=True, scattering_coefficient=0.3, depth=3, rays=1 << 9)
     stations = [receiver(p, f"roof{k}") for k, p in enumerate(inside(2, 2))]
-    found = trace_paths(open_scene(divided_xml, FREQUENCY_HZ, THICKNESS_M), inside(5), stations, options)
-    assert set(np.unique(found.paths.interactions)) == {0, 1, 2, 4, 8}
-    return found
+    trace_result = trace_paths(open_scene(divided_xml, FREQUENCY_HZ, THICKNESS_M), inside(5), stations, options)
+    assert set(np.unique(trace_result.paths.interactions)) == {0, 1, 2, 4, 8}
+    return trace_result
 
 
 @pytest.fixture(scope="module")
