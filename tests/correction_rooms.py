@@ -64,10 +64,10 @@ def channels(scene: Path, count: int, snr_db: float = np.inf, seed: int = 0) -> 
     official = np.arange(count - 10), np.arange(count - 10, count)
     record = Record("made-up", "csi", positions, (receiver,), empty, frequencies_hz=hz, official=official)
     tracer = RayTracer(scene, instrument_of(record), TraceOptions(transmission=True, depth=3))
-    found = tracer(positions)
-    noise = np.sqrt(np.square(np.abs(found)).mean() / 10 ** (snr_db / 10) / 2)
-    found = found + noise * (rng.normal(size=found.shape) + 1j * rng.normal(size=found.shape))
-    return replace(record, observation=found.astype(np.complex64))
+    observed = tracer(positions)
+    noise = np.sqrt(np.square(np.abs(observed)).mean() / 10 ** (snr_db / 10) / 2)
+    observed = observed + noise * (rng.normal(size=observed.shape) + 1j * rng.normal(size=observed.shape))
+    return replace(record, observation=observed.astype(np.complex64))
 
 
 def true_scene(folder: Path, seed: int = 0) -> tuple[Path, np.ndarray, np.ndarray]:

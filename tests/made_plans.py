@@ -51,9 +51,9 @@ def scan(walls_m, pose_m, beams=720, noise_m=0.01, seed=0):
     distance = (begin[..., 0] * along[..., 1] - begin[..., 1] * along[..., 0]) / safe
     part = (begin[..., 0] * ray[..., 1] - begin[..., 1] * ray[..., 0]) / safe
     met = np.where((distance > 1e-6) & (part >= 0) & (part <= 1) & np.isfinite(safe), distance, np.inf).min(axis=1)
-    seen = np.isfinite(met)
-    met = met[seen] + np.random.default_rng(seed).normal(0, noise_m, np.count_nonzero(seen))
-    return pose_m + met[:, None] * ray[seen, 0]
+    hit = np.isfinite(met)
+    met = met[hit] + np.random.default_rng(seed).normal(0, noise_m, np.count_nonzero(hit))
+    return pose_m + met[:, None] * ray[hit, 0]
 
 
 def scans(walls_m, poses_m=POSES_M, **more):
@@ -76,10 +76,10 @@ def grid_of(walls_m, poses_m=POSES_M, resolution_m=0.05, **more):
 
 def agreement(made_m, true_m, tolerance_m):
     """Share of the true walls near made ones, and of the made walls near true ones."""
-    made, true = (shapely.unary_union(shapely.linestrings(w)) for w in (made_m, true_m))
-    found = true.intersection(made.buffer(tolerance_m)).length / true.length
-    right = made.intersection(true.buffer(tolerance_m)).length / made.length
-    return found, right
+    made_lines, true = (shapely.unary_union(shapely.linestrings(w)) for w in (made_m, true_m))
+    recall = true.intersection(made_lines.buffer(tolerance_m)).length / true.length
+    right = made_lines.intersection(true.buffer(tolerance_m)).length / made_lines.length
+    return recall, right
 
 
 def distance(point_m, walls_m):

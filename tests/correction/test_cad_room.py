@@ -217,10 +217,10 @@ def test_commands_need_a_minute_and_two_gibibytes(large, tmp_path):
 @pytest.mark.parametrize("task", ["rssi", "csi"])
 def test_strengths_and_channels_correct_the_room(large, task):
     record = observed(large / "truth", task)
-    found = correct_scene(large / "room", record, make_splits(record, "official")[0])
-    assert len(found.misfit.sides[0].surfaces.triangles) > 100_000
-    assert len(found.misfit.sides[0].surfaces.normal) > 90_000
-    assert len(found.vector) < 5_000
+    correction = correct_scene(large / "room", record, make_splits(record, "official")[0])
+    assert len(correction.misfit.sides[0].surfaces.triangles) > 100_000
+    assert len(correction.misfit.sides[0].surfaces.normal) > 90_000
+    assert len(correction.vector) < 5_000
     # Three held-out strengths may not tell a change from chance; then the scene stays.
-    assert found.kept or task == "rssi"
-    assert np.isfinite(found.vector).all()
+    assert correction.kept or task == "rssi"
+    assert np.isfinite(correction.vector).all()

@@ -61,10 +61,10 @@ def corrected(truth, tmp_path_factory):
     """The lowest and the highest carrier correct the stated materials."""
     folder = tmp_path_factory.mktemp("corrected")
     record = strengths(truth[0], 300)
-    stated = stated_scene(folder / "stated")
-    found = correct_scene(stated, record, make_splits(record, "frequency:1")[0], OPTIONS)
-    write_page(found, folder / "corrected")
-    return found, record, folder
+    uncorrected_scene = stated_scene(folder / "stated")
+    correction = correct_scene(uncorrected_scene, record, make_splits(record, "frequency:1")[0], OPTIONS)
+    write_page(correction, folder / "corrected")
+    return correction, record, folder
 
 
 def test_residuals_are_those_of_each_carrier_alone(truth):
@@ -91,8 +91,10 @@ def test_antennas_of_transmitters_are_those_of_the_record(truth):
     vertical = Record("made-up", "rssi", record.tx_pos_m[rows], record.receivers, silent, frequencies_hz=hz)
     horizontal = replace(vertical, tx_antenna=Antenna("dipole", "H"))
     powers = RayTracer(scene, instrument_of(horizontal), TRACE)(vertical.tx_pos_m).astype(np.float32)
-    for stated, below in ((horizontal, True), (vertical, False)):
-        misfit = Misfit(replace(stated, observation=powers), rows, Prepared(open_scene(scene, CARRIER_HZ)), OPTIONS)
+    for antenna_record, below in ((horizontal, True), (vertical, False)):
+        misfit = Misfit(
+            replace(antenna_record, observation=powers), rows, Prepared(open_scene(scene, CARRIER_HZ)), OPTIONS
+        )
         assert (np.abs(misfit.residual(misfit.start)).max() < ROUNDING_DB) == below
 
 
@@ -121,16 +123,16 @@ def test_derivatives_by_exponents_are_those_of_finite_differences(truth):
 
 def test_a_carrier_without_rows_is_predicted_better(corrected):
     """Powers at 2.4 GHz, traced in the scene that rows at 1.2 and 5.8 GHz corrected."""
-    found, record, folder = corrected
-    assert found.kept == "materials+gain"
+    correction, record, folder = corrected
+    assert correction.kept == "materials+gain"
     test = make_splits(record, "frequency:1")[0].test
     instrument = instrument_of(replace(record, carriers_hz=None, frequencies_hz=np.array([CARRIERS_HZ[1]])))
-    stated, new = (
+    stated_std, new = (
         np.std(RayTracer(folder / name, instrument, TRACE)(record.tx_pos_m[test])[0] - record.observation[0, test])
         for name in ("stated", "corrected")
     )
     # Of some hundred rows; with seeds 0 to 4 of the positions it is 0.10 to 0.40.
-    assert new < 0.5 * stated
+    assert new < 0.5 * stated_std
 
 
 def test_the_folder_states_laws_of_conductivities(corrected):
@@ -182,7 +184,7 @@ def test_moments_are_those_of_von_mises_phases():
     rng = np.random.default_rng(0)
     concentration, row = np.array([0.3, 2.0, 11.0]), np.array([0, 0, 1])
     gain, wave = rng.normal(size=3) + 1j * rng.normal(size=3), np.exp(2j * np.pi * rng.random((3, 4)))
-    found = moments(gain, i1e(concentration) / i0e(concentration), wave, row, 2)
+    computed = moments(gain, i1e(concentration) / i0e(concentration), wave, row, 2)
     mean, covariance = np.zeros((2, 4), complex), np.zeros((2, 4, 4), complex)
     for path, kappa in enumerate(concentration):
         density = [
@@ -192,8 +194,8 @@ def test_moments_are_those_of_von_mises_phases():
         mean[row[path]] += first * gain[path] * wave[path]
         outer = np.abs(gain[path]) ** 2 * np.outer(wave[path], wave[path].conj())
         covariance[row[path]] += (1 - first**2) * outer
-    np.testing.assert_allclose(found.mean, mean, rtol=QUADRATURE)
-    np.testing.assert_allclose(found.covariance, covariance, rtol=QUADRATURE)
+    np.testing.assert_allclose(computed.mean, mean, rtol=QUADRATURE)
+    np.testing.assert_allclose(computed.covariance, covariance, rtol=QUADRATURE)
 
 
 @pytest.fixture(scope="module")
@@ -217,8 +219,8 @@ WITH_PHASES = CorrectionOptions(
 @pytest.mark.parametrize("certain", [False, True])
 def test_gradient_is_that_of_differences(room, certain):
     """Where reflections have no mean by the priors of planes, and where phases are almost certain."""
-    record, stated = room
-    misfit = Misfit(record, np.arange(40), Prepared(open_scene(stated, HZ)), WITH_PHASES)
+    record, uncorrected_scene = room
+    misfit = Misfit(record, np.arange(40), Prepared(open_scene(uncorrected_scene, HZ)), WITH_PHASES)
     fit = UncertainPhases(ScenePosterior(misfit, WITH_PHASES, lambda what, share: None))
     assert np.median(fit.resultant) < 0.01
     if certain:
@@ -238,22 +240,26 @@ def test_gradient_is_that_of_differences(room, certain):
 
 def test_materials_are_found_where_planes_are_not(room):
     """Logarithms of permittivities are off by less than half of what those of the rules are."""
-    record, stated = room
+    record, uncorrected_scene = room
     split = make_splits(record, "official")[0]
-    found = correct_scene(stated, record, split, WITH_PHASES)
-    assert found.kept == "materials+phases"
-    slabs = found.misfit.sides[0].slabs
-    fitted = slabs.fitted(found.misfit.named(found.vector)).permittivity
-    rules = slabs.fitted(found.misfit.named(found.misfit.start)).permittivity
-    known = {name.partition("/")[0]: place for place, name in enumerate(slabs.names)}
-    true = Prepared(open_scene(stated_scene(stated.parent / "named", TRUE_MATERIALS), HZ)).tables("surface").slabs
+    correction = correct_scene(uncorrected_scene, record, split, WITH_PHASES)
+    assert correction.kept == "materials+phases"
+    slabs = correction.misfit.sides[0].slabs
+    fitted = slabs.fitted(correction.misfit.named(correction.vector)).permittivity
+    rules = slabs.fitted(correction.misfit.named(correction.misfit.start)).permittivity
+    slab_index = {name.partition("/")[0]: place for place, name in enumerate(slabs.names)}
+    true = (
+        Prepared(open_scene(stated_scene(uncorrected_scene.parent / "named", TRUE_MATERIALS), HZ))
+        .tables("surface")
+        .slabs
+    )
     expected = dict(zip((name.partition("/")[0] for name in true.names), true.permittivity, strict=True))
     errors = [
-        np.mean([abs(np.log(values[known[name]] / expected[name])) for name in expected if name != "board"])
+        np.mean([abs(np.log(values[slab_index[name]] / expected[name])) for name in expected if name != "board"])
         for values in (rules, fitted)
     ]
     assert errors[1] < errors[0] / 2
-    assert (found.deviation[found.misfit.plane_entries] == 0).all()
+    assert (correction.deviation[correction.misfit.plane_entries] == 0).all()
 
 
 def test_phases_without_what_makes_them_uncertain_are_refused():

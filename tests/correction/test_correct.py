@@ -62,46 +62,54 @@ def true(tmp_path_factory):
 @pytest.fixture(scope="module")
 def corrected(true, tmp_path_factory):
     folder = tmp_path_factory.mktemp("corrected")
-    (scene, shift, tilt), stated = true, stated_scene(folder / "stated")
+    (scene, shift, tilt), uncorrected_scene = true, stated_scene(folder / "stated")
     record = channels(scene, 100)
-    return correct_scene(stated, record, first_split(record), CorrectionOptions(steps=10)), record, shift, tilt, folder
+    return (
+        correct_scene(uncorrected_scene, record, first_split(record), CorrectionOptions(steps=10)),
+        record,
+        shift,
+        tilt,
+        folder,
+    )
 
 
 def test_picture_shows_shifts_or_the_materials_where_no_plane_moved(corrected):
-    found, facts = corrected[0], _facts(corrected[0])
-    assert _picture(found, facts).axes[0].get_title() == "shifts of planes along their normals"
+    correction, facts = corrected[0], _facts(corrected[0])
+    assert _picture(correction, facts).axes[0].get_title() == "shifts of planes along their normals"
     still = [plane | {"shift_mm": 0.0} for plane in facts["planes"]]
-    assert _picture(found, facts | {"planes": still}).axes[0].get_title() == "materials of surfaces"
+    assert _picture(correction, facts | {"planes": still}).axes[0].get_title() == "materials of surfaces"
 
 
 def test_the_scene_is_recovered_from_channels(corrected, tmp_path):
     """Planes within four standard deviations, which are below those stated before, and permittivities."""
-    found, _, shift, tilt, _ = corrected
-    part = found.misfit.parts[SHIFT]
-    np.testing.assert_allclose(found.vector[part], shift, atol=PLANE_M)
-    np.testing.assert_allclose(found.vector[found.misfit.parts[TILT]].reshape(tilt.shape), tilt, atol=PLANE_RAD)
-    assert (np.abs(found.vector[part] - shift) < 4 * found.deviation[part] + 1e-4).all()
-    assert (found.deviation[part] < found.state.posterior.prior_deviation[part] / 2).all()
-    slabs = found.misfit.sides[0].slabs
+    correction, _, shift, tilt, _ = corrected
+    part = correction.misfit.parts[SHIFT]
+    np.testing.assert_allclose(correction.vector[part], shift, atol=PLANE_M)
+    np.testing.assert_allclose(
+        correction.vector[correction.misfit.parts[TILT]].reshape(tilt.shape), tilt, atol=PLANE_RAD
+    )
+    assert (np.abs(correction.vector[part] - shift) < 4 * correction.deviation[part] + 1e-4).all()
+    assert (correction.deviation[part] < correction.state.posterior.prior_deviation[part] / 2).all()
+    slabs = correction.misfit.sides[0].slabs
     true = open_scene(stated_scene(tmp_path / "named", TRUE_MATERIALS), CARRIER_HZ)
     expected = Prepared(true).tables("surface").slabs
     assert slabs.names == expected.names
     felt = [not name.startswith("board") for name in slabs.names]  # no wave feels the permittivity of metal
-    ratio = slabs.fitted(found.misfit.named(found.vector)).permittivity[felt] / expected.permittivity[felt]
+    ratio = slabs.fitted(correction.misfit.named(correction.vector)).permittivity[felt] / expected.permittivity[felt]
     assert np.mean(np.abs(ratio - 1) < PERMITTIVITY) >= 0.8
     # To the amplitude of the paths that are dropped as faint, 0.1 %. With the paths of the stated scene, whose board
     # of metal is taken for wood, held-out channels without noise have 34 dB.
-    assert np.mean(found.scores[found.kept]) > 50
+    assert np.mean(correction.scores[correction.kept]) > 50
 
 
 def test_rows_are_told_to_models_of_the_corrected_scene(corrected, tmp_path, caplog):
     """The data set and its rows are in the scene folder; a run that is tested on them warns."""
-    found, record, *_ = corrected
+    correction, record, *_ = corrected
     split = first_split(record)
-    write_page(found, tmp_path / "scene")
+    write_page(correction, tmp_path / "scene")
     data = read_correction_data(tmp_path / "scene")
     assert data is not None
-    assert (data.rows.tolist(), data.error_ratio) == (split.all_train.tolist(), found.data.error_ratio)
+    assert (data.rows.tolist(), data.error_ratio) == (split.all_train.tolist(), correction.data.error_ratio)
     for rows, warned in ((split, False), (replace(split, train=split.test, test=split.train[:7]), True)):
         caplog.clear()
         wrf_mi.train(record, "ray-tracing", out=tmp_path / str(warned), scene=str(tmp_path / "scene"), split=rows)
@@ -127,10 +135,10 @@ def test_planes_alone_are_corrected(true, corrected):
     """Channels that were held out are predicted better where all materials stay as stated."""
     record = corrected[1]
     options = CorrectionOptions(parts=("planes", "frame"), rays=1 << 14)
-    found = correct_scene(true[0].parent / "base", record, first_split(record), options)
-    assert found.kept == "planes+frame"
-    stated, kept = mean_scores(found)
-    assert kept > stated + 10
+    correction = correct_scene(true[0].parent / "base", record, first_split(record), options)
+    assert correction.kept == "planes+frame"
+    stated_score, kept_score = mean_scores(correction)
+    assert kept_score > stated_score + 10
 
 
 @pytest.mark.slow
@@ -138,10 +146,10 @@ def test_a_wall_is_of_another_material_that_reflects_alike_at_one_carrier(tmp_pa
     """A pane of glass at 3.5 GHz, which is first taken for thick, moist concrete 1.5 mm from it."""
     monkeypatch.setattr(correction_rooms, "CARRIER_HZ", 3.5e9)
     true, shift, _ = true_scene(tmp_path, seed=1)
-    record, stated = channels(true, 60, seed=1), stated_scene(tmp_path / "stated")
-    found = correct_scene(stated, record, first_split(record), CorrectionOptions(steps=10))
-    np.testing.assert_allclose(found.vector[found.misfit.parts[SHIFT]], shift, atol=PLANE_M)
-    assert of_wall_2(found) == "glass"
+    record, uncorrected_scene = channels(true, 60, seed=1), stated_scene(tmp_path / "stated")
+    correction = correct_scene(uncorrected_scene, record, first_split(record), CorrectionOptions(steps=10))
+    np.testing.assert_allclose(correction.vector[correction.misfit.parts[SHIFT]], shift, atol=PLANE_M)
+    assert of_wall_2(correction) == "glass"
 
 
 def of_wall_2(found):
@@ -173,24 +181,24 @@ def room_with_box(folder, monkeypatch, corners, true, stated, count, **noise):
 
 def test_channels_show_the_faces_of_a_box_that_the_scan_missed(tmp_path, monkeypatch):
     """Its top, of metal, is found; faces that are found once belong to the stated scene of the next correction."""
-    true, seen = ({f"other_{k:02d}": "itu_metal" for k in range(1, 1 + n)} for n in (5, 2))
-    record, scene = room_with_box(tmp_path, monkeypatch, LOW_BOX, true, seen, 100)
+    true, scanned_faces = ({f"other_{k:02d}": "itu_metal" for k in range(1, 1 + n)} for n in (5, 2))
+    record, scene = room_with_box(tmp_path, monkeypatch, LOW_BOX, true, scanned_faces, 100)
     options = CorrectionOptions(parts=("materials", "hidden"), depth=2, rays=1 << 14, steps=3)
-    found = correct_scene(scene, record, first_split(record), options)
-    facts = write_page(found, tmp_path / "corrected")
-    present = {one["surface"]: one["conductivity"][1] for one in facts["materials"] if not one["absent"]}
+    correction = correct_scene(scene, record, first_split(record), options)
+    facts = write_page(correction, tmp_path / "corrected")
+    present = {entry["surface"]: entry["conductivity"][1] for entry in facts["materials"] if not entry["absent"]}
     hidden = [surface for surface in read_surfaces(tmp_path / "corrected")[0] if surface.name.startswith("hidden")]
     (top,) = [surface.name for surface in hidden if np.ptp(surface.vertices_m[:, 2]) < 1e-3]
     assert present[top] > 1e5
-    stated, kept = mean_scores(found)
-    assert kept > stated + 3
+    stated_score, kept_score = mean_scores(correction)
+    assert kept_score > stated_score + 3
 
     again = correct_scene(tmp_path / "corrected", record, first_split(record), replace(options, steps=0))
     supposed = {name.partition("/")[0] for name in again.state.posterior.supposed}
     assert not supposed & {surface.name for surface in hidden}
     facts = write_page(again, tmp_path / "again")
-    assert top in {one["surface"] for one in facts["materials"] if not one["absent"]}
-    assert np.nanmean(again.scores[""]) > stated + 3
+    assert top in {entry["surface"] for entry in facts["materials"] if not entry["absent"]}
+    assert np.nanmean(again.scores[""]) > stated_score + 3
 
 
 @pytest.mark.parametrize("material", ["chipboard", "wood"])
@@ -199,31 +207,31 @@ def test_a_cabinet_of_one_material_is_found_from_few_channels(tmp_path, monkeypa
     true = {f"other_{k:02d}": f"itu_{material}" for k in range(1, 6)}
     record, scene = room_with_box(tmp_path, monkeypatch, CABINET, true, {}, 60, snr_db=25)
     options = CorrectionOptions(parts=("materials", "hidden"), depth=3, rays=1 << 14, steps=3)
-    found = correct_scene(scene, record, first_split(record), options)
-    faces = [kind for name, kind in found.state.materials.items() if name.startswith(("other", "hidden"))]
+    correction = correct_scene(scene, record, first_split(record), options)
+    faces = [kind for name, kind in correction.state.materials.items() if name.startswith(("other", "hidden"))]
     assert faces == [material] * 5
-    assert not found.state.absent()
-    assert mean_scores(found)[1] > 19
+    assert not correction.state.absent()
+    assert mean_scores(correction)[1] > 19
 
 
 def test_walls_in_wrong_minima_are_found(tmp_path, monkeypatch):
     """At 3.5 GHz and 25 dB, where a wall a wavelength from its place fits as long as another does not move either."""
     monkeypatch.setattr(correction_rooms, "CARRIER_HZ", 3.5e9)
     true, shift, _ = true_scene(tmp_path, seed=3)
-    record, stated = channels(true, 60, snr_db=25, seed=3), stated_scene(tmp_path / "stated")
-    found = correct_scene(stated, record, first_split(record), CorrectionOptions(steps=10))
-    part = found.misfit.parts[SHIFT]
-    assert (np.abs(found.vector[part] - shift) < 4 * found.deviation[part] + 1e-4).all()
-    assert (found.deviation[part] < 3e-3).all()
-    assert of_wall_2(found) == "glass"
+    record, uncorrected_scene = channels(true, 60, snr_db=25, seed=3), stated_scene(tmp_path / "stated")
+    correction = correct_scene(uncorrected_scene, record, first_split(record), CorrectionOptions(steps=10))
+    part = correction.misfit.parts[SHIFT]
+    assert (np.abs(correction.vector[part] - shift) < 4 * correction.deviation[part] + 1e-4).all()
+    assert (correction.deviation[part] < 3e-3).all()
+    assert of_wall_2(correction) == "glass"
 
 
 def test_corrected_scene_is_a_folder_that_a_plain_trace_opens(corrected):
     """Channels at test positions, traced anew in the written scene, are 20 dB better than in the stated one."""
     from sionna import rt
 
-    found, record, _, _, folder = corrected
-    facts = write_page(found, folder / "corrected")
+    correction, record, _, _, folder = corrected
+    facts = write_page(correction, folder / "corrected")
     test, score = record.official[1], {}
     for name in ("stated", "corrected"):
         tracer = RayTracer(folder / name, instrument_of(record), TraceOptions(transmission=True, depth=3))
@@ -240,8 +248,10 @@ def test_a_scene_without_errors_stays_as_good(tmp_path):
     """Held-out scores are never below those of the stated scene."""
     scene = stated_scene(tmp_path / "scene")
     record = channels(scene, 60, snr_db=15)
-    stated, kept = mean_scores(correct_scene(scene, record, first_split(record), CorrectionOptions(steps=2, depth=2)))
-    assert kept >= stated
+    stated_score, kept_score = mean_scores(
+        correct_scene(scene, record, first_split(record), CorrectionOptions(steps=2, depth=2))
+    )
+    assert kept_score >= stated_score
 
 
 def strengths(record: Any) -> Any:
@@ -263,13 +273,13 @@ def test_strengths_correct_materials_by_a_bounded_number_of_rows(powers):
     record, _, scene = powers
     split, options = first_split(record), replace(default_options(record), rows=40, rays=4096)
     quieter = replace(record, observation=record.observation - 40)
-    found, again = (correct_scene(scene, data, split, options) for data in (record, quieter))
-    assert found.facts["rows"] == 40 < len(split.all_train)
-    assert set(found.misfit.rows) < set(split.all_train)
-    assert found.kept == "materials+gain"
-    stated, kept = mean_scores(found)
-    assert kept < stated
-    np.testing.assert_allclose(again.scores[again.kept], found.scores[found.kept], atol=0.05)
+    correction, again = (correct_scene(scene, data, split, options) for data in (record, quieter))
+    assert correction.facts["rows"] == 40 < len(split.all_train)
+    assert set(correction.misfit.rows) < set(split.all_train)
+    assert correction.kept == "materials+gain"
+    stated_score, kept_score = mean_scores(correction)
+    assert kept_score < stated_score
+    np.testing.assert_allclose(again.scores[again.kept], correction.scores[correction.kept], atol=0.05)
 
 
 def test_regions_judge_wherever_test_and_validation_rows_are(powers):
@@ -279,10 +289,10 @@ def test_regions_judge_wherever_test_and_validation_rows_are(powers):
     train, validation, test = map(np.sort, np.split(rows, [50, 60]))
     splits = [Split("mine", 0, train, validation, tested) for tested in (test, test[:0])]
     options = replace(default_options(record), rays=4096, depth=2)
-    found, other = (correct_scene(scene, record, split, options) for split in splits)
-    np.testing.assert_array_equal(other.vector, found.vector)
+    correction, other = (correct_scene(scene, record, split, options) for split in splits)
+    np.testing.assert_array_equal(other.vector, correction.vector)
     groups = hold_out_groups(splits[0], record.tx_pos_m)
-    assert found.facts["held_out"] == len(groups.validation) - 10
+    assert correction.facts["held_out"] == len(groups.validation) - 10
 
 
 def test_receivers_that_a_split_holds_out_are_not_used(powers):
@@ -291,9 +301,9 @@ def test_receivers_that_a_split_holds_out_are_not_used(powers):
     both = replace(record, receivers=(*record.receivers, second), observation=np.tile(record.observation, (2, 1)))
     broken = replace(both, observation=both.observation + np.array([[0.0], [1e3]], np.float32))
     split, options = make_splits(both, "receiver:1")[0], replace(default_options(both), rays=4096, depth=2)
-    found, other = (correct_scene(scene, data, split, options) for data in (both, broken))
-    np.testing.assert_array_equal(other.vector, found.vector)
-    assert np.isfinite(found.vector).all()
+    correction, other = (correct_scene(scene, data, split, options) for data in (both, broken))
+    np.testing.assert_array_equal(other.vector, correction.vector)
+    assert np.isfinite(correction.vector).all()
 
 
 def test_new_receivers_decide_where_receivers_are_held_out(powers, tmp_path):
@@ -305,21 +315,21 @@ def test_new_receivers_decide_where_receivers_are_held_out(powers, tmp_path):
     tracer = RayTracer(true, Instrument("power", receivers, np.array([CARRIER_HZ])), TraceOptions(depth=2, rays=4096))
     record = replace(record, receivers=receivers, observation=(tracer(record.tx_pos_m) - 40).astype(np.float32))
     split = make_splits(record, "receiver:0")[0]
-    found = correct_scene(scene, record, split, replace(default_options(record), rays=4096, depth=2))
-    for score in found.scores.values():
+    correction = correct_scene(scene, record, split, replace(default_options(record), rays=4096, depth=2))
+    for score in correction.scores.values():
         judged = np.isfinite(score.reshape(7, -1)).any(axis=1)
         assert (judged.sum(), judged[0]) == (3, False)
-    assert found.kept == "materials+gain"
-    names = found.facts["held_out_receivers"]
+    assert correction.kept == "materials+gain"
+    names = correction.facts["held_out_receivers"]
     assert len(names) == 3
     assert "rx0" not in names
-    write_page(found, tmp_path / "page", False)
+    write_page(correction, tmp_path / "page", False)
     page = (tmp_path / "page" / "correction.md").read_text()
     held_out = f"{len(split.all_train)} training rows at the receivers {', '.join(names)}, which were held out"
     assert f"{held_out} while choosing" in page
     # The offset of -40 dB is that of the others; three receivers in the walls' near field leave some error.
-    stated, kept = mean_scores(found)
-    assert kept < stated < 3
+    stated_score, kept_score = mean_scores(correction)
+    assert kept_score < stated_score < 3
 
 
 def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:
@@ -376,11 +386,11 @@ def test_command_refuses_in_one_line(arguments, message, tmp_path, command):
 
 def test_command_corrects_by_spectra(tmp_path, command):
     """Materials of the laboratory, all stated as wood: held-out scores rise."""
-    stated, xml = tmp_path / "stated", scenes()["laboratory"].xml.name
-    shutil.copytree(scenes()["laboratory"].folder, stated)
-    text = (stated / xml).read_text()
-    (stated / xml).write_text(re.sub(r'<ref id="mat-itu_\w+"', '<ref id="mat-itu_wood"', text))
-    words = ["correct", "laboratory", "--scene", stated, "--out", tmp_path / "corrected", "--calibrate", "materials"]
+    folder, xml = tmp_path / "stated", scenes()["laboratory"].xml.name
+    shutil.copytree(scenes()["laboratory"].folder, folder)
+    text = (folder / xml).read_text()
+    (folder / xml).write_text(re.sub(r'<ref id="mat-itu_\w+"', '<ref id="mat-itu_wood"', text))
+    words = ["correct", "laboratory", "--scene", folder, "--out", tmp_path / "corrected", "--calibrate", "materials"]
     facts = command.json([*words, "--depth", "2", "--rays", "4096", "--n-train", "60"])
     assert facts["kept"] == "materials"
     scores = facts["held_out_scores"]

@@ -67,13 +67,13 @@ def test_parameters_without_data_stay_at_the_prior():
 
 def test_standard_deviations_are_those_of_repeated_measurements():
     """Within 25 %: 60 repetitions know a standard deviation to 9 %, and weights cost a few per cent more."""
-    vectors, stated = [], []
+    vectors, deviations = [], []
     for seed in range(60):
         noisy = MATRIX @ TRUE + np.random.default_rng(seed).normal(0, 0.3, (ROWS, VALUES))
         vector, covariance = solve(MATRIX, noisy, weak())
         vectors.append(vector)
-        stated.append(np.sqrt(np.diag(covariance)))
-    np.testing.assert_allclose(np.std(vectors, axis=0), np.mean(stated, axis=0), rtol=0.25)
+        deviations.append(np.sqrt(np.diag(covariance)))
+    np.testing.assert_allclose(np.std(vectors, axis=0), np.mean(deviations, axis=0), rtol=0.25)
 
 
 def test_residuals_of_rows_left_out_are_those_of_fits_to_the_others():
@@ -81,7 +81,7 @@ def test_residuals_of_rows_left_out_are_those_of_fits_to_the_others():
     rng, prior = np.random.default_rng(4), weak(1.0)
     slope, observed = rng.normal(size=(10, 2, 3)), rng.normal(size=(10, 2))
     observed[3] = np.nan
-    noise, seen = Noise(0.5, 2.0), np.arange(10) != 3
+    noise, is_observed = Noise(0.5, 2.0), np.arange(10) != 3
 
     def fit(weights, rows):
         part, values = slope[rows], observed[rows]
@@ -90,26 +90,26 @@ def test_residuals_of_rows_left_out_are_those_of_fits_to_the_others():
 
     weights = noise.weights(observed)
     for _ in range(200):
-        vector, information = fit(weights, np.flatnonzero(seen))
+        vector, information = fit(weights, np.flatnonzero(is_observed))
         weights = noise.weights(slope @ vector - observed)
-    found = left_out_residuals(first(slope), slope @ vector - observed, np.linalg.inv(information), noise)
-    assert np.isnan(found[3]).all()
-    for row in np.flatnonzero(seen):
-        without, _ = fit(weights, np.flatnonzero(seen & (np.arange(10) != row)))
-        np.testing.assert_allclose(found[row], slope[row] @ without - observed[row], rtol=1e-6)
+    residuals = left_out_residuals(first(slope), slope @ vector - observed, np.linalg.inv(information), noise)
+    assert np.isnan(residuals[3]).all()
+    for row in np.flatnonzero(is_observed):
+        without, _ = fit(weights, np.flatnonzero(is_observed & (np.arange(10) != row)))
+        np.testing.assert_allclose(residuals[row], slope[row] @ without - observed[row], rtol=1e-6)
 
 
 def test_correlated_values_count_once():
     """Equal values in a row are one measurement: standard deviations do not fall with their number."""
     rng = np.random.default_rng(3)
-    one, many = (np.repeat(rng.normal(0, 0.2, (ROWS, 1)), count, axis=1) for count in (1, 50))
+    single, many = (np.repeat(rng.normal(0, 0.2, (ROWS, 1)), count, axis=1) for count in (1, 50))
     assert Noise.of(many).values == pytest.approx(1, abs=0.05)
     assert Noise.of(rng.normal(size=(4000, 20))).values == pytest.approx(20, rel=0.05)
     slope = np.ones((ROWS, 1, 1))
     prior = Prior(np.zeros(1), np.full((1, 1), 1e-6))
-    pairs = (slope, one), (np.repeat(slope, 50, axis=1), many)
-    found = [solve(matrix, observed, prior)[1][0, 0] for matrix, observed in pairs]
-    assert found[1] == pytest.approx(found[0], rel=0.2)
+    pairs = (slope, single), (np.repeat(slope, 50, axis=1), many)
+    variances = [solve(matrix, observed, prior)[1][0, 0] for matrix, observed in pairs]
+    assert variances[1] == pytest.approx(variances[0], rel=0.2)
 
 
 def test_cost_is_the_likelihood_of_students_t():
@@ -146,8 +146,8 @@ def test_motions_are_those_of_the_moved_room(planes):
     normal, offset = planes.moved_planes(change[:count], change[count:].reshape(count, 2))
     turn, middle = Rotation.from_rotvec(motion[3:]), centre.mean(axis=0)
     np.testing.assert_allclose(normal, turn.apply(planes.normal), atol=SECOND_ORDER)
-    there = turn.apply(centre - middle) + middle + motion[:3]
-    np.testing.assert_allclose((normal * there).sum(axis=1), offset, atol=SECOND_ORDER)
+    moved_centre = turn.apply(centre - middle) + middle + motion[:3]
+    np.testing.assert_allclose((normal * moved_centre).sum(axis=1), offset, atol=SECOND_ORDER)
 
 
 def test_motions_are_found_again_with_their_uncertainty(planes):
@@ -155,14 +155,14 @@ def test_motions_are_found_again_with_their_uncertainty(planes):
     rng, deviation = np.random.default_rng(0), 1e-3
     change = rigid_motions(planes) @ motion
     precision = np.full(len(change), deviation**-2.0)
-    found = [rigid_motion(planes, change + rng.normal(0, deviation, len(change)), precision) for _ in range(200)]
-    values, stated = np.array([one[0] for one in found]), found[0][1]
-    np.testing.assert_allclose(values.mean(axis=0), motion, atol=4 * stated.max() / np.sqrt(200))
-    np.testing.assert_allclose(values.std(axis=0), stated, rtol=0.25)
+    estimates = [rigid_motion(planes, change + rng.normal(0, deviation, len(change)), precision) for _ in range(200)]
+    values, motion_sd = np.array([estimate[0] for estimate in estimates]), estimates[0][1]
+    np.testing.assert_allclose(values.mean(axis=0), motion, atol=4 * motion_sd.max() / np.sqrt(200))
+    np.testing.assert_allclose(values.std(axis=0), motion_sd, rtol=0.25)
     count = len(planes.normal)
     precision = np.zeros(3 * count)
     upright = np.abs(planes.normal[:, 2]) > 0.9
     precision[:count][upright] = 1.0  # floor and ceiling alone
-    _, stated = rigid_motion(planes, np.zeros(3 * count), precision)
-    assert np.isinf(stated[:2]).all()
-    assert np.isfinite(stated[2])
+    _, motion_sd = rigid_motion(planes, np.zeros(3 * count), precision)
+    assert np.isinf(motion_sd[:2]).all()
+    assert np.isfinite(motion_sd[2])

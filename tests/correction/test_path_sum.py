@@ -51,18 +51,18 @@ def moved(misfit: Misfit, shift_m: float = 4e-3, tilt_rad: float = 1e-3) -> np.n
 def test_trials_of_one_plane_and_its_material_follow_the_tracer(misfit, accepted):
     """To second order in 1 cm: the error is below 5 % of the change, before and after the trial is accepted."""
     vector = moved(misfit)
-    trials, there, before = PathSum(misfit, vector), vector.copy(), misfit.residual(vector)
+    trials, changed_vector, before = PathSum(misfit, vector), vector.copy(), misfit.residual(vector)
     np.testing.assert_allclose(trials.residual(vector), before, atol=ROUNDING)
-    there[misfit.parts[SHIFT].start + 2] += 0.01
-    there[misfit.parts[TILT].start + 5] += 3e-3
+    changed_vector[misfit.parts[SHIFT].start + 2] += 0.01
+    changed_vector[misfit.parts[TILT].start + 5] += 3e-3
     slab = next(k for k, name in enumerate(misfit.sides[0].slabs.names) if name.endswith("/2"))
-    there[misfit.parts[name_of(SURFACE, "permittivity")].start + slab] += 0.7
+    changed_vector[misfit.parts[name_of(SURFACE, "permittivity")].start + slab] += 0.7
     if accepted:
-        trials.accept(there)
-    expected = misfit.residual(there)
+        trials.accept(changed_vector)
+    expected = misfit.residual(changed_vector)
     change = np.nanmax(np.abs(expected - before))
     assert change > 0.05
-    np.testing.assert_allclose(trials.residual(there), expected, atol=0.05 * change)
+    np.testing.assert_allclose(trials.residual(changed_vector), expected, atol=0.05 * change)
 
 
 def test_trials_together_are_those_of_each(misfit, strengths, monkeypatch):
@@ -74,7 +74,7 @@ def test_trials_together_are_those_of_each(misfit, strengths, monkeypatch):
     vectors[1:4, misfit.parts[name_of(SURFACE, "permittivity")].start] += 0.9
     pair = np.stack(changed(strengths))
     for trials, several in ((PathSum(misfit, vector), vectors), (PathSum(strengths, pair[0]), pair)):
-        expected = [np.square(trials.residual(one)).mean(axis=1) for one in several]
+        expected = [np.square(trials.residual(trial)).mean(axis=1) for trial in several]
         assert not np.array_equal(expected[0], expected[1], equal_nan=True)
         for together in (1, 1 << 20):
             monkeypatch.setattr(path_sum, "TOGETHER", together)
@@ -85,21 +85,23 @@ def derivatives_agree(misfit: Misfit, vector: np.ndarray, there: np.ndarray, sha
     """Those of sums over paths and of the tracer, to a share of the largest one of each part."""
     columns = np.arange(len(vector))
     jacobians = misfit.jacobian(there, columns), PathSum(misfit, vector).jacobian(there, columns)
-    expected, found = (np.stack([jacobian.at(row) for row in range(len(misfit.observed))], 1) for jacobian in jacobians)
+    expected, computed = (
+        np.stack([jacobian.at(row) for row in range(len(misfit.observed))], 1) for jacobian in jacobians
+    )
     for name, part in misfit.parts.items():
         most = np.abs(expected[part]).max()
-        np.testing.assert_allclose(found[part], expected[part], atol=share * most + floor, err_msg=name)
-    assert (found[:, ~np.isfinite(misfit.observed).all(axis=1)] == 0).all()
+        np.testing.assert_allclose(computed[part], expected[part], atol=share * most + floor, err_msg=name)
+    assert (computed[:, ~np.isfinite(misfit.observed).all(axis=1)] == 0).all()
 
 
 @pytest.mark.parametrize("step_m", [0.0, 2e-3])
 def test_derivatives_are_those_of_the_tracer(misfit, step_m):
     """By planes and materials, to the change of gains with the angle, which sums of paths leave out."""
     vector = moved(misfit)
-    there = vector.copy()
-    there[misfit.parts[SHIFT].start + 2] += step_m
+    changed_vector = vector.copy()
+    changed_vector[misfit.parts[SHIFT].start + 2] += step_m
     assert not np.isfinite(misfit.observed[3]).all()
-    derivatives_agree(misfit, vector, there, 0.03)
+    derivatives_agree(misfit, vector, changed_vector, 0.03)
 
 
 @pytest.fixture(scope="module")
@@ -121,23 +123,23 @@ def strengths(room):
 def changed(misfit: Misfit) -> tuple[np.ndarray, np.ndarray]:
     """A vector of other materials and gains, and one with one more material and gain that differ."""
     vector = changed_material(misfit)
-    there = vector.copy()
-    there[misfit.parts[name_of(SURFACE, "permittivity")].start + 2] += 0.7
-    there[misfit.parts[misfit.sides[1].gain_name].start] += 0.4
-    return vector, there
+    changed_vector = vector.copy()
+    changed_vector[misfit.parts[name_of(SURFACE, "permittivity")].start + 2] += 0.7
+    changed_vector[misfit.parts[misfit.sides[1].gain_name].start] += 0.4
+    return vector, changed_vector
 
 
 def test_strengths_and_their_derivatives_are_those_of_the_tracer(strengths):
     """A receiver without rows has a parameter and is not traced."""
-    vector, there = changed(strengths)
+    vector, changed_vector = changed(strengths)
     trials, louder = PathSum(strengths, vector), vector.copy()
     louder[strengths.parts[strengths.sides[1].gain_name].start] += 0.4
-    for tried in (vector, there, louder):
+    for tried in (vector, changed_vector, louder):
         np.testing.assert_allclose(trials.residual(tried), strengths.residual(tried), atol=DECIBEL)
-    assert np.nanmax(np.abs(strengths.residual(there) - strengths.residual(vector))) > 1
-    trials.accept(there)
+    assert np.nanmax(np.abs(strengths.residual(changed_vector) - strengths.residual(vector))) > 1
+    trials.accept(changed_vector)
     np.testing.assert_allclose(trials.residual(vector), strengths.residual(vector), atol=DECIBEL)
-    derivatives_agree(strengths, vector, there, 0.01, DECIBEL)
+    derivatives_agree(strengths, vector, changed_vector, 0.01, DECIBEL)
     assert [receiver.name for receiver in strengths.receivers] == ["first", "third"]
     assert "receiver.silent.gain" in strengths.parts
     assert np.isnan(strengths.residual(strengths.start)[16:32]).all()
@@ -160,18 +162,20 @@ def spectra(request, room):
 def test_spectra_are_those_of_the_tracer(spectra):
     """Materials exactly; the planes' shifts to second order and to the change of the angle of arrival."""
     assert PathSum.serves(spectra)
-    vector, there = spectra.start.copy(), spectra.start.copy()
-    there[spectra.parts[name_of(SURFACE, "permittivity")].start + 2] += 0.7
+    vector, changed_vector = spectra.start.copy(), spectra.start.copy()
+    changed_vector[spectra.parts[name_of(SURFACE, "permittivity")].start + 2] += 0.7
     trials = PathSum(spectra, vector)
-    for tried in (vector, there):
+    for tried in (vector, changed_vector):
         np.testing.assert_allclose(trials.residual(tried), spectra.residual(tried), atol=10 * ROUNDING)
-    assert np.abs(spectra.residual(there) - spectra.residual(vector)).max() > 0.05
-    trials.accept(there)
+    assert np.abs(spectra.residual(changed_vector) - spectra.residual(vector)).max() > 0.05
+    trials.accept(changed_vector)
     np.testing.assert_allclose(trials.residual(vector), spectra.residual(vector), atol=10 * ROUNDING)
     if SHIFT in spectra.parts:
-        there[spectra.parts[SHIFT].start + 2] += 0.003
-        expected, before = spectra.residual(there), spectra.residual(vector)
-        np.testing.assert_allclose(trials.residual(there), expected, atol=0.05 * np.abs(expected - before).max())
+        changed_vector[spectra.parts[SHIFT].start + 2] += 0.003
+        expected, before = spectra.residual(changed_vector), spectra.residual(vector)
+        np.testing.assert_allclose(
+            trials.residual(changed_vector), expected, atol=0.05 * np.abs(expected - before).max()
+        )
 
 
 def test_derivatives_of_spectra_are_those_of_the_tracer(spectra):

@@ -73,8 +73,8 @@ def test_bare_meshes_turn_in_every_entry(tmp_path):
 
 def test_rooms_and_scans_that_look_turned_are_named(tmp_path, caplog):
     box().export(tmp_path / "room.glb")
-    made = make_scene(tmp_path / "room.glb", tmp_path / "scene", up="z")
-    np.testing.assert_allclose(extent(made.folder), [[0, 0, 0], ROOM], atol=ROUNDING_M)
+    new_scene = make_scene(tmp_path / "room.glb", tmp_path / "scene", up="z")
+    np.testing.assert_allclose(extent(new_scene.folder), [[0, 0, 0], ROOM], atol=ROUNDING_M)
     assert not caplog.records
     make_scene(tmp_path / "room.glb", tmp_path / "turned")
     assert "looks as if z were up" in caplog.text
@@ -83,8 +83,8 @@ def test_rooms_and_scans_that_look_turned_are_named(tmp_path, caplog):
     np.savez(tmp_path / "scan.npz", points=points @ Y_UP[:3, :3].T)
     np.testing.assert_allclose(read_points(tmp_path / "scan.npz", up="y"), points)
     caplog.clear()
-    made = make_scene(tmp_path / "scan.npz", tmp_path / "of_scan", up="y")
-    assert sorted(made.materials.surfaces.values()) == ["ceiling", "floor", *["wall"] * 4]
+    new_scene = make_scene(tmp_path / "scan.npz", tmp_path / "of_scan", up="y")
+    assert sorted(new_scene.materials.surfaces.values()) == ["ceiling", "floor", *["wall"] * 4]
     assert not caplog.records
     assert looks_y_up(read_points(tmp_path / "scan.npz"))
     assert not looks_y_up(points)
@@ -114,8 +114,8 @@ def test_a_room_whose_floor_would_be_missing_is_refused(tmp_path):
     y_up(room).export(tmp_path / "room.ply")
     with pytest.raises(InputError, match=r"has no floor with z up, and one with y up; .*--up y, or --up z"):
         make_scene(tmp_path / "room.ply", tmp_path / "scene")
-    made = make_scene(tmp_path / "room.ply", tmp_path / "scene", up="y")
-    assert sorted(made.materials.surfaces.values()) == ["ceiling", "floor", "wall", "wall"]
+    new_scene = make_scene(tmp_path / "room.ply", tmp_path / "scene", up="y")
+    assert sorted(new_scene.materials.surfaces.values()) == ["ceiling", "floor", "wall", "wall"]
 
 
 LIVING, HALL = (6, 4, 2.5), (30.0, 20.0, 16.42)
@@ -174,10 +174,10 @@ def test_a_national_grid_gets_an_origin_that_keeps_millimetres(tmp_path, capsys)
 def test_a_scan_in_a_national_grid_keeps_its_walls(tmp_path, monkeypatch):
     points = sampled(closed_box(), 20_000) + GRID
     file = write_las(tmp_path / "scan.las", points, 0.001)
-    made = make_scene(file, tmp_path / "scene")
+    new_scene = make_scene(file, tmp_path / "scene")
     low = GRID - LOCAL
-    assert made.origin_m == LOCAL
-    np.testing.assert_allclose(extent(made.folder), [low, low + np.array([5.0, 4.0, 2.8])], atol=WALLS_M)
+    assert new_scene.origin_m == LOCAL
+    np.testing.assert_allclose(extent(new_scene.folder), [low, low + np.array([5.0, 4.0, 2.8])], atol=WALLS_M)
     # Positions are in the scene's frame, which they do not tell; without a search for planes, which takes minutes.
     monkeypatch.delattr("wrf_mi.scene.scan.cloud.find_planes")
     (tmp_path / "positions.csv").write_text("x,y\n1,1\n2,1\n")
@@ -197,8 +197,8 @@ def test_scenes_of_a_national_grid_are_brought_near_or_refused(tmp_path):
     motion = np.eye(4)
     motion[:3, 3] = -np.array(LOCAL)
     file = write_obj(tmp_path / "utm.obj", box(ROOM, GRID))
-    made = make_scene(file, tmp_path / "near", registration=motion)
-    np.testing.assert_allclose(extent(made.folder)[0], GRID - LOCAL, atol=ROUNDING_M)
+    new_scene = make_scene(file, tmp_path / "near", registration=motion)
+    np.testing.assert_allclose(extent(new_scene.folder)[0], GRID - LOCAL, atol=ROUNDING_M)
 
 
 def test_a_plan_in_a_national_grid_is_moved_with_its_positions(tmp_path):
@@ -211,9 +211,9 @@ def test_a_plan_in_a_national_grid_is_moved_with_its_positions(tmp_path):
     for name, xy in (("right.csv", places), ("mirrored.csv", places * (1, -1) + (0, 2 * 15.72))):
         (tmp_path / name).write_text("x,y\n" + "\n".join(f"{x:.2f},{y:.2f}" for x, y in xy) + "\n")
     options: dict[str, Any] = {"height_m": 2.5, "origin_m": LOCAL, "floor_m": LOCAL[2]}
-    made = make_scene(tmp_path / "layout.csv", tmp_path / "scene", positions=tmp_path / "right.csv", **options)
+    new_scene = make_scene(tmp_path / "layout.csv", tmp_path / "scene", positions=tmp_path / "right.csv", **options)
     low = np.append(GRID[:2] - LOCAL[:2], 0)
-    np.testing.assert_allclose(extent(made.folder), [low, low + np.array([6, 4, 2.5])], atol=ROUNDING_M)
+    np.testing.assert_allclose(extent(new_scene.folder), [low, low + np.array([6, 4, 2.5])], atol=ROUNDING_M)
     with pytest.raises(InputError, match="positions"):
         make_scene(tmp_path / "layout.csv", tmp_path / "no", positions=tmp_path / "mirrored.csv", **options)
 
@@ -233,9 +233,9 @@ def test_files_that_were_rounded_far_away_are_refused(tmp_path):
         require_near(near, "room")
         require_precise(near.astype(np.float32).astype(float), 1.0, "room")
         require_precise(1000 * near, 0.001, "room")
-    whole = np.array([[701_362.0, 4_485_513.0, 1650], [701_368.0, 4_485_518.0, 1652]])
-    require_precise(whole, 1.0, "whole metres")
-    require_precise(whole + 0.5, 1.0, "half metres")
+    whole_metres = np.array([[701_362.0, 4_485_513.0, 1650], [701_368.0, 4_485_518.0, 1652]])
+    require_precise(whole_metres, 1.0, "whole metres")
+    require_precise(whole_metres + 0.5, 1.0, "half metres")
     require_precise(GRID[None] * 1000, 0.001, "millimetres")
     with pytest.raises(InputError, match=r"y has been rounded to steps of 0\.51 m"):
         require_precise((GRID[None] * 1000).astype(np.float32).astype(float), 0.001, "millimetres")

@@ -75,7 +75,7 @@ def test_moved_part_gives_the_channels_of_the_room_measured_anew(scene, tmp_path
 
 def test_other_parts_and_all_materials_stay(scene, tmp_path):
     edited = edit_scene(scene, tmp_path / "edited", [Move((CABINET,), SHIFT_M)], remove=("piece_1*",))
-    before, after = ({one.name: one for one in read_surfaces(folder)[0]} for folder in (scene, edited))
+    before, after = ({part.name: part for part in read_surfaces(folder)[0]} for folder in (scene, edited))
     assert set(before) - set(after) == {name for name in before if name.startswith("piece_1")}
     for name, surface in after.items():
         shift = np.array(SHIFT_M) if name == CABINET else 0.0
@@ -87,9 +87,9 @@ def test_other_parts_and_all_materials_stay(scene, tmp_path):
     # About their common middle: half a turn leaves the box of two parts where it was, and their distance.
     names = ("piece_02", "piece_12")
     edited = edit_scene(scene, tmp_path / "turned", [Move(names, turn_deg=180)])
-    still, turned = ([one for one in read_surfaces(f)[0] if one.name in names] for f in (scene, edited))
+    still, turned = ([part for part in read_surfaces(f)[0] if part.name in names] for f in (scene, edited))
     np.testing.assert_allclose(box_of(turned), box_of(still), atol=SINGLE_M)
-    centres = [np.stack([box_of([one]).mean(axis=0) for one in found]) for found in (still, turned)]
+    centres = [np.stack([box_of([part]).mean(axis=0) for part in parts]) for parts in (still, turned)]
     turned_m = 2 * box_of(still).mean(axis=0) - centres[0]
     np.testing.assert_allclose(centres[1][:, :2], turned_m[:, :2], atol=SINGLE_M)
     low, high = random_room(103).parts[CABINET][1].bounds
@@ -214,20 +214,22 @@ def apart(one: np.ndarray, other: np.ndarray) -> float:
 def test_two_faces_complete_a_box(size, turn, base, seen):
     """Of any size and direction; each missing face is found once."""
     faces = box_faces(size, turn, base)
-    found = boxes([surface(f"other_{k}", faces[k]) for k in seen]).hidden
+    hidden_faces = boxes([surface(f"other_{k}", faces[k]) for k in seen]).hidden
     missing = [face for k, face in enumerate(faces) if k not in seen]
-    assert len(found) == len(missing)
+    assert len(hidden_faces) == len(missing)
     for face in missing:
-        assert min(apart(face, one.vertices_m) for one in found) < EXACT_M * max(1, *map(abs, base))
+        assert min(apart(face, hidden.vertices_m) for hidden in hidden_faces) < EXACT_M * max(1, *map(abs, base))
 
 
 def test_edges_may_be_seen_to_a_few_centimetres():
     faces = box_faces((0.8, 0.5, 1.2), 0.3, (1, 2, 0))
     middle = faces[0].mean(axis=0)
-    found = boxes([surface("other_01", middle + 0.94 * (faces[0] - middle)), surface("other_02", faces[1])]).hidden
-    assert len(found) == 3
+    hidden_faces = boxes(
+        [surface("other_01", middle + 0.94 * (faces[0] - middle)), surface("other_02", faces[1])]
+    ).hidden
+    assert len(hidden_faces) == 3
     for face in (faces[2], faces[3]):
-        assert min(apart(face, one.vertices_m) for one in found) < 0.08
+        assert min(apart(face, hidden.vertices_m) for hidden in hidden_faces) < 0.08
 
 
 def test_nothing_is_supposed_where_surfaces_lie_or_of_single_faces():
@@ -235,9 +237,9 @@ def test_nothing_is_supposed_where_surfaces_lie_or_of_single_faces():
     faces = box_faces((0.8, 0.5, 1.2), 0.0, (0, 0.05, 0))
     side, top = surface("other_01", faces[3]), surface("other_02", faces[4])
     wall = surface("wall_01", np.array([[-3, 0, 0], [3, 0, 0], [3, 0, 3], [-3, 0, 3.0]]), "wall")
-    found = boxes([side, top, wall]).hidden
-    assert len(found) == 2
-    assert min(apart(faces[0], one.vertices_m) for one in found) > 0.1
+    hidden_faces = boxes([side, top, wall]).hidden
+    assert len(hidden_faces) == 2
+    assert min(apart(faces[0], hidden.vertices_m) for hidden in hidden_faces) > 0.1
     front, twisted = surface("other_02", faces[0]), np.array([[0, 0, 0], [1, 0, 0], [1, 1, 1], [0, 1, 0.0]])
     for what, parts in {
         "single": [side],
@@ -247,8 +249,8 @@ def test_nothing_is_supposed_where_surfaces_lie_or_of_single_faces():
         "not flat": [surface("other_01", twisted), front],
     }.items():
         assert not boxes(parts).hidden, what
-    taken = [surface("hidden_01", faces[0]), surface("other_01", faces[1])]
-    assert [face.name for face in boxes(taken).hidden] == ["hidden_02", "hidden_03", "hidden_04"]
+    named_faces = [surface("hidden_01", faces[0]), surface("other_01", faces[1])]
+    assert [face.name for face in boxes(named_faces).hidden] == ["hidden_02", "hidden_03", "hidden_04"]
 
 
 def test_a_scene_folder_has_them_for_as_long_as_asked(tmp_path):
@@ -257,15 +259,18 @@ def test_a_scene_folder_has_them_for_as_long_as_asked(tmp_path):
     floor = Surface("floor", "floor", np.asarray(mesh.vertices), np.asarray(mesh.faces))
     plain = write_scene(tmp_path / "plain", [floor], frame="f", source="s")
     sides = [surface(f"other_{k}", faces[k]) for k in (0, 1)]
-    with with_hidden_faces(write_scene(tmp_path / "scene", [floor, *sides], frame="f", source="s")) as (scene, found):
-        names = [face.name for face in found.hidden]
+    with with_hidden_faces(write_scene(tmp_path / "scene", [floor, *sides], frame="f", source="s")) as (
+        scene,
+        completed,
+    ):
+        names = [face.name for face in completed.hidden]
         assert names == ["hidden_01", "hidden_02", "hidden_03"]
-        assert found.members == [{"other_0", "other_1", *names}]
+        assert completed.members == [{"other_0", "other_1", *names}]
         surfaces, materials = read_surfaces(scene)
-        assert [one.name for one in surfaces][3:] == names
+        assert [stored_surface.name for stored_surface in surfaces][3:] == names
         assert materials.of("hidden_01", "other") == materials.of("other_0", "other")
     assert not Path(scene).exists()
     for other in (plain, "box", tmp_path / "scene" / "meshes" / "floor.ply"):
-        with with_hidden_faces(other) as (scene, found):
+        with with_hidden_faces(other) as (scene, completed):
             assert scene == other
-            assert not found.hidden
+            assert not completed.hidden

@@ -61,7 +61,7 @@ def test_a_folder_is_read_as_written_and_opened_by_mitsuba_and_sionna(folder):
 
     assert bounds(mi.load_file(str(folder / "scene.xml"))) == pytest.approx(np.array([[0, 0, 0], [4, 3, 2.5]]))
     scene = rt.load_scene(str(folder / "scene.xml"), merge_shapes=False)
-    materials = {name: one.radio_material.name for name, one in scene.objects.items()}
+    materials = {name: scene_object.radio_material.name for name, scene_object in scene.objects.items()}
     assert materials == {"floor": "itu_concrete", "ceiling": "itu_ceiling_board", "table": "itu_wood"}
     assert {name.removeprefix("itu_") for name in THICKNESS_M} == set(ITU_MATERIALS_PROPERTIES)
 
@@ -73,8 +73,8 @@ def test_editing_the_materials_changes_the_scene(folder):
     facts["thickness_m"]["itu_metal"] = 0.005
     (folder / "materials.yml").write_text(yaml.safe_dump(facts))
     scene = open_scene(folder, FREQUENCY_HZ)
-    materials = {name: one.radio_material for name, one in scene.objects.items()}
-    names = {name: one.name for name, one in materials.items()}
+    materials = {name: scene_object.radio_material for name, scene_object in scene.objects.items()}
+    names = {name: material.name for name, material in materials.items()}
     assert names == {"floor": "itu_marble", "ceiling": "itu_ceiling_board", "table": "itu_metal"}
     assert float(materials["table"].thickness[0]) == pytest.approx(0.005)
     assert float(materials["floor"].thickness[0]) == pytest.approx(THICKNESS_M["itu_marble"])
@@ -91,7 +91,7 @@ def test_a_perfect_conductor_is_a_material_of_a_scene_folder(folder):
     facts["rules"]["floor"] = facts["surfaces"]["table"] = "perfect"
     facts["thickness_m"] = {"perfect": 0.3}
     (folder / "materials.yml").write_text(yaml.safe_dump(facts))
-    of = {name: one.radio_material for name, one in open_scene(folder, FREQUENCY_HZ).objects.items()}
+    of = {name: scene_object.radio_material for name, scene_object in open_scene(folder, FREQUENCY_HZ).objects.items()}
     assert [of[name].name for name in ("floor", "table", "ceiling")] == ["perfect", "perfect", "itu_ceiling_board"]
     expected = perfect_reflector()
     for key in ("relative_permittivity", "conductivity"):
@@ -182,14 +182,14 @@ def test_a_scan_becomes_a_folder_in_a_registered_frame(tmp_path):
     (tmp_path / "mine.yml").write_text("rules: {wall: itu_brick}\nthickness_m: {itu_brick: 0.12}\n")
     quarter = np.array([[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 1], [0, 0, 0, 1.0]])
     options = {"units": "mm", "materials": tmp_path / "mine.yml", "registration": quarter}
-    made = make_scene(tmp_path / "scan.npz", tmp_path / "out", **options)
-    assert made.counts == {"surfaces": 6, "faces": 12, "points": 20_200}
-    np.testing.assert_array_equal(yaml.safe_load((made.folder / "scene.yml").read_text())["registration"], quarter)
-    assert made.materials.of("wall_01", "wall") == "itu_brick"
-    assert made.materials.thickness_m["itu_brick"] == 0.12
-    scene = open_scene(made.folder, FREQUENCY_HZ).mi_scene
+    new_scene = make_scene(tmp_path / "scan.npz", tmp_path / "out", **options)
+    assert new_scene.counts == {"surfaces": 6, "faces": 12, "points": 20_200}
+    np.testing.assert_array_equal(yaml.safe_load((new_scene.folder / "scene.yml").read_text())["registration"], quarter)
+    assert new_scene.materials.of("wall_01", "wall") == "itu_brick"
+    assert new_scene.materials.thickness_m["itu_brick"] == 0.12
+    scene = open_scene(new_scene.folder, FREQUENCY_HZ).mi_scene
     np.testing.assert_allclose(bounds(scene), [[6.0, 20, 1], [10, 25, 3.8]], atol=0.01)
-    read_materials(made.folder)  # a folder stands for its file
+    read_materials(new_scene.folder)  # a folder stands for its file
 
 
 def test_a_mesh_and_a_layout_become_folders(tmp_path):
@@ -216,12 +216,12 @@ def test_triangles_that_lose_their_area_in_single_precision_are_not_written(tmp_
     lines += ["f {} {} {}".format(*np.add(face, 1)) for face in floor + faces]
     (tmp_path / "room.obj").write_text("\n".join(lines))
     with caplog.at_level(logging.WARNING):
-        made = make_scene(tmp_path / "room.obj", tmp_path / "room")
+        new_scene = make_scene(tmp_path / "room.obj", tmp_path / "room")
     assert "room.obj: 1 of 14 triangles have no area and are left out" in caplog.text
-    assert made.counts == {"surfaces": 6, "faces": 13}
-    (written,) = mesh_parts(made.folder / "meshes" / "floor.ply")
+    assert new_scene.counts == {"surfaces": 6, "faces": 13}
+    (written,) = mesh_parts(new_scene.folder / "meshes" / "floor.ply")
     assert written.area == pytest.approx(12.0, rel=1e-6)
-    assert "zero-area" not in {finding.kind for finding in check_scene(made.folder).findings}
+    assert "zero-area" not in {finding.kind for finding in check_scene(new_scene.folder).findings}
 
 
 def test_surface_of_lines_is_left_out():

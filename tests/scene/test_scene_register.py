@@ -161,8 +161,8 @@ def test_positions_pass_through_the_door_between_two_rooms_and_not_through_walls
     xy = xy[np.abs(xy[:, 0] - 3.5) > 0.3]
     grid = write_grid(tmp_path / "map.npz", "top", TWO_ROOMS_M, np.array([[1.0, 1.0], [2.5, 3.0], [4.5, 1.4]]))
     positions = write_positions(tmp_path / "places.csv", xy)
-    made = make_scene(grid, tmp_path / "scene", height_m=2.5, positions=positions)
-    assert made.counts["surfaces"] == len(TWO_ROOMS_M) + 2  # floor and ceiling
+    new_scene = make_scene(grid, tmp_path / "scene", height_m=2.5, positions=positions)
+    assert new_scene.counts["surfaces"] == len(TWO_ROOMS_M) + 2  # floor and ceiling
     shifted = write_positions(tmp_path / "shifted.csv", xy + np.array([0.0, 1.5]))
     with pytest.raises(InputError, match="cross walls"):
         make_scene(grid, tmp_path / "refused", height_m=2.5, positions=shifted)
@@ -190,10 +190,10 @@ def test_pairs_give_back_any_rigid_motion(rows, seed):
     rng = np.random.default_rng(seed)
     source = rng.uniform(-5, 5, (6, 3))
     rotation, shift = Rotation.random(rng=rng).as_matrix(), np.array(rows[0])
-    found = register_pairs(source, source @ rotation.T + shift)
-    assert np.allclose(found[:3, :3], rotation, atol=EXACT_M)
-    assert np.allclose(found[:3, 3], shift, atol=1e-8)
-    assert np.allclose(moved(found, source), source @ rotation.T + shift, atol=1e-8)
+    motion = register_pairs(source, source @ rotation.T + shift)
+    assert np.allclose(motion[:3, :3], rotation, atol=EXACT_M)
+    assert np.allclose(motion[:3, 3], shift, atol=1e-8)
+    assert np.allclose(moved(motion, source), source @ rotation.T + shift, atol=1e-8)
 
 
 @given(angles, shifts, shifts)
@@ -202,9 +202,9 @@ def test_pairs_in_a_plane_turn_about_z(degrees, x, y):
     source = np.array([[0, 0], [4, 0], [1, 3]], float)
     target = turn(source, degrees, (x, y))
     for pairs in (3, 2):  # two points are enough in a plane
-        found = register_pairs(source[:pairs], target[:pairs])
-        assert np.allclose(moved(found, source), target, atol=1e-8), pairs
-        assert found[2].tolist() == [0, 0, 1, 0]
+        motion = register_pairs(source[:pairs], target[:pairs])
+        assert np.allclose(moved(motion, source), target, atol=1e-8), pairs
+        assert motion[2].tolist() == [0, 0, 1, 0]
 
 
 @pytest.mark.parametrize(
@@ -238,28 +238,28 @@ def test_pairs_from_a_file_and_with_errors(tmp_path):
             read_pairs(file)
     source = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 2]], float)
     noise = np.random.default_rng(0).normal(0, 0.02, source.shape)
-    found = register_pairs(source, source + np.array([1, 2, 3]) + noise)
-    assert np.abs(moved(found, source) - source - [1, 2, 3]).max() < 0.05
+    motion = register_pairs(source, source + np.array([1, 2, 3]) + noise)
+    assert np.abs(moved(motion, source) - source - [1, 2, 3]).max() < 0.05
 
 
 @given(angles, shifts, shifts)
 @settings(max_examples=3, deadline=None)
 def test_walls_give_back_any_turn_and_shift(degrees, x, y):
     points = turn(sample_walls(L_WALLS), degrees, (x, y))
-    found = register_walls(points, L_WALLS)
+    motion = register_walls(points, L_WALLS)
     corners = turn(L_ROOM_M, degrees, (x, y))
-    assert np.abs(moved(found, corners) - L_ROOM_M).max() < FITTED_M
-    assert best_scale(moved(found, points), np.zeros(3), L_WALLS)[0] == pytest.approx(1, abs=1e-3)
+    assert np.abs(moved(motion, corners) - L_ROOM_M).max() < FITTED_M
+    assert best_scale(moved(motion, points), np.zeros(3), L_WALLS)[0] == pytest.approx(1, abs=1e-3)
 
 
 def test_walls_fit_in_spite_of_noise_furniture_and_what_is_missing():
     rng = np.random.default_rng(1)
-    seen = np.concatenate([TWO_ROOMS_M[1:], box(0.5, 0.5, 1.0, 0.6)])
-    points = sample_walls(seen) + rng.normal(0, 0.03, (len(sample_walls(seen)), 2))
-    found = register_walls(turn(points, 140, (2, -3)), TWO_ROOMS_M)
+    visible_walls = np.concatenate([TWO_ROOMS_M[1:], box(0.5, 0.5, 1.0, 0.6)])
+    points = sample_walls(visible_walls) + rng.normal(0, 0.03, (len(sample_walls(visible_walls)), 2))
+    motion = register_walls(turn(points, 140, (2, -3)), TWO_ROOMS_M)
     corners = turn(TWO_ROOMS_M.reshape(-1, 2), 140, (2, -3))
     # 3 cm of noise on some 200 points.
-    assert np.abs(moved(found, corners) - TWO_ROOMS_M.reshape(-1, 2)).max() < 0.02
+    assert np.abs(moved(motion, corners) - TWO_ROOMS_M.reshape(-1, 2)).max() < 0.02
     surfaces = plan_surfaces(L_ROOM_M, height_m=2.5)
     points = wall_points(surfaces)
     assert distance_to_walls(points, L_WALLS).max() < EXACT_M

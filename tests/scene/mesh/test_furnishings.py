@@ -46,17 +46,17 @@ def test_upright_planes_below_the_ceiling_are_named(piece, name):
 def test_an_image_in_a_mirror_adjoins_no_floor():
     image = level(0.0, -4, 1, -1, 2), across_x(-4.0, 1, 2, 0.0, 2.5)
     both = Face(FLOOR.plane, shapely.union_all([FLOOR.area, image[0].area]))
-    kept = reached([both, WALL, image[1]], ["floor", "wall", "wall"])
-    assert [part.area.area for part in kept] == pytest.approx([20, 10, 0])
+    reached_parts = reached([both, WALL, image[1]], ["floor", "wall", "wall"])
+    assert [part.area.area for part in reached_parts] == pytest.approx([20, 10, 0])
 
 
 def test_floors_are_completed_below_the_ceiling_but_not_above_a_stairwell():
     bed, stairs = shapely.box(0, 0, 2, 1.5), shapely.box(4, 3, 5, 4)
     holes = shapely.transform(shapely.union_all([bed, stairs]), lambda xy: FLOOR.plane.flat(np.c_[xy, 0 * xy[:, :1]]))
-    seen = shapely.difference(FLOOR.area, holes)
+    visible_floor = shapely.difference(FLOOR.area, holes)
     steps = np.random.default_rng(1).uniform((4, 3, -1.5), (5, 4, -0.2), (2000, 3))
     planes, roles = [FLOOR.plane, CEILING.plane], list[Kind](("floor", "ceiling"))
-    floor, ceiling = levels_completed(planes, [seen, CEILING.area], roles, steps, 0.03)
+    floor, ceiling = levels_completed(planes, [visible_floor, CEILING.area], roles, steps, 0.03)
     assert floor.area == pytest.approx(19, abs=0.02)
     assert ceiling.area == pytest.approx(20, abs=0.02)
 

@@ -67,14 +67,14 @@ def model(path, version="IFC4", metres=False, shift_m=(0.0, 0.0, 0.0)):
 
 @pytest.mark.parametrize(("version", "metres"), [("IFC4", False), ("IFC4X3", True)])
 def test_elements_are_surfaces_in_metres_with_materials_by_their_names(tmp_path, caplog, version, metres):
-    made = make_scene(model(tmp_path / "a.ifc", version, metres), tmp_path / "scene")
-    surfaces = {surface.name: surface for surface in read_surfaces(made.folder)[0]}
+    new_scene = make_scene(model(tmp_path / "a.ifc", version, metres), tmp_path / "scene")
+    surfaces = {surface.name: surface for surface in read_surfaces(new_scene.folder)[0]}
     kinds = {name: surface.kind for name, surface in surfaces.items()}
     walls = {f"wall_0{number}": "wall" for number in range(1, 5)}
     others = dict.fromkeys(["door", "window", "column", "furniture"], "other")
     # The upper slab is of the class of floors, and nothing stands on it.
     assert kinds == walls | others | {"floor": "floor", "ceiling": "ceiling"}
-    materials = made.materials.by_surface()
+    materials = new_scene.materials.by_surface()
     assert [materials[f"wall_0{number}"] for number in range(1, 5)] == ["itu_concrete", *["itu_plasterboard"] * 3]
     assert [materials[name] for name in ("door", "window", "column")] == ["itu_wood", "itu_glass", "itu_concrete"]
     assert "Backstein XY" in caplog.text
@@ -86,9 +86,9 @@ def test_elements_are_surfaces_in_metres_with_materials_by_their_names(tmp_path,
 
 
 def test_a_model_in_a_national_grid_gets_an_origin(tmp_path):
-    made = make_scene(model(tmp_path / "a.ifc", shift_m=(701300.0, 4485500.0, 30.0)), tmp_path / "scene")
-    assert made.origin_m == (701200, 4485400, 0)
-    assert box_of(read_surfaces(made.folder)[0])[0] == pytest.approx([99.8, 99.8, 29.8], abs=1e-3)
+    new_scene = make_scene(model(tmp_path / "a.ifc", shift_m=(701300.0, 4485500.0, 30.0)), tmp_path / "scene")
+    assert new_scene.origin_m == (701200, 4485400, 0)
+    assert box_of(read_surfaces(new_scene.folder)[0])[0] == pytest.approx([99.8, 99.8, 29.8], abs=1e-3)
 
 
 def test_the_floor_is_counted_once_and_options_that_the_file_states_are_refused(tmp_path, command):

@@ -37,7 +37,7 @@ def split(*parts: Mesh) -> tuple[dict[str, int], list[Surface]]:
     before = sorted(mesh.triangles.reshape(len(mesh.faces), 9).tolist())
     after = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
     assert sorted(after.reshape(len(after), 9).tolist()) == before
-    return {kind: len(found) for kind, found in by_kind(surfaces).items()}, surfaces
+    return {kind: len(members) for kind, members in by_kind(surfaces).items()}, surfaces
 
 
 ROOM = (0.0, 0.0, 0.0), (5.0, 4.0, 2.5)
@@ -95,12 +95,12 @@ def test_rooms_storeys_and_slopes_and_what_is_no_building(tmp_path):
     assert split(mesh)[0] == EMPTY
     ball = trimesh.creation.icosphere(3, 1.0)
     ball.export(tmp_path / "ball.stl")
-    (given,) = read_mesh(tmp_path / "ball.stl")
-    assert planes_of_mesh([given]) == [given]
+    (ball_mesh,) = read_mesh(tmp_path / "ball.stl")
+    assert planes_of_mesh([ball_mesh]) == [ball_mesh]
     solid((0, 0, 0), (1, 0.6, 1)).export(tmp_path / "cupboard.ply")
-    made = make_scene(tmp_path / "cupboard.ply", tmp_path / "scene")  # drawn without a free edge
-    assert made.materials.surfaces == {"mesh": "other"}
-    assert (made.folder / "preview.png").stat().st_size > 1000
+    new_scene = make_scene(tmp_path / "cupboard.ply", tmp_path / "scene")  # drawn without a free edge
+    assert new_scene.materials.surfaces == {"mesh": "other"}
+    assert (new_scene.folder / "preview.png").stat().st_size > 1000
 
 
 def test_pairs_out_of_reach_change_nothing(monkeypatch):
@@ -115,9 +115,9 @@ def test_pairs_out_of_reach_change_nothing(monkeypatch):
         areas.append(shapely.box(*low, *(low + rng.uniform(0.3, 3, 2))))
     reach = [0.15] * len(planes)
     skipped = outline.join(planes, areas, reach)
-    monkeypatch.setattr(outline, "_beside", lambda *given: False)
-    assert [one.wkb for one in skipped] == [one.wkb for one in outline.join(planes, areas, reach)]
-    assert any(one.wkb != area.wkb for one, area in zip(skipped, areas, strict=True))
+    monkeypatch.setattr(outline, "_beside", lambda *arguments: False)
+    assert [polygon.wkb for polygon in skipped] == [polygon.wkb for polygon in outline.join(planes, areas, reach)]
+    assert any(polygon.wkb != area.wkb for polygon, area in zip(skipped, areas, strict=True))
 
 
 EQUAL = 1e-6
@@ -236,9 +236,9 @@ def test_every_format_has_the_same_floors_walls_and_ceilings(name, up, unit, tmp
     file = tmp_path / name
     WRITERS[name](file, in_file, polygons, unit_m, up)
     # COLLADA and USD state their unit and axis; glTF has y up.
-    stated = file.suffix in (".dae", ".usda", ".usdc")
-    axis = None if stated or (up == "y" and file.suffix in (".glb", ".gltf")) else up
-    surfaces = planes_of_mesh(read_mesh(file, None if stated else unit, axis))
+    states_axes = file.suffix in (".dae", ".usda", ".usdc")
+    axis = None if states_axes or (up == "y" and file.suffix in (".glb", ".gltf")) else up
+    surfaces = planes_of_mesh(read_mesh(file, None if states_axes else unit, axis))
     assert [s.kind for s in surfaces] == ["floor"] * 2 + ["ceiling"] * 2 + ["wall"] * 12
     levels = {"floor": [low for low, _ in STOREYS], "ceiling": [high for _, high in STOREYS]}
     levels["wall"] = levels["floor"]

@@ -173,5 +173,5 @@ def test_paper_around_a_drawing_is_no_floor_though_a_position_stands_in_an_entra
     places = np.concatenate([np.stack([x.ravel(), y.ravel()], axis=1), [[0.7, 3.7], [1.2, 3.7], [1.9, 3.7]]])
     np.savetxt(tmp_path / "walk.csv", places, "%.2f", ",", header="x,y", comments="")
     how = {"height_m": 2.7, "resolution_m": CELL_M, "positions": tmp_path / "walk.csv"}
-    made = make_scene(tmp_path / "plan.png", tmp_path / "scene", **how)
-    assert level_area([read_surfaces(made.folder)[0][0]]).area == pytest.approx(FLOOR_M2 + 0.3, abs=1)
+    new_scene = make_scene(tmp_path / "plan.png", tmp_path / "scene", **how)
+    assert level_area([read_surfaces(new_scene.folder)[0][0]]).area == pytest.approx(FLOOR_M2 + 0.3, abs=1)

@@ -113,9 +113,13 @@ def test_unclear_layers_and_units_are_asked_for_by_their_options(tmp_path, comma
 
 
 def test_a_scene_of_a_drawing_states_its_materials(tmp_path):
-    made = make_scene(drawing(tmp_path / "plan.dxf"), tmp_path / "scene", height_m=2.5)
-    stated = made.materials.by_surface()
-    assert [stated[name] for name in ("wall_01", "wall_09", "door_01")] == ["itu_plasterboard", "itu_glass", "itu_wood"]
+    new_scene = make_scene(drawing(tmp_path / "plan.dxf"), tmp_path / "scene", height_m=2.5)
+    materials = new_scene.materials.by_surface()
+    assert [materials[name] for name in ("wall_01", "wall_09", "door_01")] == [
+        "itu_plasterboard",
+        "itu_glass",
+        "itu_wood",
+    ]
 
 
 def test_a_plan_of_single_lines_keeps_them():

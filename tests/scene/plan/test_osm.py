@@ -63,7 +63,7 @@ YARD = ([(3, "outer"), (4, "inner")], {"building": "yes", "height": "15"})
 
 @pytest.mark.parametrize("name", ["town.osm", "town.json"])
 def test_buildings_have_roofs_and_walls_at_their_heights(tmp_path, name):
-    made = make_scene(written(tmp_path / name, TOWN, [YARD]), tmp_path / "scene")
+    new_scene = make_scene(written(tmp_path / name, TOWN, [YARD]), tmp_path / "scene")
     surfaces = plan_surfaces(read_plan(tmp_path / name), height_m=None)
     roofs = {round(float(each.vertices_m[0, 2]), 2): each.mesh.area for each in surfaces if each.kind == "ceiling"}
     assert roofs == {12: pytest.approx(200, abs=0.5), 6: pytest.approx(100, abs=0.5), 15: pytest.approx(800, abs=1)}
@@ -74,7 +74,7 @@ def test_buildings_have_roofs_and_walls_at_their_heights(tmp_path, name):
         60 * 12 + 30 * 6 + 160 * 15, abs=3
     )
     assert level_area([surfaces[0]]).area == pytest.approx(120 * 70, abs=5)
-    assert made.materials.of("wall_01", "wall") == "itu_concrete"
+    assert new_scene.materials.of("wall_01", "wall") == "itu_concrete"
 
 
 def test_parts_of_a_building_take_its_place_and_begin_at_their_lower_ends(tmp_path):

@@ -64,8 +64,8 @@ def test_furniture_is_left_out_and_the_wall_behind_it_goes_on(degrees):
 def test_furniture_noise_and_strays_of_points():
     points = np.concatenate(scans(np.concatenate([TWO_ROOMS_M, WARDROBE, TABLE])))
     walls = find_walls(grid_from_points(points))
-    found, right = agreement(walls, TWO_ROOMS_M, CLOSE_M)
-    assert 0.9 < found < 1  # behind the wardrobe nothing was seen
+    recall, right = agreement(walls, TWO_ROOMS_M, CLOSE_M)
+    assert 0.9 < recall < 1  # behind the wardrobe nothing was seen
     assert right > 0.9
     assert distance([0.6, 3.2], walls) < CLOSE_M
     assert distance([4.33, 2.23], walls) > 0.4
@@ -184,14 +184,14 @@ def test_grids_of_log_odds_and_probabilities_and_ros_maps_are_read(tmp_path):
 def test_row_0_of_the_caller_overrides_that_of_the_file_and_is_refused_where_the_format_fixes_it(tmp_path):
     file = tmp_path / "map.npz"
     occupied, free = [[False, False, True], [False, False, True]], [[True, True, False], [True, False, False]]
-    for stated, asked, from_top in (
+    for row_0, asked, from_top in (
         ("top", None, True),
         ("bottom", None, False),
         (b"Bottom", None, False),
         ("bottom", "top", True),
         (None, "bottom", False),
     ):
-        side = {} if stated is None else {"row_0": stated}
+        side = {} if row_0 is None else {"row_0": row_0}
         write_arrays(file, {"log_odds": ODDS, "resolution_m": 0.5, **side})
         grid = read_grid(file, row_0=asked)
         assert (grid.occupied.tolist(), grid.free.tolist()) == (occupied, free if from_top else free[::-1])

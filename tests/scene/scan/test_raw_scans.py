@@ -31,8 +31,8 @@ def scan_file(file, points):
 
 
 def surfaces_of(file, folder, **options):
-    made = make_scene(file, folder / "scene", replace=True, **options)
-    return read_surfaces(made.folder)[0]
+    new_scene = make_scene(file, folder / "scene", replace=True, **options)
+    return read_surfaces(new_scene.folder)[0]
 
 
 def as_surfaces(*parts):

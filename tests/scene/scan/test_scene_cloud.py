@@ -81,7 +81,7 @@ def test_an_l_shape_a_sloping_ceiling_and_a_real_slope_are_kept():
     points = sampled(closed_box(), COUNT)
     # A wall turned by 2 degrees is 14 cm off over 4 m; the points tell, so it stays.
     points[:, 0] += np.where(points[:, 0] > 4.8, points[:, 1] * np.tan(np.radians(2.0)), 0.0)
-    wall = max(by_kind(surfaces_from_points(points))["wall"], key=lambda one: one.vertices_m[:, 0].mean())
+    wall = max(by_kind(surfaces_from_points(points))["wall"], key=lambda surface: surface.vertices_m[:, 0].mean())
     run = np.ptp(wall.vertices_m[:, 0]) / np.ptp(wall.vertices_m[:, 1])
     assert np.degrees(np.arctan(run)) == pytest.approx(2.0, abs=0.1)
 
@@ -116,7 +116,7 @@ def test_the_shadow_of_a_cupboard_is_filled_and_a_window_is_not():
     behind = on_wall & (np.abs(points[:, 0] - 1.5) < 0.5) & (points[:, 2] < 1.9)
     window = on_wall & (np.abs(points[:, 0] - 3.7) < 0.6) & (np.abs(points[:, 2] - 1.5) < 0.5)
     surfaces = surfaces_from_points(points[~behind & ~window])
-    wall = min(by_kind(surfaces)["wall"], key=lambda one: np.abs(one.vertices_m[:, 1]).max())
+    wall = min(by_kind(surfaces)["wall"], key=lambda surface: np.abs(surface.vertices_m[:, 1]).max())
     # The window's free edges: 4.4 m long.
     assert abs(wall.mesh.area - (5 * 2.8 - 1.2 * 1.0)) < 4.4 * EDGE_M
 
@@ -160,23 +160,27 @@ def room() -> list[Mesh]:
 
 def across(surfaces: list[Surface]) -> dict[float, Surface]:
     """Surfaces near the wall and parallel to it, by their mean x."""
-    flat = [one for one in surfaces if np.ptp(one.vertices_m[:, 0]) < 1e-3 and abs(one.vertices_m[:, 0].mean()) < 0.2]
-    return {float(one.vertices_m[:, 0].mean()): one for one in flat}
+    flat = [
+        surface
+        for surface in surfaces
+        if np.ptp(surface.vertices_m[:, 0]) < 1e-3 and abs(surface.vertices_m[:, 0].mean()) < 0.2
+    ]
+    return {float(surface.vertices_m[:, 0].mean()): surface for surface in flat}
 
 
 def test_layers_of_a_wall_are_surfaces_of_their_own():
     """The wall goes on behind what hides it, and ends at the niche."""
-    found = across(surfaces_from_points(sampled(room(), LAYER_COUNT, NOISE_M)))
-    assert len(found) == 4
+    layers = across(surfaces_from_points(sampled(room(), LAYER_COUNT, NOISE_M)))
+    assert len(layers) == 4
     for expected, (along, above) in ((0.02, BOARD), (0.05, SHEET), (-0.06, NICHE)):
-        at = min(found, key=lambda x: abs(x - expected))
+        at = min(layers, key=lambda x: abs(x - expected))
         assert at == pytest.approx(expected, abs=LAYER_M)
-        bounds = np.array([found[at].vertices_m.min(axis=0)[1:], found[at].vertices_m.max(axis=0)[1:]])
+        bounds = np.array([layers[at].vertices_m.min(axis=0)[1:], layers[at].vertices_m.max(axis=0)[1:]])
         np.testing.assert_allclose(bounds, np.array([along, above]).T, atol=RIM_M)
-    at = min(found, key=abs)
+    at = min(layers, key=abs)
     assert at == pytest.approx(0, abs=LAYER_M)
     niche = np.prod(np.diff(NICHE, axis=1))
-    assert found[at].mesh.area == pytest.approx(7 * 2.8 - niche, rel=0.03)
+    assert layers[at].mesh.area == pytest.approx(7 * 2.8 - niche, rel=0.03)
 
 
 PLACE = np.array([1.3, 1.7, 1.35])

@@ -234,8 +234,8 @@ def test_scan_in_feet_is_refused_until_its_unit_is_given_and_one_of_two_units_is
     assert text == ["its coordinate system is in m and heights in ft, and is read in m"]
     assert "stated-units" in {finding.kind for finding in check_scene(file).of_level("warning")}
     assert "stated-units" not in {finding.kind for finding in check_scene(file, units="ft").findings}
-    made = make_scene(file, tmp_path / "scene", units="ft")
-    vertices_m = [trimesh.load_mesh(mesh).vertices for mesh in (made.folder / "meshes").iterdir()]
+    new_scene = make_scene(file, tmp_path / "scene", units="ft")
+    vertices_m = [trimesh.load_mesh(mesh).vertices for mesh in (new_scene.folder / "meshes").iterdir()]
     size = np.ptp(np.concatenate(vertices_m), axis=0)
     np.testing.assert_allclose(size, trimesh.util.concatenate(closed_box()).extents, atol=0.02)
 
@@ -350,8 +350,8 @@ def test_files_that_are_cut_off_or_damaged_are_refused_in_one_line(name, points,
 def test_more_points_than_a_file_can_hold_are_refused_before_they_are_read(name, points, tmp_path):
     WRITERS[name](tmp_path / name, points[:500])
     head, end, body = (tmp_path / name).read_bytes().partition(b"DATA" if name.endswith("pcd") else b"\n")
-    stated = head.replace(b"500", b"1000000000000") if end == b"DATA" else b"1000000000000"
-    (tmp_path / name).write_bytes(stated + end + body)
+    false_count = head.replace(b"500", b"1000000000000") if end == b"DATA" else b"1000000000000"
+    (tmp_path / name).write_bytes(false_count + end + body)
     with pytest.raises(InputError, match=r"states 1000000000000 points, and has \d+ bytes"):
         read_scan([tmp_path / name])
 
