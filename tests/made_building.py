@@ -36,10 +36,10 @@ def building(**received: tuple[int, ...]) -> Record:
     tx_pos_m = np.column_stack([rng.uniform(0, 12, rows), rng.uniform(0, 8, rows), np.full(rows, 1.3)])
     noise = dict(zip(PLACES_M | FAR_M, rng.normal(0, 1, (len(PLACES_M | FAR_M), rows)), strict=True))
     observation = np.full((len(places), rows), np.nan, np.float32)
-    for one, (name, place) in zip(observation, places.items(), strict=True):
+    for readings, (name, place) in zip(observation, places.items(), strict=True):
         heard = list(received.get(name, range(rows)))
         distance_m = np.linalg.norm(tx_pos_m[heard] - place, axis=1)
-        one[heard] = -40 - 25 * np.log10(distance_m) + noise[name][heard]
+        readings[heard] = -40 - 25 * np.log10(distance_m) + noise[name][heard]
     receivers = tuple(Receiver(name, np.array(place), UPRIGHT) for name, place in places.items())
     official = np.arange(TRAINED), np.arange(TRAINED, rows)
     hz = np.array([2.44e9])

@@ -48,7 +48,7 @@ def params(stations: int = 1, users: tuple[int, ...] = (10,)) -> dict[str, Any]:
 
 def matrices(rng: np.random.Generator, users: int, paths: int, station: np.ndarray) -> dict[str, np.ndarray]:
     """Matrices of random paths in single precision, as DeepMIMO stores them; user 0 has no path."""
-    made = {
+    arrays = {
         "power": rng.uniform(-140, -60, (users, paths)),
         "phase": rng.uniform(-180, 180, (users, paths)),
         "delay": rng.uniform(1e-8, 2e-6, (users, paths)),
@@ -60,11 +60,11 @@ def matrices(rng: np.random.Generator, users: int, paths: int, station: np.ndarr
     }
     count = rng.integers(1, paths + 1, users)
     count[0] = 0
-    for values in made.values():
+    for values in arrays.values():
         values[np.arange(paths) >= count[:, None]] = np.nan
-    made["inter_pos"] = np.full((users, paths, 2, 3), np.nan)
-    made |= {"rx_pos": rng.uniform(-50, 50, (users, 3)), "tx_pos": station[None]}
-    return {key: values.astype(np.float32) for key, values in made.items()}
+    arrays["inter_pos"] = np.full((users, paths, 2, 3), np.nan)
+    arrays |= {"rx_pos": rng.uniform(-50, 50, (users, 3)), "tx_pos": station[None]}
+    return {key: values.astype(np.float32) for key, values in arrays.items()}
 
 
 def write_scenario(folder, stations=1, users=(10,), paths=5, suffix=".npz"):
@@ -76,9 +76,9 @@ def write_scenario(folder, stations=1, users=(10,), paths=5, suffix=".npz"):
     for index in range(stations):
         station = np.array([10.0 * index, 5, 20])
         for k, count in enumerate(users):
-            made = matrices(rng, count, paths, station)
-            made["rx_pos"] = positions.setdefault(k, made["rx_pos"])
-            for key, values in made.items():
+            arrays = matrices(rng, count, paths, station)
+            arrays["rx_pos"] = positions.setdefault(k, arrays["rx_pos"])
+            for key, values in arrays.items():
                 file = folder / f"{key}_t000_tx{index:03}_r{1 + k:03}{suffix}"
                 if suffix == ".mat":
                     savemat(file, {key: values})
@@ -102,7 +102,7 @@ def package_dataset(folder: Path, **load: Any) -> Any:
 def package_channels(dataset: Any, chosen: Mapping[str, Any], **more: Any) -> np.ndarray:
     """`compute_channels` of the package for the users' single antenna [n, m, k], times sqrt(N)."""
     deepmimo = pytest.importorskip("deepmimo", reason=LACKING)
-    given = {"bs_antenna": {"shape": [1, 1]}, **chosen, **more}
+    parameters = {"bs_antenna": {"shape": [1, 1]}, **chosen, **more}
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        channels = dataset.compute_channels(deepmimo.ChannelParameters(given))
-    return channels[:, 0] * np.sqrt(given.get("ofdm", {}).get("subcarriers", 512))
+        channels = dataset.compute_channels(deepmimo.ChannelParameters(parameters))
+    return channels[:, 0] * np.sqrt(parameters.get("ofdm", {}).get("subcarriers", 512))

@@ -89,10 +89,14 @@ def test_suspicions_have_names_and_can_be_ignored():
     wrong = replace(record, observation=observation)
     report = check_data(wrong)
     names = ["strengths", "constant"]
-    assert [one.name for one in report.suspicions] == [one["name"] for one in report.as_dict()["suspicions"]] == names
+    assert (
+        [suspicion.name for suspicion in report.suspicions]
+        == [suspicion["name"] for suspicion in report.as_dict()["suspicions"]]
+        == names
+    )
     assert [line.partition(":")[0] for line in report.lines()] == [*(f"suspicion {name}" for name in names), "walk"]
     assert report.lines()[-1] == "walk: no fault, 2 suspicions"
-    assert [one.name for one in check_data(wrong, ignore=["strengths"]).suspicions] == ["constant"]
+    assert [suspicion.name for suspicion in check_data(wrong, ignore=["strengths"]).suspicions] == ["constant"]
     with pytest.raises(InputError, match=r"suspicion 'strength': unknown; known are not-heard, few-rows, "):
         check_data(wrong, ignore=["strength"])
     text = (CHECKOUT / "docs" / "data.md").read_text(encoding="utf-8")
@@ -112,9 +116,9 @@ def odd_records() -> dict[str, Record]:
     zero[:, :5] = 0
     broken = room.observation.copy()
     broken[:, 2] = np.inf
-    one = replace(walk, tx_pos_m=walk.tx_pos_m[:1], observation=walk.observation[:, :1], official=None)
+    one_row = replace(walk, tx_pos_m=walk.tx_pos_m[:1], observation=walk.observation[:, :1], official=None)
     return {
-        "one row": replace(one, tx_heading_rad=np.zeros(1)),
+        "one row": replace(one_row, tx_heading_rad=np.zeros(1)),
         "silent": replace(walk, observation=silent),
         "unknown positions": replace(room, tx_pos_m=np.full_like(room.tx_pos_m, np.nan), receivers=(nowhere,)),
         "silent channels": replace(room, observation=zero),
@@ -134,4 +138,4 @@ def odd_records() -> dict[str, Record]:
 def test_odd_data_are_checked_without_an_error(case):
     report = check_data(odd_records()[case])
     assert isinstance(report, DataReport)
-    assert {one.name for one in report.suspicions} <= set(SUSPICIONS)
+    assert {suspicion.name for suspicion in report.suspicions} <= set(SUSPICIONS)

@@ -22,11 +22,11 @@ def test_solids_are_those_of_the_solid_angle():
     ring = np.asarray(trimesh.creation.annulus(r_min=0.5, r_max=0.8, height=2.0).triangles)
     radius, height = np.hypot(places[:, 0], places[:, 1]), np.abs(places[:, 2])
     edge = deep + 0.02  # sides are flat
-    found = in_solid(places, ring)
+    inside = in_solid(places, ring)
     within = (radius > 0.5 + edge) & (radius < 0.8 - edge) & (height < 1 - edge)
     assert within.any()
-    assert found[within].all()
-    assert not found[(radius < 0.5 - edge) | (radius > 0.8) | (height > 1)].any()
+    assert inside[within].all()
+    assert not inside[(radius < 0.5 - edge) | (radius > 0.8) | (height > 1)].any()
 
 
 def test_positions_of_a_scene_without_floor_below_are_named():

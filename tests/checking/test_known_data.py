@@ -38,7 +38,7 @@ def loaded(name: str) -> Record:
 def suspected(record: Record) -> dict[str, str]:
     report = check_data(record)
     assert report.ok
-    return {one.name: one.text for one in report.suspicions}
+    return {suspicion.name: suspicion.text for suspicion in report.suspicions}
 
 
 @pytest.mark.parametrize("name", ["rfid-lab", "newrf-conference"])
@@ -53,13 +53,13 @@ def test_copies_of_rows(name):
     record = known(name)
     rows = np.arange(len(record))
     rows[[5, 9]] = 3
-    taken = record.inputs(rows)
-    observed = replace(record, observation=record.observation[:, rows], truth=None, carriers_hz=taken.carriers_hz)
-    found = suspected(
-        replace(observed, tx_pos_m=taken.tx_pos_m, tx_heading_rad=taken.tx_heading_rad, uplink=taken.uplink)
+    inputs = record.inputs(rows)
+    observed = replace(record, observation=record.observation[:, rows], truth=None, carriers_hz=inputs.carriers_hz)
+    suspicions = suspected(
+        replace(observed, tx_pos_m=inputs.tx_pos_m, tx_heading_rad=inputs.tx_heading_rad, uplink=inputs.uplink)
     )
-    assert found
-    assert set(found) <= {"repeated-rows", "train-test"}
+    assert suspicions
+    assert set(suspicions) <= {"repeated-rows", "train-test"}
 
 
 def table_changed(folder, changes):
@@ -100,7 +100,7 @@ def test_copied_rows_of_tables(tmp_path):
     train, test = ((folder / name).read_text().splitlines() for name in ("calibration_df.csv", "test_robot_df.csv"))
     (folder / "calibration_df.csv").write_text("\n".join([*train, train[8], train[20]]))
     (folder / "test_robot_df.csv").write_text("\n".join([*test, train[50]]))
-    found = {one.name: one.text for one in check_data(folder).suspicions}
-    assert set(found) == {"repeated-rows", "train-test"}
-    assert "2 of 4826 rows repeat an earlier row, observation included: rows 4105, 4106;" in found["repeated-rows"]
-    assert "1 of 720 test rows are training rows too, observation included: row 4826;" in found["train-test"]
+    suspicions = {suspicion.name: suspicion.text for suspicion in check_data(folder).suspicions}
+    assert set(suspicions) == {"repeated-rows", "train-test"}
+    assert "2 of 4826 rows repeat an earlier row, observation included: rows 4105, 4106;" in suspicions["repeated-rows"]
+    assert "1 of 720 test rows are training rows too, observation included: row 4826;" in suspicions["train-test"]

@@ -160,7 +160,7 @@ def test_quantised_strengths_are_seldom_suspected(seed, spread_db, step_db, rows
     """Of twenty receivers, which a whole building may have, none or one."""
     values = np.random.default_rng(seed).normal(-65, spread_db, (20, rows))
     values = step_db * np.round(values / step_db) if step_db else values
-    assert sum(bool(suspicious_values(one)) for one in values) <= 1
+    assert sum(bool(suspicious_values(strengths_dbm)) for strengths_dbm in values) <= 1
 
 
 @pytest.mark.parametrize(

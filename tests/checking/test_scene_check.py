@@ -83,8 +83,8 @@ def test_whole_scenes_and_the_city_of_sionna_raise_no_alarm(tmp_path):
 @needs("fdtd-toy")
 def test_old_scene_of_blender_has_no_radio_materials():
     for file in sorted((DATA / "fdtd-toy").rglob("*.xml")):
-        found = {f.shape for f in check_scene(file).findings if f.kind == "not-radio"}
-        assert found == {"mesh-upper_wall", "mesh-lower_wall", "mesh-blocker"}
+        shapes = {f.shape for f in check_scene(file).findings if f.kind == "not-radio"}
+        assert shapes == {"mesh-upper_wall", "mesh-lower_wall", "mesh-blocker"}
 
 
 @pytest.mark.parametrize(
@@ -254,8 +254,8 @@ def test_carrier_decides_materials_and_phase(tmp_path):
         (140e9, ["coarse-phase"]),
         (1e8, ["material-range"]),
     ):
-        found = check_scene(path, frequency_hz=hz).findings
-        assert [f.kind for f in found if f.level != "note"] == expected, hz
+        findings = check_scene(path, frequency_hz=hz).findings
+        assert [f.kind for f in findings if f.level != "note"] == expected, hz
 
 
 def test_help_lists_kinds_of_findings(capsys):

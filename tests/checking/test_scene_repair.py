@@ -65,8 +65,8 @@ def test_repaired_scene_opens_in_sionna(kind, turn, tmp_path):
 
 @pytest.mark.parametrize("kind", SAME_GEOMETRY)
 def test_repaired_scene_has_the_paths_of_the_whole_one(kind, tmp_path):
-    whole = damaged_scene(kind, 0, tmp_path / "whole", damage=False)
-    expected = gains_db(whole.folder / "scene.xml")
+    undamaged_scene = damaged_scene(kind, 0, tmp_path / "whole", damage=False)
+    expected = gains_db(undamaged_scene.folder / "scene.xml")
     repair, _ = repaired(kind, tmp_path)
     assert repair.folder is not None, repair.lines()
     np.testing.assert_allclose(gains_db(repair.folder / "scene.xml"), expected, atol=DECIBELS)

@@ -69,7 +69,7 @@ PER_DEGREE_M = 111e3
 def at(record: Record, offset: tuple[float, ...], scale: float) -> Record:
     """The record with horizontal positions offset + scale * metres."""
     shift, factor = np.array([*offset, 0.0]), np.array([scale, scale, 1.0])
-    moved = tuple(replace(one, position_m=shift + factor * one.position_m) for one in record.receivers)
+    moved = tuple(replace(receiver, position_m=shift + factor * receiver.position_m) for receiver in record.receivers)
     return replace(record, receivers=moved, tx_pos_m=shift + factor * record.tx_pos_m)
 
 
@@ -84,7 +84,7 @@ def test_degrees_are_suspected_in_either_order(place, step, size):
     if np.abs(place).max() > 90:
         assert ("longitude, latitude" if step == 1 else "latitude, longitude") in text
     report = check_data(at(building(), place[::step], size / PER_DEGREE_M))
-    assert [one.name for one in report.suspicions] == ["degrees"]  # others about places wait for metres
+    assert [suspicion.name for suspicion in report.suspicions] == ["degrees"]  # others about places wait for metres
 
 
 def test_positions_in_degrees_alone_are_suspected_and_map_projections_noted():
@@ -97,7 +97,7 @@ def test_positions_in_degrees_alone_are_suspected_and_map_projections_noted():
         for receivers in (metres.receivers, metres.receivers[:1]):
             assert list(degrees(replace(metres, receivers=receivers))) == []
     assert list(degrees(replace(record, tx_pos_m=np.full_like(record.tx_pos_m, np.nan)))) == []
-    unsurveyed = tuple(replace(one, position_m=np.full(3, np.nan)) for one in record.receivers)
+    unsurveyed = tuple(replace(receiver, position_m=np.full(3, np.nan)) for receiver in record.receivers)
     ((_, text),) = list(degrees(at(replace(record, receivers=unsurveyed), SALT_LAKE, 1 / PER_DEGREE_M)))
     assert text.startswith("transmitters have x from -111.84")
     report = check_data(at(building(), (423456.0, 4512345.0), 1.0))

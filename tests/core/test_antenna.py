@@ -82,10 +82,12 @@ def test_options_replace_only_the_given_properties() -> None:
 
 def test_stored_receivers_are_read_back(tmp_path: Path) -> None:
     words = [(p, q, f) for p in PATTERNS for q in POLARIZATIONS for f in FRAMES]
-    stated = [Antenna(p, q, f) for p, q, f in words if (p, f) != ("tr38901", "world")]
+    antennas = [Antenna(p, q, f) for p, q, f in words if (p, f) != ("tr38901", "world")]
     rng = np.random.default_rng(2)
-    given = [Receiver(f"r{i}", rng.normal(size=3), rng.normal(size=4), antenna) for i, antenna in enumerate(stated)]
-    write_arrays(tmp_path / "receivers.npz", receiver_arrays(given))
+    receivers = [
+        Receiver(f"r{i}", rng.normal(size=3), rng.normal(size=4), antenna) for i, antenna in enumerate(antennas)
+    ]
+    write_arrays(tmp_path / "receivers.npz", receiver_arrays(receivers))
     with np.load(tmp_path / "receivers.npz", allow_pickle=False) as arrays:
         read = stored_receivers(arrays)
-    np.testing.assert_equal([*map(vars, read)], [*map(vars, given)])
+    np.testing.assert_equal([*map(vars, read)], [*map(vars, receivers)])

@@ -37,8 +37,8 @@ GREY = 2e-4
 
 def test_rows_keep_their_order_by_carrier() -> None:
     carriers = np.array([3.0, 1.0, 3.0, 2.0, 1.0])
-    found = by_carrier(carriers, lambda hz, rows: np.stack([rows, np.full(len(rows), hz)]), axis=1)
-    np.testing.assert_array_equal(found, [np.arange(5), carriers])
+    merged = by_carrier(carriers, lambda hz, rows: np.stack([rows, np.full(len(rows), hz)]), axis=1)
+    np.testing.assert_array_equal(merged, [np.arange(5), carriers])
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +61,10 @@ def of(record: Record, carrier_hz: float) -> tuple[Record, Split]:
     rows = np.flatnonzero(record.carriers_hz == carrier_hz)
     train_rows, test = (np.flatnonzero(np.isin(rows, part)) for part in record.official)
     heading, observation = record.tx_heading_rad[rows], record.observation[:, rows]
-    own = replace(record.at_carrier(carrier_hz), tx_pos_m=record.tx_pos_m[rows], tx_heading_rad=heading, official=None)
-    return replace(own, observation=observation), Split("own", 0, train_rows, train_rows[:0], test)
+    carrier_record = replace(
+        record.at_carrier(carrier_hz), tx_pos_m=record.tx_pos_m[rows], tx_heading_rad=heading, official=None
+    )
+    return replace(carrier_record, observation=observation), Split("own", 0, train_rows, train_rows[:0], test)
 
 
 @pytest.mark.parametrize("name", [name for name in MODELS if not MODELS[name].several_carriers])
@@ -100,8 +102,8 @@ def test_carriers_are_interpolated_separately(name: str, flat: Record, tmp_path:
         np.testing.assert_array_equal(read.prediction[:, carriers == carrier], alone.prediction)
     again = open_run(run.folder, flat)
     heading = flat.tx_heading_rad[read.row] if name in ("kriging", "trees") else None
-    found = again.predict(flat.tx_pos_m[read.row], 1, heading, carriers_hz=carriers).mean
-    np.testing.assert_array_equal(found.astype(np.float32), read.prediction[1])
+    predicted = again.predict(flat.tx_pos_m[read.row], 1, heading, carriers_hz=carriers).mean
+    np.testing.assert_array_equal(predicted.astype(np.float32), read.prediction[1])
 
 
 def test_predictions_of_several_carriers(flat: Record, flat_folder: Path, tmp_path: Path) -> None:
@@ -115,8 +117,8 @@ def test_predictions_of_several_carriers(flat: Record, flat_folder: Path, tmp_pa
     np.testing.assert_allclose(between, (low + high) / 2, rtol=1e-6)
     beyond = run.predict(place, carriers_hz=[0.1 * LOW, 10 * HIGH]).mean
     np.testing.assert_array_equal(beyond, np.stack([low[:, 0], high[:, 1]], axis=1))
-    one = train(flat_folder, "idw", out=tmp_path / "one")
-    refusal(one.predict, place, "its data have one carrier; omit frequency_hz", carriers_hz=[LOW, LOW])
+    single_carrier = train(flat_folder, "idw", out=tmp_path / "one")
+    refusal(single_carrier.predict, place, "its data have one carrier; omit frequency_hz", carriers_hz=[LOW, LOW])
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -133,19 +135,21 @@ def test_a_carrier_is_predicted_from_the_others(name: str, flat: Record, tmp_pat
         observation=(np.tile(flat.observation, 3) - loss).astype(np.float32),
         official=None,
     )
-    found = read_run(
+    results = read_run(
         train(three, name, out=tmp_path / "run", split="frequency-known:1", settings=SETTINGS[name]).folder
     )
-    assert (carriers[found.row] == middle).all()
-    step = found.references["idw"] - found.references[CARRIER]
+    assert (carriers[results.row] == middle).all()
+    step = results.references["idw"] - results.references[CARRIER]
     np.testing.assert_allclose(step, -20 * np.log10(middle / LOW), atol=FLOAT32_DB)  # the lower of two as near
     lowest = Split("lowest", 0, np.arange(n), np.zeros(0, np.int64), np.arange(2 * n, 3 * n))
     low = train(three, name, out=tmp_path / "low", split=lowest, settings=SETTINGS[name])
-    turned = heading[found.row] if name in ("kriging", "trees") else None
+    turned = heading[results.row] if name in ("kriging", "trees") else None
     for receiver in range(len(flat.receivers)):
-        known = low.predict(three.tx_pos_m[found.row], receiver, turned, carriers_hz=np.full(len(found.row), LOW)).mean
-        expected = known - 20 * np.log10(middle / LOW)
-        np.testing.assert_allclose(found.prediction[receiver], expected, atol=FLOAT32_DB)
+        low_dbm = low.predict(
+            three.tx_pos_m[results.row], receiver, turned, carriers_hz=np.full(len(results.row), LOW)
+        ).mean
+        expected = low_dbm - 20 * np.log10(middle / LOW)
+        np.testing.assert_allclose(results.prediction[receiver], expected, atol=FLOAT32_DB)
 
 
 def test_predictions_take_and_state_carriers(flat: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -155,8 +159,8 @@ def test_predictions_take_and_state_carriers(flat: Record, tmp_path: Path, capsy
     np.savetxt(tmp_path / "tx.csv", table, "%.17g", ",", header="x,y,z,frequency_hz", comments="")
     np.savez(tmp_path / "tx.npz", tx_pos=table[:, :3], frequency_hz=table[:, 3])
     expected = [run.predict(table[:, :3], r, carriers_hz=table[:, 3]).mean for r in (0, 1)]
-    for option, given, out in (("--tx", "tx.csv", "out.csv"), ("--input", "tx.npz", "out.npz")):
-        status, _, err = call(["predict", run.folder, option, tmp_path / given, "--out", tmp_path / out], capsys)
+    for option, input_name, out in (("--tx", "tx.csv", "out.csv"), ("--input", "tx.npz", "out.npz")):
+        status, _, err = call(["predict", run.folder, option, tmp_path / input_name, "--out", tmp_path / out], capsys)
         assert status == 0, err
     written = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
     assert written.dtype.names == ("x", "y", "z", "frequency_hz", "anchor1_dbm", "anchor2_dbm")
@@ -174,8 +178,8 @@ def test_direct_paths_have_the_free_space_loss_of_each_row(flat: Record, room: P
     rx = np.stack([receiver.position_m for receiver in flat.receivers])
     distance = np.linalg.norm(flat.tx_pos_m - rx[:, None], axis=-1)
     loss = 20 * np.log10(speed_of_light / flat.carriers_hz / (4 * np.pi * distance))
-    known = flat.official[0]
-    expected = loss + np.median((flat.observation - loss)[:, known], axis=1, keepdims=True)
+    training_rows = flat.official[0]
+    expected = loss + np.median((flat.observation - loss)[:, training_rows], axis=1, keepdims=True)
     read = read_run(run.folder)
     assert read.prediction == pytest.approx(expected[:, read.row], abs=FLOAT32_DB)
     # Traced anew at another carrier than any row had.
@@ -186,8 +190,8 @@ def test_direct_paths_have_the_free_space_loss_of_each_row(flat: Record, room: P
 def spectra_of(record: Record) -> Record:
     """A record of spectra by arrays at the same receivers."""
     grey = np.zeros((len(record.receivers), len(record), 9, 24), np.float32)
-    own = replace(record, task="spectrum", observation=grey, tx_heading_rad=None)
-    return own.with_array(planar_array(3, 3, 0.05))
+    spectra = replace(record, task="spectrum", observation=grey, tx_heading_rad=None)
+    return spectra.with_array(planar_array(3, 3, 0.05))
 
 
 @pytest.mark.parametrize("make", [lambda record: record, spectra_of])
@@ -197,24 +201,24 @@ def test_reflections_equal_a_trace_at_the_carrier(make: Callable[[Record], Recor
     carriers, tx = record.carriers_hz[rows], record.tx_pos_m[rows]
     tracer = RayTracer(room, instrument_of(record.at_carrier(2.4e9)), options)
     traced = tracer.trace(tx, carriers_hz=carriers)
-    found = tracer.observe(traced)
+    observed = tracer.observe(traced)
     halves = [tracer.trace(tx[part], carriers_hz=carriers[part]) for part in (slice(4), slice(4, None))]
-    np.testing.assert_allclose(tracer.observe(join_traces(halves)), found, atol=FLOAT32_DB)
+    np.testing.assert_allclose(tracer.observe(join_traces(halves)), observed, atol=FLOAT32_DB)
     for carrier in (LOW, HIGH):
         alone = RayTracer(room, instrument_of(record.at_carrier(carrier)), options)(tx)
-        own = carriers == carrier
+        at_carrier = carriers == carrier
         tolerance = GREY if record.task.name == "spectrum" else FLOAT32_DB
-        np.testing.assert_allclose(found[:, own], alone[:, own], atol=tolerance)
-        assert not np.allclose(found[:, ~own], alone[:, ~own], atol=0.05)
+        np.testing.assert_allclose(observed[:, at_carrier], alone[:, at_carrier], atol=tolerance)
+        assert not np.allclose(observed[:, ~at_carrier], alone[:, ~at_carrier], atol=0.05)
 
 
 def test_cross_polarisation_is_judged_at_one_carrier(flat: Record, room: Path) -> None:
     tracer = RayTracer(room, instrument_of(flat.at_carrier(LOW)), TraceOptions(depth=2, rays=20000))
     traced = tracer.trace(flat.tx_pos_m, carriers_hz=np.full(len(flat), 100 * LOW))
-    here = recompute(traced, tracer.scene)
-    assert here.carriers_hz is None
-    direct = here.paths.bounces == 0
-    np.testing.assert_allclose(np.abs(here.paths.gain / traced.paths.gain)[direct], 100, rtol=1e-4)
+    recomputed = recompute(traced, tracer.scene)
+    assert recomputed.carriers_hz is None
+    direct = recomputed.paths.bounces == 0
+    np.testing.assert_allclose(np.abs(recomputed.paths.gain / traced.paths.gain)[direct], 100, rtol=1e-4)
     # The turned antenna brings at LOW about what the stated one, which nothing is wrong with, brings at 100 LOW.
     assert cross_polarized(traced, tracer.scene) == {}
 
@@ -238,12 +242,12 @@ def test_one_target_error_and_unknown_materials_are_refused(flat: Record, room: 
 
 
 def test_reference_interpolates_rows_of_the_same_carrier(flat: Record) -> None:
-    known, rows = flat.official
+    training_rows, rows = flat.official
     key = reference_key("idw")
-    split = Split("two", 0, known, known[:0], rows)
-    found = reference_arrays(flat, split)[key]
+    split = Split("two", 0, training_rows, training_rows[:0], rows)
+    reference = reference_arrays(flat, split)[key]
     shifted = replace(flat, observation=flat.observation + np.where(flat.carriers_hz == LOW, 30, 0).astype(np.float32))
-    moved = reference_arrays(shifted, split)[key] - found
+    moved = reference_arrays(shifted, split)[key] - reference
     np.testing.assert_allclose(moved, [np.where(flat.carriers_hz[rows] == LOW, 30, 0)] * 2, atol=FLOAT32_DB)
 
 
@@ -251,10 +255,13 @@ def test_data_command_shows_carriers_readings_and_noise(flat: Record, tmp_path: 
     shape = flat.observation.shape
     readings = np.ones(shape, np.int64)
     readings[:, ::2] = 5
-    own = replace(flat, n_readings=readings, std=np.linspace(1, 3, readings.size).reshape(shape))
+    extended_record = replace(flat, n_readings=readings, std=np.linspace(1, 3, readings.size).reshape(shape))
     # Runs are shown in the order of their first rows, as they are read: training rows first.
-    own = replace(own, runs=np.where(np.isin(np.arange(len(own)), own.official[1]), "early", "late"))
-    folder = write_ble_folder(tmp_path / "flat", own)
+    extended_record = replace(
+        extended_record,
+        runs=np.where(np.isin(np.arange(len(extended_record)), extended_record.official[1]), "early", "late"),
+    )
+    folder = write_ble_folder(tmp_path / "flat", extended_record)
     status, out, _ = call(["data", "info", folder, "--json"], capsys)
     shown = json.loads(out)
     assert (status, shown["carriers_hz"]) == (0, {str(LOW): 10, str(HIGH): 20})

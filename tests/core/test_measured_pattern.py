@@ -110,10 +110,10 @@ def test_attenuations_of_two_cuts_add_up(write: Callable[[Path, Gain], Path], tm
 
 
 def test_gains_of_planet_files_are_over_a_dipole_by_default(tmp_path: Path) -> None:
-    known = [
+    antennas = [
         Antenna(str(planet(tmp_path / "a.pln", beam, line))) for line in ("GAIN 5", "GAIN 5.0 dBd", "GAIN 7.15 dBi")
     ]
-    assert {round(a.measured.peak_dbi, 6) for a in known if a.measured} == {7.15}
+    assert {round(a.measured.peak_dbi, 6) for a in antennas if a.measured} == {7.15}
 
 
 def test_derivatives_and_phases_with_drjit(tmp_path: Path) -> None:

@@ -83,11 +83,11 @@ def sounder(path: Path, symbols: int = 4, group: str = "Data", cells: int = 1, *
 
 def assert_found(record: Any, symbols: int, frames: Any = slice(None)) -> None:
     expected = truth()[frames].reshape(-1, ANTENNAS, 52)
-    found = np.concatenate([record.uplink, record.observation[0]], axis=-1)
-    assert found.shape == expected.shape
+    read_channels = np.concatenate([record.uplink, record.observation[0]], axis=-1)
+    assert read_channels.shape == expected.shape
     # A bin adds 64 samples of noise; rounding to whole steps adds 1/12 to its variance.
     deviation = np.sqrt(64 * 2 * (NOISE**2 + 1 / 12) / symbols) / 2**15
-    error = np.abs(found - expected)
+    error = np.abs(read_channels - expected)
     assert error.max() < DEVIATIONS * deviation
     assert error.std() > deviation / 10  # so that the bound means something
     assert np.abs(expected).mean() > 20 * deviation

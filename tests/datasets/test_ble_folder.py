@@ -166,10 +166,10 @@ def with_columns(folder: Path, **columns: list[str]) -> Path:
 
 def test_antennas_are_read(tmp_path: Path):
     plain = read_ble_folder(write_flat(tmp_path / "plain"))
-    assert {one.antenna for one in plain.receivers} | {plain.tx_antenna} == {Antenna()}
+    assert {receiver.antenna for receiver in plain.receivers} | {plain.tx_antenna} == {Antenna()}
     columns = {"pattern": ["dipole", ""], "polarization": ["", "H"], "tx_polarization": ["H", "H"]}
     record = read_ble_folder(with_columns(write_flat(tmp_path / "own"), **columns))
-    assert [one.antenna for one in record.receivers] == [Antenna("dipole"), Antenna("iso", "H")]
+    assert [receiver.antenna for receiver in record.receivers] == [Antenna("dipole"), Antenna("iso", "H")]
     assert record.tx_antenna == Antenna("iso", "H")
 
 
@@ -259,11 +259,11 @@ WRONG["noise: in one file"] = (
 
 
 def test_written_record_is_read_again(folder: Path, tmp_path: Path):
-    own = read_ble_folder(with_noise(with_columns(folder, pattern=["", "dipole"], tx_polarization=["H", "H"])))
+    original = read_ble_folder(with_noise(with_columns(folder, pattern=["", "dipole"], tx_polarization=["H", "H"])))
     names = ("hall, upper", "anchorage")
-    named = tuple(replace(receiver, name=name) for receiver, name in zip(own.receivers, names, strict=True))
-    for record in (own, replace(own, receivers=named, n_readings=None, tx_heading_rad=None)):
-        again = read_ble_folder(write_ble_folder(tmp_path / record.receivers[0].name, record), own.name)
+    named = tuple(replace(receiver, name=name) for receiver, name in zip(original.receivers, names, strict=True))
+    for record in (original, replace(original, receivers=named, n_readings=None, tx_heading_rad=None)):
+        again = read_ble_folder(write_ble_folder(tmp_path / record.receivers[0].name, record), original.name)
         assert_same(again, record)
 
 
@@ -303,10 +303,10 @@ def test_the_run_of_each_row_is_read_and_written(folder: Path, tmp_path: Path):
 
 def test_the_carrier_of_each_row_is_read_and_written(folder: Path, tmp_path: Path):
     record, carriers = read_ble_folder(folder), np.array([2.402e9, 2.426e9, 2.48e9, 2.402e9, 2.48e9])
-    for own in (record.at_carriers(carriers), record.at_carrier(868e6), record):
-        again = read_ble_folder(write_ble_folder(tmp_path / "again", own, replace=True))
-        np.testing.assert_equal(again.carriers_hz, own.carriers_hz)
-        np.testing.assert_equal(again.frequencies_hz, own.frequencies_hz)
+    for carrier_record in (record.at_carriers(carriers), record.at_carrier(868e6), record):
+        again = read_ble_folder(write_ble_folder(tmp_path / "again", carrier_record, replace=True))
+        np.testing.assert_equal(again.carriers_hz, carrier_record.carriers_hz)
+        np.testing.assert_equal(again.frequencies_hz, carrier_record.frequencies_hz)
     text(TEST_FILE, "ts", "frequency_hz")(folder)
     refusal(read_ble_folder, folder, rf"{TRAIN_FILE}: line 1: no column frequency_hz, but {TEST_FILE} has one")
     text(TRAIN_FILE, ",ts", ",frequency_hz")(folder)

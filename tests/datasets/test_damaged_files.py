@@ -195,7 +195,7 @@ def samples(folder: Path, flat_folder: Path, room: Path, tmp_path_factory: pytes
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_refused_in_one_line_or_give_finite_numbers(name: str, samples: Path) -> None:
     file, read = samples / name, READERS[name]
-    whole = file.read_bytes()
+    undamaged_bytes = file.read_bytes()
 
     def assert_finite() -> None:
         for numbers in read(file):
@@ -206,10 +206,10 @@ def test_damaged_files_are_refused_in_one_line_or_give_finite_numbers(name: str,
         deadline=DEADLINE,
         suppress_health_check=list(HealthCheck),
     )
-    @given(damaged(whole))
+    @given(damaged(undamaged_bytes))
     @example(b"")
-    @example(whole.replace(b"1.0", b"\x80", 1))
-    @example(whole.decode("latin-1").encode("utf-16"))
+    @example(undamaged_bytes.replace(b"1.0", b"\x80", 1))
+    @example(undamaged_bytes.decode("latin-1").encode("utf-16"))
     def refused_or_finite(content: bytes) -> None:
         file.write_bytes(content)
         message = ""
@@ -227,7 +227,7 @@ def test_damaged_files_are_refused_in_one_line_or_give_finite_numbers(name: str,
         refused_or_finite()
     finally:
         resource.setrlimit(resource.RLIMIT_AS, limits)
-        file.write_bytes(whole)
+        file.write_bytes(undamaged_bytes)
 
 
 def picture(size: int) -> bytes:

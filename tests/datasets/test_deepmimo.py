@@ -218,10 +218,10 @@ def test_command_summarises_and_trains_on_a_scenario(tmp_path: Path, command: Co
     folder = scenario(tmp_path, stations=2, users=(60,))
     command.refused(["data", "info", folder], r"2 base stations, 0 to 1; choose in channel_params\.yml")
     (folder / CHANNEL_PARAMS).write_text("base_stations: all\nofdm: {bandwidth: 10e6, selected_subcarriers: [0, 256]}")
-    found = command.json(["data", "info", folder])
-    assert (found["task"], found["rows"], found["observation"]) == ("csi", 60, [2])
-    assert found["receivers"] == {"bs0": 59, "bs1": 59}
-    np.testing.assert_allclose(found["frequencies_hz"], [CARRIER_HZ, CARRIER_HZ + 5e6])
+    summary = command.json(["data", "info", folder])
+    assert (summary["task"], summary["rows"], summary["observation"]) == ("csi", 60, [2])
+    assert summary["receivers"] == {"bs0": 59, "bs1": 59}
+    np.testing.assert_allclose(summary["frequencies_hz"], [CARRIER_HZ, CARRIER_HZ + 5e6])
     metrics = command.json(["train", folder, "--model", "kriging", "--out", tmp_path / "run"])
     assert (metrics["task"], metrics["n_test"]) == ("csi", 12)
     assert set(metrics["receivers"]) == {"bs0", "bs1"}

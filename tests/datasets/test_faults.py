@@ -68,10 +68,10 @@ def test_wrong_data_are_refused_in_one_line_that_collection_finds(layout: str, c
     _, file, message = LAYOUTS[layout][1][case]
     line = refusal(load, folder, message)
     assert Path(line.partition(": ")[0]).name == file
-    found = lines(folder)
+    fault_lines = lines(folder)
     first = line.partition(" (")[0]  # what stands in brackets may be another library's message
-    assert any(line.startswith(first) for line in found)
-    assert len(set(found)) == len(found)
+    assert any(line.startswith(first) for line in fault_lines)
+    assert len(set(fault_lines)) == len(fault_lines)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -107,7 +107,7 @@ def test_faults_of_all_files_are_collected(tmp_path: Path) -> None:
     write("blocked_folds.txt", "0\none\n")(folder)
     record, faults = collect_faults(lambda: load(folder))
     assert record is None
-    found = [(fault.file.name, fault.place, fault.row) for fault in faults if isinstance(fault, DataFault)]
+    data_faults = [(fault.file.name, fault.place, fault.row) for fault in faults if isinstance(fault, DataFault)]
     expected = [
         *(("tx_pos.csv", f"row {row}", row) for row in (5, 2, 2)),  # number of fields, x and z
         *((f"0000{row}.png", f"row {row}", row) for row in (3, 4)),
@@ -115,8 +115,8 @@ def test_faults_of_all_files_are_collected(tmp_path: Path) -> None:
         *((name, "", None) for name in ("gateway_info.yml", "00099.png", "test_index.txt")),
         *(("blocked_folds.txt", place, None) for place in ("line 2", "", "")),  # number of lines, and a single fold
     ]
-    assert sorted(found, key=str) == sorted(expected, key=str)
-    assert len(faults) == len(found)
+    assert sorted(data_faults, key=str) == sorted(expected, key=str)
+    assert len(faults) == len(data_faults)
 
 
 def test_every_faulty_field_is_collected_once(tmp_path: Path) -> None:
@@ -151,8 +151,8 @@ def test_faults_of_columns_are_the_only_ones(rows: str, count: int, message: str
     folder = made(tmp_path / "data", "ble")
     for name in (ble.TRAIN_FILE, ble.TEST_FILE):
         (folder / name).write_text(rows.format(header=(folder / name).read_text().splitlines()[0]))
-    found = lines(folder)
-    assert [bool(re.search(message, line)) for line in found] == [True] * count
+    fault_lines = lines(folder)
+    assert [bool(re.search(message, line)) for line in fault_lines] == [True] * count
 
 
 @needs("flat-ble")

@@ -31,7 +31,7 @@ def folder(tmp_path: Path) -> Path:
 def test_reads_a_folder(folder: Path) -> None:
     record = load(folder)
     assert (record.task.name, record.source) == ("rssi", str(folder))
-    assert [one.name for one in record.receivers] == ["gateway1", "gateway2"]
+    assert [receiver.name for receiver in record.receivers] == ["gateway1", "gateway2"]
     np.testing.assert_array_equal(record.receivers[1].position_m, [4, 5, 6])
     np.testing.assert_array_equal(record.receivers[1].to_world, np.eye(3))
     np.testing.assert_array_equal(record.tx_pos_m, [[0.5, 1.5, 1], [0.25, 1.75, 1], [1, 2, 1.5], [1.25, 2, 1]])

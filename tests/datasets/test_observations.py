@@ -87,18 +87,18 @@ def test_fields_need_every_receiver_in_every_row(two_gateways: Record, tmp_path:
 def test_rows_that_test_are_counted_and_not_scored(train: Any, two_gateways: Record, tmp_path: Path) -> None:
     a, b, c = (int(row) for row in official(two_gateways).test[:3])
     broken = changed(two_gateways, ((0, a, 4, 5), np.nan), ((1, b), np.inf), ((1, c), np.nan))
-    whole, found = train(two_gateways, out=tmp_path / "whole"), train(broken, out=tmp_path / "broken")
-    metrics = json.loads((found / "metrics.json").read_text())
+    complete_run, broken_run = train(two_gateways, out=tmp_path / "whole"), train(broken, out=tmp_path / "broken")
+    metrics = json.loads((broken_run / "metrics.json").read_text())
     assert metrics["n_not_scored"] == 2
-    assert json.loads((whole / "metrics.json").read_text())["n_not_scored"] == 0
+    assert json.loads((complete_run / "metrics.json").read_text())["n_not_scored"] == 0
     rows = len(official(two_gateways).test)
     names = [receiver.name for receiver in two_gateways.receivers]
     assert [metrics["receivers"][name]["n_test"] for name in names] == [rows - 1, rows - 2]
-    np.testing.assert_array_equal(stored(found)["prediction"], stored(whole)["prediction"])
-    assert np.isnan(stored(found)["truth"]).reshape(2, rows, -1).all(axis=2).sum(axis=1).tolist() == [1, 2]
+    np.testing.assert_array_equal(stored(broken_run)["prediction"], stored(complete_run)["prediction"])
+    assert np.isnan(stored(broken_run)["truth"]).reshape(2, rows, -1).all(axis=2).sum(axis=1).tolist() == [1, 2]
     assert np.isfinite(list(metrics["ssim"].values())).all()
     if train is train_idw:
-        compare([found, whole], tmp_path / "compare")
+        compare([broken_run, complete_run], tmp_path / "compare")
 
 
 def test_a_split_without_a_finite_test_row_is_refused(two_gateways: Record) -> None:
@@ -108,8 +108,8 @@ def test_a_split_without_a_finite_test_row_is_refused(two_gateways: Record) -> N
     refusal(evaluate, broken, split, lambda rows, receiver: broken.observation[receiver, rows], message)
     # Observations that are finite or missing stay.
     missed = changed(two_gateways, ((0, 3), np.nan)).observation
-    kept, count = scorable(missed)
-    assert (kept is missed, count) == (True, 0)
+    scorable_split, count = scorable(missed)
+    assert (scorable_split is missed, count) == (True, 0)
 
 
 @pytest.mark.parametrize("arguments", [{}, {"model": "ray-tracing", "scene": "room"}, {"model": "kriging"}], ids=str)

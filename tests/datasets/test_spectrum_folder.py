@@ -253,9 +253,9 @@ def test_attributes_beyond_the_layout_are_not_written(tmp_path: Path, case: str)
 def test_equal_carriers_of_rows_are_one(tmp_path: Path):
     folder = write_spectrum_folder(tmp_path / "made-up", ONE)
     (folder / POS).write_text("x,y,z,frequency_hz\n" + "1,2,3,868e6\n" * 4)
-    one = read_spectrum_folder(folder)
-    np.testing.assert_array_equal(one.frequencies_hz, [868e6])
-    assert one.carriers_hz is None
+    record = read_spectrum_folder(folder)
+    np.testing.assert_array_equal(record.frequencies_hz, [868e6])
+    assert record.carriers_hz is None
     append(YML, "frequency_hz: 868e6")(folder)
     refusal(read_spectrum_folder, folder, r"tx_pos.csv: line 1: column frequency_hz, but gateway_info.yml states a car")
 

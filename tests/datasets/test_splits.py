@@ -91,11 +91,11 @@ def test_blocks_are_the_tightest_of_several_starts():
 
 def several_carriers(official: bool) -> Record:
     """50 positions at three carriers."""
-    one = make_record()
-    tests = np.concatenate([one.official[1] + 50 * number for number in range(3)])
+    record = make_record()
+    tests = np.concatenate([record.official[1] + 50 * number for number in range(3)])
     return replace(
-        one,
-        tx_pos_m=np.tile(one.tx_pos_m, (3, 1)),
+        record,
+        tx_pos_m=np.tile(record.tx_pos_m, (3, 1)),
         observation=np.zeros((1, 150), np.float32),
         carriers_hz=np.repeat([5e9, 1e9, 2e9], 50),
         official=(np.setdiff1d(np.arange(150), tests), tests) if official else None,
@@ -106,9 +106,9 @@ def several_carriers(official: bool) -> Record:
 @pytest.mark.parametrize("official", [True, False])
 def test_carriers_and_positions_are_held_out_together(official: bool):
     record = several_carriers(official)
-    splits, known = (make_splits(record, name, seed=2) for name in ("frequency", "frequency-known"))
+    splits, known_splits = (make_splits(record, name, seed=2) for name in ("frequency", "frequency-known"))
     assert [split.name for split in splits] == ["frequency:0", "frequency:1", "frequency:2"]
-    for split, beside, carrier_hz in zip(splits, known, [1e9, 2e9, 5e9], strict=True):
+    for split, beside, carrier_hz in zip(splits, known_splits, [1e9, 2e9, 5e9], strict=True):
         assert_partition(split, 150, all_rows=False)
         assert (record.carriers_hz[split.test] == carrier_hz).all()
         assert carrier_hz not in record.carriers_hz[split.all_train]
@@ -125,12 +125,12 @@ def test_carriers_and_positions_are_held_out_together(official: bool):
 
 def several_receivers(count: int, official: bool = True) -> Record:
     """50 positions; each receiver misses a row in ten, and the last one the rows from 20 on."""
-    one = make_record()
+    record = make_record()
     observation = np.zeros((count, 50), np.float32)
     observation[np.arange(50) % 10 == np.arange(count)[:, None] % 10] = np.nan
     observation[-1, 20:] = np.nan
-    receivers = tuple(replace(one.receivers[0], name=f"gateway{number}") for number in range(count))
-    return replace(one, receivers=receivers, observation=observation, official=one.official if official else None)
+    receivers = tuple(replace(record.receivers[0], name=f"gateway{number}") for number in range(count))
+    return replace(record, receivers=receivers, observation=observation, official=record.official if official else None)
 
 
 @pytest.mark.parametrize(("count", "folds"), [(3, 3), (16, 4)])
@@ -143,10 +143,10 @@ def test_each_receiver_is_held_out_once(count: int, folds: int, official: bool):
     (base,) = make_splits(record, "official" if official else "random", seed=3)
     received = np.isfinite(record.observation)
     for split in splits:
-        held = list(split.held_receivers)
-        others = np.setdiff1d(np.arange(count), held)
-        assert abs(len(held) - count / folds) < 1
-        np.testing.assert_array_equal(split.test, base.test[received[held][:, base.test].any(axis=0)])
+        held_receivers = list(split.held_receivers)
+        others = np.setdiff1d(np.arange(count), held_receivers)
+        assert abs(len(held_receivers) - count / folds) < 1
+        np.testing.assert_array_equal(split.test, base.test[received[held_receivers][:, base.test].any(axis=0)])
         np.testing.assert_array_equal(split.all_train, base.all_train[received[others][:, base.all_train].any(axis=0)])
     (second,) = make_splits(record, "receiver:1", seed=3)
     assert_same(second, splits[1])
@@ -160,9 +160,9 @@ def test_rows_are_left_to_held_out_receivers():
         np.testing.assert_array_equal(split.left[:, 0], np.ones(count))
         assert np.isin(split.left[:, 1], split.all_train).all()
         np.testing.assert_array_equal(split.all_train, none.all_train)
-        seen = record.seen(split).observation
-        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(seen[1])), split.left[:, 1])
-        np.testing.assert_array_equal(seen[[0, 2]], record.observation[[0, 2]])
+        observed = record.seen(split).observation
+        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(observed[1])), split.left[:, 1])
+        np.testing.assert_array_equal(observed[[0, 2]], record.observation[[0, 2]])
     assert set(few.left[:, 1]) < set(more.left[:, 1])
 
 
@@ -195,8 +195,8 @@ def test_splits_depend_on_the_seed():
         again, same, other = (make_splits(record, rule, seed=seed)[0] for seed in (5, 5, 6))
         np.testing.assert_array_equal(again.validation, same.validation)
         assert set(again.validation.tolist()) != set(other.validation.tolist())
-    one, two = (make_splits(record, "random", seed=seed)[0] for seed in (5, 6))
-    assert set(one.test.tolist()) != set(two.test.tolist())
+    first, second = (make_splits(record, "random", seed=seed)[0] for seed in (5, 6))
+    assert set(first.test.tolist()) != set(second.test.tolist())
     # The blocks belong to the data: no seed moves them.
     blocks, same_blocks = ([split.test for split in make_splits(record, "blocked", seed=seed)] for seed in (5, 6))
     np.testing.assert_equal(blocks, same_blocks)
@@ -225,17 +225,17 @@ SEEDED = st.sampled_from(["official", "random", "trajectory"])
 @given(st.integers(5, 120), st.integers(1, 100), st.integers(1, 100), FRACTIONS, st.integers(0, 2**32 - 1), SEEDED)
 def test_subsets_are_nested_validation_included(rows, smaller, larger, fraction, seed, rule):
     record = make_record(rows)
-    whole = make_splits(record, rule, seed, validation_fraction=fraction)[0]
-    counts = sorted(min(count, len(whole.all_train)) for count in (smaller, larger))
+    full_split = make_splits(record, rule, seed, validation_fraction=fraction)[0]
+    counts = sorted(min(count, len(full_split.all_train)) for count in (smaller, larger))
     few, many = (make_splits(record, rule, seed, count, fraction)[0] for count in counts)
     for split, count in zip((few, many), counts, strict=True):
         assert_partition(split, rows, all_rows=False)
         assert len(split.all_train) == count
         assert len(split.train) >= 1
         assert len(split.validation) == int(np.ceil(round((count - 1) * fraction, 9)))
-        np.testing.assert_array_equal(split.test, whole.test)
-    assert set(few.train) <= set(many.train) <= set(whole.train)
-    assert set(few.validation) <= set(many.validation) <= set(whole.validation)
+        np.testing.assert_array_equal(split.test, full_split.test)
+    assert set(few.train) <= set(many.train) <= set(full_split.train)
+    assert set(few.validation) <= set(many.validation) <= set(full_split.validation)
 
 
 @pytest.mark.parametrize(
@@ -311,8 +311,8 @@ def test_bad_split_files_are_refused(tmp_path: Path):
     np.savez(path, train=np.arange(3))
     refusal(load_split, path, "not readable")
     rows = np.arange(3)
-    whole = Split("a", 0, rows, rows + 3, rows + 6)
-    head: dict[str, Any] = {"format": SPLIT_FORMAT, **to_arrays(whole)}
+    full_split = Split("a", 0, rows, rows + 3, rows + 6)
+    head: dict[str, Any] = {"format": SPLIT_FORMAT, **to_arrays(full_split)}
     for wrong, message in (
         ({"validation": rows, "test": rows + 3}, "twice"),
         ({"validation": rows + 3, "test": rows - 9}, "whole numbers"),

@@ -73,11 +73,11 @@ def test_receivers_and_rows_are_in_one_frame(tmp_path: Path) -> None:
     lon, lat = to_degrees.transform(*PLACES_M.T)
     frame = wide().drop(columns=["x", "y"]).assign(latitude=lat, longitude=lon)
     record = imported(tmp_path, frame, anchors=tmp_path / "anchors.csv")
-    stated = {receiver.name.removeprefix("anchor"): receiver.position_m for receiver in record.receivers}
-    assert {ap: place[2] for ap, place in stated.items()} == {"kitchen": 2.0, "hall": 2.5, "7": 3.0}
-    shift_m = stated["kitchen"][:2] - APS_M["kitchen"]
+    positions_m = {receiver.name.removeprefix("anchor"): receiver.position_m for receiver in record.receivers}
+    assert {ap: place[2] for ap, place in positions_m.items()} == {"kitchen": 2.0, "hall": 2.5, "7": 3.0}
+    shift_m = positions_m["kitchen"][:2] - APS_M["kitchen"]
     for ap, place in APS_M.items():
-        np.testing.assert_allclose(stated[ap][:2] - shift_m, place, atol=1e-3)
+        np.testing.assert_allclose(positions_m[ap][:2] - shift_m, place, atol=1e-3)
     shifted_m = record.tx_pos_m[:, :2] - shift_m
     assert max(np.linalg.norm(shifted_m - place, axis=1).min() for place in PLACES_M) < 1e-3
     facts = yaml.safe_load((tmp_path / "data" / "import.yml").read_text())
@@ -137,11 +137,11 @@ def test_further_columns_are_kept(tmp_path: Path) -> None:
     frame = wide().assign(**{"hall RTT(mm)": np.arange(30.0), "operator": "a", "count_x": 3})
     imported(tmp_path, pandas.concat([frame, frame.assign(operator="b")]))
     tables = [pandas.read_csv(path) for path in (tmp_path / "data").glob("*.csv")]
-    kept = pandas.concat([table for table in tables if "rssi_hall" in table])
-    order = [int(np.argmin(np.linalg.norm(kept[["x", "y"]] - place, axis=1))) for place in PLACES_M]
-    np.testing.assert_allclose(kept["hall RTT(mm)"].iloc[order], np.arange(30.0))
-    assert set(kept.operator) == {"a|b"}
-    assert set(kept.source_count_x) == {3}
+    source_table = pandas.concat([table for table in tables if "rssi_hall" in table])
+    order = [int(np.argmin(np.linalg.norm(source_table[["x", "y"]] - place, axis=1))) for place in PLACES_M]
+    np.testing.assert_allclose(source_table["hall RTT(mm)"].iloc[order], np.arange(30.0))
+    assert set(source_table.operator) == {"a|b"}
+    assert set(source_table.source_count_x) == {3}
 
 
 def of_two_devices(frame: Any) -> Any:
@@ -176,8 +176,8 @@ def test_receivers_of_a_scan_have_their_carriers(tmp_path: Path) -> None:
     mhz = {"kitchen": 2412, "hall": 5180, "7": 2412}
     record = imported(tmp_path, long().assign(frequency=long().bssid.map(mhz)))
     carriers = zip(record.receivers, record.receiver_carriers_hz, strict=True)
-    stated = {receiver.name.removeprefix("anchor"): hz for receiver, hz in carriers}
-    assert stated == {ap: 1e6 * carrier for ap, carrier in mhz.items()}
+    carrier_of_ap = {receiver.name.removeprefix("anchor"): hz for receiver, hz in carriers}
+    assert carrier_of_ap == {ap: 1e6 * carrier for ap, carrier in mhz.items()}
     assert len(record) == len(PLACES_M)
 
 

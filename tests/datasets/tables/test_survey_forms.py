@@ -88,8 +88,8 @@ GNETTRACK = (
 
 def test_serving_cell_and_neighbours_of_gnettrack_are_receivers(tmp_path: Path) -> None:
     report = imported(tmp_path, written(tmp_path, "log.txt", GNETTRACK))
-    found = {name: sorted(values.values()) for name, values in strengths(report.record).items()}
-    assert found == {"anchor17": [-88, -80], "anchor42": [-95, -84], "anchor3": [-99]}
+    strengths_dbm = {name: sorted(values.values()) for name, values in strengths(report.record).items()}
+    assert strengths_dbm == {"anchor17": [-88, -80], "anchor42": [-95, -84], "anchor3": [-99]}
     columns = "id=CellID,rssi=Level"
     serving = strengths(imported(tmp_path, tmp_path / "log.txt", columns=columns).record)
     assert {name: list(values.values()) for name, values in serving.items()} == {"anchor5": [-80], "anchor6": [-84]}
@@ -215,8 +215,8 @@ def test_cells_of_opencellid_are_anchors(header: str, ids: list[str], tmp_path: 
     anchors = written(tmp_path, "262.csv", OPENCELLID)
     report = imported(tmp_path, file, anchors=anchors)
     position_m = {receiver.name: receiver.position_m for receiver in report.record.receivers}
-    known = [name for name in position_m if name.endswith("20161")]
-    east_north_m = position_m[known[0]][:2] - report.record.tx_pos_m[0, :2]
+    listed_cells = [name for name in position_m if name.endswith("20161")]
+    east_north_m = position_m[listed_cells[0]][:2] - report.record.tx_pos_m[0, :2]
     np.testing.assert_allclose(east_north_m, [74.6, 55.6], atol=0.1)  # 0.001 and 0.0005 degrees at 48 degrees
     assert np.isnan(next(place for name, place in position_m.items() if name.endswith("99"))).all()
 
@@ -277,9 +277,9 @@ def test_dumps_of_bermuda_are_readings_of_scanners(tmp_path: Path) -> None:
         files.append(written(tmp_path, f"{name}.json", json.dumps({"02:00:00:00:00:99": device})))
     spots = written(tmp_path, "spots.csv", "file,x,y\np.json,0,0\nq.json,3,1\n")
     record = import_measurements(files, tmp_path / "data", positions=[spots]).record
-    found = strengths(record)
-    assert found[scanners[0]] == {(0.0, 0.0): -50, (3.0, 1.0): -60}
-    assert found[scanners[1]] == {(0.0, 0.0): -60, (3.0, 1.0): -70}
+    readings = strengths(record)
+    assert readings[scanners[0]] == {(0.0, 0.0): -50, (3.0, 1.0): -60}
+    assert readings[scanners[1]] == {(0.0, 0.0): -60, (3.0, 1.0): -70}
     assert set(record.runs) == {"02:00:00:00:00:99"}
 
 
