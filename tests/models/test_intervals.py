@@ -48,11 +48,11 @@ def test_nothing_is_held_out_of_two_rows_or_one_position_and_distances_are_those
     rows, still = np.arange(6), replace(record, tx_pos_m=np.zeros_like(record.tx_pos_m))
     assert hold_out(still, Split("still", 0, rows, rows[:0], rows[:0])) is None
     _, fold = fold_of(record)
-    held = HeldOut.of(record, fold, 0)
-    for place in (0, len(held) // 2, len(held) - 1):
-        known = fold.all_train[np.isfinite(record.observation[held.receiver[place], fold.all_train])]
-        apart = np.linalg.norm(record.tx_pos_m[known] - record.tx_pos_m[held.row[place]], axis=1)
-        assert held.distance_m[place] == pytest.approx(apart.min())
+    held_out = HeldOut.of(record, fold, 0)
+    for place in (0, len(held_out) // 2, len(held_out) - 1):
+        training_rows = fold.all_train[np.isfinite(record.observation[held_out.receiver[place], fold.all_train])]
+        apart = np.linalg.norm(record.tx_pos_m[training_rows] - record.tx_pos_m[held_out.row[place]], axis=1)
+        assert held_out.distance_m[place] == pytest.approx(apart.min())
 
 
 @pytest.mark.parametrize("is_complex", [False, True])
@@ -67,11 +67,11 @@ def test_intervals_cover_new_errors_that_grow_with_size_and_distance(is_complex:
     mean, observed, distance = draw(400)
     intervals = fit_intervals(mean, observed, np.abs(mean), distance, np.arange(400))
     mean, truth, distance = draw(400)
-    found = intervals(mean, np.abs(mean), distance)
-    assert inside_interval(mean, found.stated_std, truth) == pytest.approx(0.9, abs=COVERED)
+    prediction = intervals(mean, np.abs(mean), distance)
+    assert inside_interval(mean, prediction.stated_std, truth) == pytest.approx(0.9, abs=COVERED)
     for part in (distance < 0.3, distance > 0.7):
-        assert inside_interval(mean[part], found.stated_std[part], truth[part]) == pytest.approx(0.9, abs=0.06)
-    assert found.stated_std[distance > 0.7].mean() > 2 * found.stated_std[distance < 0.3].mean()
+        assert inside_interval(mean[part], prediction.stated_std[part], truth[part]) == pytest.approx(0.9, abs=0.06)
+    assert prediction.stated_std[distance > 0.7].mean() > 2 * prediction.stated_std[distance < 0.3].mean()
 
 
 def test_intervals_of_few_rows_are_not_too_narrow():
@@ -88,8 +88,8 @@ def test_intervals_of_few_rows_are_not_too_narrow():
         distance = rng.uniform(0, 1, 30)
         intervals = fit_intervals(mean, observed, np.abs(mean), distance, np.tile(np.arange(15), 2))
         mean, truth = draw(100)
-        found = intervals(mean, np.abs(mean), rng.uniform(0, 1, 100))
-        inside.append(inside_interval(mean, found.stated_std, truth))
+        prediction = intervals(mean, np.abs(mean), rng.uniform(0, 1, 100))
+        inside.append(inside_interval(mean, prediction.stated_std, truth))
     # Of one draw the share varies by 0.06, so that the mean of 100 is known to 0.01; groups of single rows have 0.82.
     assert np.mean(inside) == pytest.approx(0.9, abs=0.03)
 
@@ -106,12 +106,12 @@ def test_intervals_hold_values_of_groups_that_they_do_not_know():
 
     for _ in range(200):
         mean, observed = draw(3)
-        group, ones, here = np.repeat(np.arange(3), 2), np.ones(mean.shape), np.zeros(6)
+        group, ones, distances_m = np.repeat(np.arange(3), 2), np.ones(mean.shape), np.zeros(6)
         new_mean, truth = draw(50)
-        for known in inside:
-            intervals = fit_intervals(mean, observed, ones, here, np.arange(6), group if known else None)
-            found = intervals(new_mean, np.ones(new_mean.shape), np.zeros(100))
-            inside[known].append(inside_interval(new_mean, found.stated_std, truth))
+        for is_known in inside:
+            intervals = fit_intervals(mean, observed, ones, distances_m, np.arange(6), group if is_known else None)
+            prediction = intervals(new_mean, np.ones(new_mean.shape), np.zeros(100))
+            inside[is_known].append(inside_interval(new_mean, prediction.stated_std, truth))
     assert np.mean(inside[False]) < 0.86
     assert np.mean(inside[True]) == pytest.approx(0.9, abs=0.03)
 
@@ -141,20 +141,20 @@ def test_crps_equals_its_integral():
 def test_errors_of_rows_that_a_corrected_scene_knows_are_enlarged(flat_folder: Path, tmp_path: Path):
     record = load(flat_folder)
     _, fold = fold_of(record)
-    held = HeldOut.of(record, fold, 0)
-    entry, observed = MODELS["kriging"].serving("rssi", True), held.observed(record)
+    held_out = HeldOut.of(record, fold, 0)
+    entry, observed = MODELS["kriging"].serving("rssi", True), held_out.observed(record)
 
     def errors(scene: Path) -> np.ndarray:
         problem = Problem(record, default_settings(entry, (), {}), scene=str(scene))
-        found = held_out_predictions(entry, problem, fold, held, Session(tmp_path, tmp_path), "kriging")
-        return found.mean - observed
+        prediction = held_out_predictions(entry, problem, fold, held_out, Session(tmp_path, tmp_path), "kriging")
+        return prediction.mean - observed
 
     plain = errors(tmp_path)
-    known = np.unique(held.row)[::2]
-    data = CorrectionData(record.name, known, 1.5)
+    corrected_rows = np.unique(held_out.row)[::2]
+    data = CorrectionData(record.name, corrected_rows, 1.5)
     for name, factor in ((record.name, 1.5), ("another", 1)):
         (tmp_path / FILE).write_text(json.dumps({"data": {**data.facts(), "name": name}}))
-        expected = plain * np.where(np.isin(held.row, known), factor, 1)
+        expected = plain * np.where(np.isin(held_out.row, corrected_rows), factor, 1)
         np.testing.assert_allclose(errors(tmp_path), expected, atol=ROUNDING_DB)
     (tmp_path / FILE).write_text('{"data": {"rows": 3}}')
     with pytest.raises(InputError, match="correct the scene again"):
@@ -165,10 +165,10 @@ def test_training_with_intervals_predicts_as_without_and_is_restored(flat_folder
     plain = wrf_mi.train(flat_folder, "kriging", out=tmp_path / "plain", settings=("generic=true",))
     run = wrf_mi.train(flat_folder, "kriging", out=tmp_path / "run", settings=("generic=true",), intervals=True)
     asked: dict[str, Any] = {"tx_pos_m": [[2.0, 1.0, 1.3]], "tx_heading_rad": [0.5]}
-    found = wrf_mi.open_run(run.folder).predict(**asked)
-    assert found.mean == pytest.approx(plain.predict(**asked).mean)
+    prediction = wrf_mi.open_run(run.folder).predict(**asked)
+    assert prediction.mean == pytest.approx(plain.predict(**asked).mean)
     assert plain.predict(**asked).std is None
-    assert (found.stated_std > 0).all()
+    assert (prediction.stated_std > 0).all()
     assert "inside_90" not in plain.metrics
     assert 0.5 < run.metrics["inside_90"] <= 1
     assert run.metrics["crps"] > 0
@@ -219,8 +219,11 @@ def field(seed: int = 0) -> Record:
     distance = np.linalg.norm(at_m - places[:, None], axis=2)
     observed = -40 - 25 * np.log10(distance) + smooth + rng.normal(0, 2, (2, ROWS))
     receivers = tuple(wrf_mi.Receiver(f"rx{k}", place, np.array([0.0, 0, 0, 1])) for k, place in enumerate(places))
-    known: dict[str, Any] = {"frequencies_hz": np.array([2.4e9]), "official": (np.arange(240), np.arange(240, ROWS))}
-    return Record("field", "rssi", at_m, receivers, observed.astype(np.float32), **known)
+    record_fields: dict[str, Any] = {
+        "frequencies_hz": np.array([2.4e9]),
+        "official": (np.arange(240), np.arange(240, ROWS)),
+    }
+    return Record("field", "rssi", at_m, receivers, observed.astype(np.float32), **record_fields)
 
 
 def weak_missing(record: Record) -> Record:
@@ -259,14 +262,14 @@ def without_pairs(of: Callable[..., HeldOut]) -> Callable[..., HeldOut]:
 def test_reception_is_in_files_and_maps_and_coverage_is_received_and_strong(tmp_path: Path) -> None:
     run = wrf_mi.train(weak_missing(field()), "kriging", out=tmp_path / "run", intervals=True)
     at_m = np.array([[1.0, 1, 1.5], [19, 1, 1.5]])
-    stated = run.predict(at_m, 0)
+    prediction = run.predict(at_m, 0)
     with np.load(run.folder / "predictions.npz") as arrays:
         again = run.predict(arrays["tx_pos"], 1)
         np.testing.assert_allclose(arrays["probability_of_reception"][1], again.reception, rtol=FLOAT32)
     write_run_predictions(run, wrf_mi.models.Inputs(at_m), tmp_path / "new.npz")
     write_run_predictions(run, wrf_mi.models.Inputs(at_m), tmp_path / "new.csv")
     with np.load(tmp_path / "new.npz") as arrays:
-        np.testing.assert_allclose(arrays["probability_of_reception"][0], stated.reception, rtol=FLOAT32)
+        np.testing.assert_allclose(arrays["probability_of_reception"][0], prediction.reception, rtol=FLOAT32)
     assert "rx0_received" in (tmp_path / "new.csv").read_text().splitlines()[0].split(",")
     always = radio_map(run, step_m=2.0, threshold_dbm=-300)
     np.testing.assert_allclose(always["coverage_probability"], always["probability_of_reception"], rtol=FLOAT32)
@@ -289,8 +292,8 @@ def test_losses_by_chance_have_the_rate_of_each_receiver(tmp_path: Path) -> None
     rows = record.official[0][~lost[:, record.official[0]].all(axis=0)]  # others are in no split
     rate = 1 - lost[:, rows].mean(axis=1)
     for receiver in range(2):
-        stated = run.predict(record.tx_pos_m, receiver).reception
-        assert np.mean(stated) == pytest.approx(rate[receiver], abs=2 * SHARE)
+        reception = run.predict(record.tx_pos_m, receiver).reception
+        assert np.mean(reception) == pytest.approx(rate[receiver], abs=2 * SHARE)
     gained = run.metrics["reception"]["reference"]["reception_rate"]["log_loss"] - run.metrics["reception"]["log_loss"]
     assert gained > -SHARE  # of 60 held-out rows
     # Neither strength nor neighbours tell of losses by chance.

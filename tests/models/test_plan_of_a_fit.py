@@ -12,12 +12,12 @@ from wrf_mi.training.fit_plan import FitPlan
 
 @pytest.mark.parametrize("model", ["wrf-gs", "factorised"])
 def test_plan_is_built_once_for_check_and_fit(model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made, build = [], FitPlan.__init__
+    plans, build = [], FitPlan.__init__
 
     def counted(self: FitPlan, *arguments: object, **more: object) -> None:
-        made.append(self)
+        plans.append(self)
         build(self, *arguments, **more)  # type: ignore[arg-type]
 
     monkeypatch.setattr(FitPlan, "__init__", counted)
     wrf_mi.train(lobes((9, 36)), model, out=tmp_path / "run", settings=settings("steps=2", model=model))
-    assert len(made) == 1
+    assert len(plans) == 1

@@ -121,8 +121,8 @@ def test_stage_of_another_package_is_trained_resumed_evaluated_and_compared(step
     with pytest.raises(Interrupted):
         train(stepped, out=out, on_progress=lambda what, *_: reports.append(what), stop=lambda: "fitted" in reports[-1])
     run = resume(out)
-    whole = train(stepped, out=tmp_path / "whole")
-    assert run.metrics["abs_error_db"] == whole.metrics["abs_error_db"] == evaluate_run(out)["abs_error_db"]
+    uninterrupted = train(stepped, out=tmp_path / "whole")
+    assert run.metrics["abs_error_db"] == uninterrupted.metrics["abs_error_db"] == evaluate_run(out)["abs_error_db"]
     chosen = {report["option"]: report for report in run.metrics["options"] if report["stage"] == "steps"}
     assert [name for name, report in chosen.items() if report["taken"]] == ["in steps"]
     without = train(stepped, out=tmp_path / "without", settings=("stages=residual",))
@@ -157,12 +157,14 @@ def test_loss_of_a_name_is_trained_resumed_stored_and_compared(noted_loss, flat_
     noted_loss.clear()
     run = resume(tmp_path / "run")
     assert noted_loss, "a resumed training has the loss that it began with"
-    whole = train(flat_folder, "wrf-gs+", out=tmp_path / "whole", **asked)
-    assert run.metrics["abs_error_db"] == whole.metrics["abs_error_db"] == evaluate_run(run.folder)["abs_error_db"]
+    uninterrupted = train(flat_folder, "wrf-gs+", out=tmp_path / "whole", **asked)
+    assert (
+        run.metrics["abs_error_db"] == uninterrupted.metrics["abs_error_db"] == evaluate_run(run.folder)["abs_error_db"]
+    )
     other = train(flat_folder, "wrf-gs+", out=tmp_path / "other", settings=SETTINGS)
-    assert other.metrics["abs_error_db"] != whole.metrics["abs_error_db"]
+    assert other.metrics["abs_error_db"] != uninterrupted.metrics["abs_error_db"]
     squared = train(flat_folder, "wrf-gs+", out=tmp_path / "squared", settings=SETTINGS, loss="squared-error")
-    assert squared.metrics["abs_error_db"] == whole.metrics["abs_error_db"]
+    assert squared.metrics["abs_error_db"] == uninterrupted.metrics["abs_error_db"]
     assert np.isfinite(open_run(run.folder).predict([[1.0, 2.0, 1.3]], 0).mean).all()
     assert compare([run.folder, other.folder], tmp_path / "page").is_file()
 

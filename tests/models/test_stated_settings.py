@@ -300,5 +300,5 @@ def test_stated_default_of_generic_kriging_chooses_it() -> None:
     ],
 )
 def test_setting_that_a_fit_replaces_or_leaves_is_refused(model: str, name: str, settings: str) -> None:
-    stated = dict(text.split("=") for text in settings.split())
-    assert refused_setting(model, RECORDS[name](), stated) == next(iter(stated))
+    assigned = dict(text.split("=") for text in settings.split())
+    assert refused_setting(model, RECORDS[name](), assigned) == next(iter(assigned))

@@ -52,8 +52,8 @@ def made(kind: str, seed: int = 0, headings: bool = False, noise_db: float = NOI
 
 def fit(record: Record, folder: Path, *settings: str) -> Strengths:
     entry = MODELS["kriging"].serving("rssi", False)
-    stated = frozenset(text.partition("=")[0] for text in settings)
-    problem = Problem(record, default_settings(entry, settings, {}), stated=stated)
+    stated_names = frozenset(text.partition("=")[0] for text in settings)
+    problem = Problem(record, default_settings(entry, settings, {}), stated=stated_names)
     split = Split("official", 0, record.official[0], np.zeros(0, np.int64), record.official[1])
     with threadpool_limits(1, "blas"):  # as in runs
         fitted = entry.fit(problem, split, Session(folder, folder))
@@ -84,9 +84,9 @@ def test_deviations_of_the_mean_by_trees_are_as_large_as_its_errors(tmp_path: Pa
     fitted, test = fit(record, tmp_path, "shadowing=trees"), record.official[1]
     predictions = [fitted.predict(inputs_of(record, test), receiver) for receiver in range(3)]
     errors = np.stack([each.mean for each in predictions]) - truth.observation[:, test]
-    stated = np.stack([each.std_mean for each in predictions if each.std_mean is not None])
+    deviations = np.stack([each.std_mean for each in predictions if each.std_mean is not None])
     # Both deviations are scaled by errors of readings, so that neither is exact.
-    assert 0.5 < np.sqrt(np.mean(stated**2) / np.mean(errors**2)) < 2
+    assert 0.5 < np.sqrt(np.mean(deviations**2) / np.mean(errors**2)) < 2
 
 
 @pytest.mark.parametrize("shadowing", [TREES, NONE])
@@ -105,9 +105,9 @@ def test_model_is_stored_bit_for_bit(shadowing: str, tmp_path: Path) -> None:
 def test_a_refit_grows_trees_of_its_rows(tmp_path: Path) -> None:
     record = made("walls")
     fitted = fit(record, tmp_path, "shadowing=trees")
-    whole, part = (fitted.refit(record, rows) for rows in (record.official[0], np.arange(100)))
+    full_refit, part = (fitted.refit(record, rows) for rows in (record.official[0], np.arange(100)))
     at = inputs_of(record, record.official[1])
-    np.testing.assert_array_equal(whole.predict(at, 0).mean, fitted.predict(at, 0).mean)
+    np.testing.assert_array_equal(full_refit.predict(at, 0).mean, fitted.predict(at, 0).mean)
     assert np.abs(part.predict(at, 0).mean - fitted.predict(at, 0).mean).mean() > 0.5
 
 

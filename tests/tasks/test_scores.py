@@ -162,9 +162,9 @@ def test_level_of_a_rician_coefficient_agrees_with_draws(mean: float) -> None:
     rng = np.random.default_rng(2)
     drawn = mean + (rng.normal(size=DRAWS) + 1j * rng.normal(size=DRAWS)) / np.sqrt(2)
     levels = 20 * np.log10(np.abs(drawn))
-    found = TASKS["csi"].level(Prediction(np.full((1, 1), mean + 0j), np.ones((1, 1))))
-    assert found.mean[0] == pytest.approx(levels.mean(), abs=SAMPLED_DB)
-    assert found.stated_std[0] == pytest.approx(levels.std(), abs=SAMPLED_DB)
+    level = TASKS["csi"].level(Prediction(np.full((1, 1), mean + 0j), np.ones((1, 1))))
+    assert level.mean[0] == pytest.approx(levels.mean(), abs=SAMPLED_DB)
+    assert level.stated_std[0] == pytest.approx(levels.std(), abs=SAMPLED_DB)
 
 
 def test_level_of_a_spectrum_is_the_mean_power_over_the_solid_angle() -> None:
@@ -184,8 +184,8 @@ def test_published_figures_of_the_authors_split_and_the_blocked_split():
     scores: dict[str, list[np.ndarray]] = {}
     for name in ("official", "blocked"):
         for split in make_splits(record, name):
-            known, rows, spectra = split.all_train, split.test, record.observation[0]
-            predicted = blend(record.tx_pos_m[known], spectra[known], record.tx_pos_m[rows])
+            training_rows, rows, spectra = split.all_train, split.test, record.observation[0]
+            predicted = blend(record.tx_pos_m[training_rows], spectra[training_rows], record.tx_pos_m[rows])
             scores.setdefault(name, []).append(ssim(predicted, spectra[rows]))
     official, blocked = (summary(np.concatenate(parts)) for parts in scores.values())
     assert official["median"] == pytest.approx(0.978, abs=PUBLISHED)
@@ -217,9 +217,9 @@ def test_published_figures_of_idw_of_signal_strengths():
     """Median and 90th percentile over all anchors and test rows."""
     record, task = load("flat-ble"), TASKS["rssi"]
     (split,) = make_splits(record, "official")
-    known, at = (record.tx_pos_m[rows] for rows in (split.all_train, split.test))
+    training_m, at = (record.tx_pos_m[rows] for rows in (split.all_train, split.test))
     how = {"k": task.neighbours, "softening_m": task.softening_m}
-    predicted = np.stack([blend(known, received[split.all_train], at, **how) for received in record.observation])
+    predicted = np.stack([blend(training_m, received[split.all_train], at, **how) for received in record.observation])
     scores = summary(task.score(predicted, record.observation[:, split.test]))
     assert scores["median"] == pytest.approx(3.30, abs=PUBLISHED_DB)
     assert scores["p90"] == pytest.approx(7.9, abs=2 * PUBLISHED_DB)

@@ -70,8 +70,8 @@ def test_clearly_worse_predictions_have_no_share_in_a_mean():
 
 def test_a_trusted_prediction_is_left_where_rows_show_a_gain():
     """A common error hides in five rows that the trusted prediction is the best; two hundred show which is."""
-    common, own = np.random.default_rng(1).normal(size=(2, 3, ROWS))
-    errors = 3 * common[:1] + own * np.array([[0.1], [1.0], [1.0]])
+    common, independent = np.random.default_rng(1).normal(size=(2, 3, ROWS))
+    errors = 3 * common[:1] + independent * np.array([[0.1], [1.0], [1.0]])
     five = np.arange(5)
     few = [chosen_of(errors[:, k : k + 5], np.zeros(5), five, five, 0) for k in range(100)]
     assert sum(form == "single" for form, _ in few) > 50
@@ -124,7 +124,7 @@ def test_no_form_is_below_the_best_single_prediction_on_its_rows(form):
     errors = np.random.default_rng(3).normal(size=(4, ROWS)) * np.array([[1.0], [2.0], [1.5], [0.8]])
     score, every = errors_of(errors), np.arange(ROWS)
     mixture = FORMS[form](HeldOutScores(score, DISTANCE, every, 4), every)
-    best = max(score(np.broadcast_to(one, (ROWS, 4)), every).mean() for one in np.eye(4))
+    best = max(score(np.broadcast_to(weights, (ROWS, 4)), every).mean() for weights in np.eye(4))
     assert score(mixture(DISTANCE), every).mean() >= best - 1e-3
 
 
@@ -159,40 +159,40 @@ def test_held_out_groups_keep_training_rows(train, validation, seed):
     parts = np.split(rng.permutation(train + validation + 5), [train, train + validation])
     split = Split("own", seed, np.sort(parts[0]), np.sort(parts[1]), np.sort(parts[2]))
     position = rng.normal(size=(train + validation + 5, 3))
-    held, again = hold_out_groups(split, position), hold_out_groups(split, position)
-    assert len(held.train) >= max(1, train / 2)
-    assert set(split.validation) <= set(held.validation)
-    assert sorted([*held.train, *held.validation]) == sorted([*split.train, *split.validation])
-    np.testing.assert_array_equal(held.validation, again.validation)
+    fold, again = hold_out_groups(split, position), hold_out_groups(split, position)
+    assert len(fold.train) >= max(1, train / 2)
+    assert set(split.validation) <= set(fold.validation)
+    assert sorted([*fold.train, *fold.validation]) == sorted([*split.train, *split.validation])
+    np.testing.assert_array_equal(fold.validation, again.validation)
 
 
 def test_held_out_groups_are_clusters_of_positions():
     """Rows of one cluster of ten are held out together, those of the others train."""
     centre = np.repeat(10.0 * np.arange(10), 8)
     position = np.stack([centre, 0 * centre, 0 * centre], 1) + np.random.default_rng(0).normal(0, 0.1, (80, 3))
-    held = hold_out_groups(Split("own", 1, np.arange(80), np.empty(0, int), np.empty(0, int)), position)
+    fold = hold_out_groups(Split("own", 1, np.arange(80), np.empty(0, int), np.empty(0, int)), position)
     for cluster in np.arange(80).reshape(10, 8):
-        assert len(set(cluster) & set(held.validation)) in (0, 8)
-    assert 8 <= len(held.validation) <= 24
+        assert len(set(cluster) & set(fold.validation)) in (0, 8)
+    assert 8 <= len(fold.validation) <= 24
 
 
 @pytest.mark.parametrize("higher_is_better", [True, False])
 def test_reach_with_the_best_held_out_scores_is_chosen(higher_is_better):
     """The truth is a correction that falls off within half a metre: weights of that reach have no error."""
-    held, reach, sign = [at(*np.linspace(0.05, 1.0, 20))], Reach(ORIGIN, 0.0), -1 if higher_is_better else 1
-    lengths = reach.lengths(held)
-    truth = replace(reach, length_m=lengths[3]).weight(held[0], 0)
-    found = choose_reach(reach, lengths, lambda r: sign * np.abs(r.weight(held[0], 0) - truth), higher_is_better)
-    assert found[0] == lengths[3]
-    assert not found[1].any()
+    positions, reach, sign = [at(*np.linspace(0.05, 1.0, 20))], Reach(ORIGIN, 0.0), -1 if higher_is_better else 1
+    lengths = reach.lengths(positions)
+    truth = replace(reach, length_m=lengths[3]).weight(positions[0], 0)
+    choice = choose_reach(reach, lengths, lambda r: sign * np.abs(r.weight(positions[0], 0) - truth), higher_is_better)
+    assert choice[0] == lengths[3]
+    assert not choice[1].any()
 
 
 def test_reach_whose_gain_is_within_its_standard_error_is_not_chosen():
     """Gaussians that add noise of mean zero, and a gain of half its standard error."""
-    held, noise = at(*np.linspace(0.05, 1.0, 40)), np.random.default_rng(0).normal(0, 1, 40)
+    positions, noise = at(*np.linspace(0.05, 1.0, 40)), np.random.default_rng(0).normal(0, 1, 40)
     noise += 0.5 * noise.std() / np.sqrt(40) - noise.mean()
     for gain, chosen in ((0, 0), (1, np.inf)):
-        score = partial(lambda gain, reach: (noise + gain) * reach.weight(held, 0), gain)
+        score = partial(lambda gain, reach: (noise + gain) * reach.weight(positions, 0), gain)
         assert choose_reach(Reach(ORIGIN, np.inf), [0.0, np.inf], score, True)[0] == chosen
 
 

@@ -201,7 +201,7 @@ def test_zero_scale_distinguishes_all_training_transmitters(extent_m, scale_m):
     resolved = TrainConfig().resolved(tx)
     assert resolved.encoding.tx_scale_m == scale_m
     assert resolved.resolved(10 * tx) == resolved
-    own = with_settings(TrainConfig(), ["encoding.tx_scale_m=0.25"])
-    assert own.resolved(tx).encoding.tx_scale_m == 0.25
+    config = with_settings(TrainConfig(), ["encoding.tx_scale_m=0.25"])
+    assert config.resolved(tx).encoding.tx_scale_m == 0.25
     with pytest.raises(InputError, match=r"encoding\.tx_scale_m: 0 is resolved by the training transmitters"):
         make_field(TrainConfig())

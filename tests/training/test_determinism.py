@@ -37,9 +37,9 @@ def arrays_of(run):
 
 def assert_same_bits(run, other):
     arrays = ({key: without_seconds(values) for key, values in arrays_of(folder).items()} for folder in (run, other))
-    found, expected = ({key: (values.dtype, values.tobytes()) for key, values in each.items()} for each in arrays)
-    assert found.keys() == expected.keys()
-    assert [name for name, bits in expected.items() if found[name] != bits] == []
+    computed, expected = ({key: (values.dtype, values.tobytes()) for key, values in each.items()} for each in arrays)
+    assert computed.keys() == expected.keys()
+    assert [name for name, bits in expected.items() if computed[name] != bits] == []
 
 
 def test_deterministic_fits_of_two_processes_have_equal_bits(folder, tmp_path):
@@ -74,7 +74,7 @@ def other_llvms():
     """Usable LLVM libraries of other major versions than this process uses."""
     major = (backend.init().llvm_version or "").split(".")[0]
     verdicts = {library.path: try_llvm(library) for library in backend.find_llvm(ignore_variable=True)}
-    return [path for path, one in verdicts.items() if one.usable and one.version.split(".")[0] != major]
+    return [path for path, verdict in verdicts.items() if verdict.usable and verdict.version.split(".")[0] != major]
 
 
 def test_another_llvm_gives_equal_steps(folder, tmp_path):
@@ -107,9 +107,9 @@ def test_no_deterministic_fit_or_run_on_a_gpu(one_gateway, tmp_path, monkeypatch
     refused = partial(pytest.raises, BackendError, match="already computes with cuda: start another for llvm")
     with refused():
         Trainer(one_gateway, official(one_gateway), settings("steps=1", "deterministic=true"))
-    for stated in ({"model": "wrf-gs+", "settings": ["deterministic=true"]}, {"model": "idw", "deterministic": True}):
+    for options in ({"model": "wrf-gs+", "settings": ["deterministic=true"]}, {"model": "idw", "deterministic": True}):
         with refused():
-            train(one_gateway, out=tmp_path / "run", **stated)
+            train(one_gateway, out=tmp_path / "run", **options)
         assert not (tmp_path / "run").exists()
 
 

@@ -107,8 +107,8 @@ def test_power_equals_the_sum_over_the_full_sphere(model):
         re, im = (part.numpy() for part in field)
         amplitude = abs(np.tile(solid_angles(6, 24), 2) @ (re + 1j * im))
         level_db = 20 / np.log(10) * (-0.3, 0.7)[r]
-        found = predict(record.tx_pos_m[:1], r)[0]
-        assert found == pytest.approx(level_db + 20 * np.log10(amplitude), abs=ROUNDING)
+        predicted = predict(record.tx_pos_m[:1], r)[0]
+        assert predicted == pytest.approx(level_db + 20 * np.log10(amplitude), abs=ROUNDING)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -118,8 +118,8 @@ def test_starting_level_matches_each_receivers_observations(model):
     predict = Trainer(louder, halves(louder), config(louder, f"model={model}")).predictor()
     rows = halves(louder).all_train
     for r in range(2):
-        found = predict(louder.tx_pos_m[rows], r).mean()
-        assert found == pytest.approx(np.nanmean(louder.observation[r, rows]), abs=1.0)
+        level_db = predict(louder.tx_pos_m[rows], r).mean()
+        assert level_db == pytest.approx(np.nanmean(louder.observation[r, rows]), abs=1.0)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -127,15 +127,15 @@ def test_components_have_separate_images(model):
     record = channels()
     trainer = Trainer(record, halves(record), config(record, f"model={model}", "initial.gaussians=5"))
     joint = trainer.field.gaussians(detached(trainer), to_tensor(np.random.default_rng(0).normal(size=(16, 4))))
-    found = by_component(joint, 3)
-    assert (found.batch, found.count) == (12, 5)
+    separated = by_component(joint, 3)
+    assert (separated.batch, separated.count) == (12, 5)
     shared = dr.width(joint.scale[0]) == 5
     for component in range(3):
         for part, half in ((0, 0), (1, 3)):
-            signal = found.signal[part].numpy().reshape(4, 3, 5)[:, component]
+            signal = separated.signal[part].numpy().reshape(4, 3, 5)[:, component]
             np.testing.assert_array_equal(signal, joint.signal[half + component].numpy().reshape(4, 5))
         if not shared:
-            for wide, narrow in zip((*found.scale, found.opacity), (*joint.scale, joint.opacity), strict=True):
+            for wide, narrow in zip((*separated.scale, separated.opacity), (*joint.scale, joint.opacity), strict=True):
                 each = wide.numpy().reshape(4, 3, 5)[:, component]
                 np.testing.assert_array_equal(each, narrow.numpy().reshape(4, 5), strict=True)
 
@@ -158,25 +158,25 @@ def test_strengths_are_learned_and_kept(model, tmp_path):
     with np.load(tmp_path / "run" / "predictions.npz") as stored:
         scored = stored["prediction"]
     for r in range(2):
-        found, truth = run.predict(record.tx_pos_m[split.test], r).mean, record.observation[r, split.test]
+        predicted, truth = run.predict(record.tx_pos_m[split.test], r).mean, record.observation[r, split.test]
         mean = np.nanmean(record.observation[r, split.all_train])
-        assert np.median(np.abs(found - truth)) < np.median(np.abs(mean - truth))
-        np.testing.assert_array_equal(scored[r], found)
+        assert np.median(np.abs(predicted - truth)) < np.median(np.abs(mean - truth))
+        np.testing.assert_array_equal(scored[r], predicted)
 
 
 @pytest.mark.parametrize("model", ["wrf-gs", "factorised"])
 def test_channels_are_learned_from_the_uplink_and_kept(model, tmp_path):
     record = channels()
     split, changed = halves(record), ("steps=200", "view.components=3", "batch=32", "optimiser.network=3e-3")
-    own = (*(text for text in FIELD if not text.startswith(("batch", "optimiser.network"))), *changed)
-    run = train(record, model, out=tmp_path / "run", split=split, settings=own)
+    extra_settings = (*(text for text in FIELD if not text.startswith(("batch", "optimiser.network"))), *changed)
+    run = train(record, model, out=tmp_path / "run", split=split, settings=extra_settings)
     assert record.uplink is not None
     uplink, truth = record.uplink[split.test], record.observation[0, split.test]
-    found = run.predict(uplink=uplink).mean
-    assert found.shape == truth.shape
-    assert relative_error(found, truth) < 0.3 * relative_error(uplink, truth)
+    predicted = run.predict(uplink=uplink).mean
+    assert predicted.shape == truth.shape
+    assert relative_error(predicted, truth) < 0.3 * relative_error(uplink, truth)
     with np.load(tmp_path / "run" / "predictions.npz") as stored:
-        np.testing.assert_array_equal(stored["prediction"], found)
+        np.testing.assert_array_equal(stored["prediction"], predicted)
     with pytest.raises(InputError, match="the rows to predict have none; give `uplink`"):
         run.predict(record.tx_pos_m[split.test])
 
@@ -206,9 +206,9 @@ def test_a_second_receiver_with_other_components_is_learned():
     split = halves(record)
     predict = fitted(record, split, "view.components=2", "steps=700", "batch=16", "optimiser.network=3e-3")
     for r in range(2):
-        truth, found = record.observation[r, split.test], predict(record.tx_pos_m[split.test], r)
-        assert found.shape == truth.shape
-        assert relative_error(found, truth) < 0.2, "in components of the other receiver alone it is 1 at least"
+        truth, predicted = record.observation[r, split.test], predict(record.tx_pos_m[split.test], r)
+        assert predicted.shape == truth.shape
+        assert relative_error(predicted, truth) < 0.2, "in components of the other receiver alone it is 1 at least"
 
 
 @pytest.mark.all_threads
@@ -223,8 +223,8 @@ def test_fit_is_invariant_to_the_power_of_a_receiver(model):
         if model == "nerf2":
             fit = nerf2.MODEL.fit(Problem(stations, small, 0), split, FitSession())
             return fit.predict(inputs_of(stations, split.test), 1).mean
-        own = f"model={model}", "view.components=2", "steps=10", "patience=0"
-        return fitted(stations, split, *own)(stations.tx_pos_m[split.test], 1)
+        extra_settings = f"model={model}", "view.components=2", "steps=10", "patience=0"
+        return fitted(stations, split, *extra_settings)(stations.tx_pos_m[split.test], 1)
 
     plain, faint = predicted(record), predicted(fainter)
     assert np.abs(plain).max() > 1e-6
@@ -247,7 +247,7 @@ STOPPING = ("steps=160", "validate_every=10", "patience=2", "deterministic=true"
 def test_early_stopping_resumes_from_the_best_state(holdout_steps_fraction):
     """Scores are given: the third of eight is the best, and after two worse ones no more are waited for."""
     record, fraction = strengths(), f"holdout_steps_fraction={holdout_steps_fraction}"
-    scores, kept = iter([5.0, 4.0, 3.0, 6.0, 6.0, 2.0, 2.0, 2.0]), dict[str, Any]()
+    scores, best = iter([5.0, 4.0, 3.0, 6.0, 6.0, 2.0, 2.0, 2.0]), dict[str, Any]()
     steps: dict[bool, list[int]] = {True: [], False: []}
     trainer = Trainer(record, halves(record), config(record, *STOPPING, fraction))
     trainer.validate = lambda: next(scores)  # type: ignore[method-assign]
@@ -257,14 +257,14 @@ def test_early_stopping_resumes_from_the_best_state(holdout_steps_fraction):
         if progress.validation_score is not None:
             steps[progress.held_out].append(progress.step)
         if progress.step == 30:
-            kept.update(trainer.state.params())
+            best.update(trainer.state.params())
 
     trainer.run(on_progress)
     left = 80 * 30 // 80 if holdout_steps_fraction < 1 else 0
     assert steps == {True: [10, 20, 30, 40, 50], False: [*range(160 - left + 10, 161, 10)]}
     assert (trainer.state.chosen, trainer.state.step) == (30, 160)
     if not left:
-        np.testing.assert_equal(trainer.state.params(), kept)
+        np.testing.assert_equal(trainer.state.params(), best)
 
 
 @pytest.fixture(scope="module")
@@ -311,9 +311,9 @@ def test_loss_divides_differences_by_stated_noise():
     data = TrainingData(to_tensor(targets.condition), to_float(targets.observed), to_float(scale), to_float(weight))
     for r in (0, 1):
         _, truth, factor = data.select(mi.UInt32(batch.tolist()), r, 1)
-        found = TASKS["rssi"].loss((truth + 2) * factor, truth * factor, len(batch), ssim_weight=0.0)
+        loss = TASKS["rssi"].loss((truth + 2) * factor, truth * factor, len(batch), ssim_weight=0.0)
         # Everything is 2 dB too high; the sum of two numbers near -50 in single precision.
-        np.testing.assert_allclose(found[0], (2 * weight[r, batch] * scale[r]).mean(), rtol=1e-5)
+        np.testing.assert_allclose(loss[0], (2 * weight[r, batch] * scale[r]).mean(), rtol=1e-5)
 
 
 def test_noisy_rows_have_less_weight():
@@ -324,8 +324,8 @@ def test_noisy_rows_have_less_weight():
     louder = replace(record, observation=np.where(wrong, record.observation + 20, record.observation))
 
     def error(observed):
-        found = fitted(observed, split, "steps=150").of_rows(record, split.test, 0)
-        return float(np.median(np.abs(found - record.observation[0, split.test])))
+        predicted = fitted(observed, split, "steps=150").of_rows(record, split.test, 0)
+        return float(np.median(np.abs(predicted - record.observation[0, split.test])))
 
     assert error(replace(louder, std=np.where(wrong, 40.0, 1.0))) < 0.5 * error(louder)
 

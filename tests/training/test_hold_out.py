@@ -106,9 +106,9 @@ def nearest_m(tx_pos_m: np.ndarray, rows: np.ndarray, known: np.ndarray) -> np.n
 
 def blocked(tx_pos_m: np.ndarray, test: np.ndarray, seed: int = 0) -> Split:
     """A split with a tenth of the other rows for validation."""
-    rest = np.random.default_rng(seed).permutation(np.setdiff1d(np.arange(len(tx_pos_m)), test))
-    count = max(1, len(rest) // 10)
-    return Split("blocked", 0, np.sort(rest[count:]), np.sort(rest[:count]), test)
+    others = np.random.default_rng(seed).permutation(np.setdiff1d(np.arange(len(tx_pos_m)), test))
+    count = max(1, len(others) // 10)
+    return Split("blocked", 0, np.sort(others[count:]), np.sort(others[:count]), test)
 
 
 @given(count=st.integers(30, 150), share=st.floats(0.02, 0.3), repeats=st.integers(1, 3), seed=st.integers(0, 999))

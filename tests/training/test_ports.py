@@ -72,13 +72,13 @@ def test_ports_report_what_a_graph_of_each_carrier_reports(model, tolerance, xml
     receivers, form = (array(), second()), replace(PORTS, receiver=model)
     rows = np.array([*CARRIERS_HZ, BETWEEN_HZ])[np.random.default_rng(0).permutation(np.arange(12) % 4)]
     predict = Predictor(graph_of(xml, form, receivers=receivers), {})
-    found = [predict(transmitters(12), number, carriers_hz=rows) for number in range(2)]
+    predicted = [predict(transmitters(12), number, carriers_hz=rows) for number in range(2)]
     for hz in np.unique(rows):
         single = replace(form, frequencies_hz=np.array([hz]), carriers_hz=None)
         alone = Predictor(graph_of(xml, single, receivers=receivers), {})
         for number in range(2):
             expected = alone(transmitters(12)[rows == hz], number)
-            np.testing.assert_allclose(found[number][rows == hz], expected, atol=tolerance)
+            np.testing.assert_allclose(predicted[number][rows == hz], expected, atol=tolerance)
 
 
 @pytest.mark.parametrize("count", [1, 5])
@@ -87,8 +87,8 @@ def test_spectra_of_uncertain_phases_are_the_expectation_of_the_tracer(count, xm
     instrument = Instrument("array", (array(),), np.array([CARRIERS_HZ[1]]), size=SIZE, phase_error=1.0)
     tracer, graph = RayTracer(xml, instrument, OPTIONS), graph_of(xml, MIDDLE)
     expected = tracer.observe(tracer.trace(transmitters(count)))[0]
-    certain, found = (Predictor(graph, {}, phase_error=sd)(transmitters(count), 0) for sd in (0.0, 1.0))
-    np.testing.assert_allclose(found, expected, rtol=0, atol=TRACED)
+    certain, predicted = (Predictor(graph, {}, phase_error=sd)(transmitters(count), 0) for sd in (0.0, 1.0))
+    np.testing.assert_allclose(predicted, expected, rtol=0, atol=TRACED)
     assert np.abs(certain - expected).max() > 0.05
 
 
@@ -106,11 +106,11 @@ def test_reports_from_one_search_are_those_of_a_search_for_each_carrier(xml):
     predict = Predictor(graph_of(xml, PORTS, faint=0.05), {})
     tx = transmitters(6)[[0, 1, 2, 2, 3, 2, 1, 0, 5, 3, 4, 4]]
     carriers = np.array([CARRIERS_HZ[0], CARRIERS_HZ[2], BETWEEN_HZ]).repeat(4)
-    found = predict(tx, 0, carriers_hz=carriers)
+    predicted = predict(tx, 0, carriers_hz=carriers)
     for hz in np.unique(carriers):
         alone = predict(tx[carriers == hz], 0, carriers_hz=carriers[carriers == hz])
-        np.testing.assert_allclose(found[carriers == hz], alone, rtol=0, atol=SINGLE)
-    assert np.abs(found[0] - found[7]).max() > 0.01  # the same position at two carriers
+        np.testing.assert_allclose(predicted[carriers == hz], alone, rtol=0, atol=SINGLE)
+    assert np.abs(predicted[0] - predicted[7]).max() > 0.01  # the same position at two carriers
     assert predict(tx[:0], 0, carriers_hz=carriers[:0]).shape == (0, *SIZE)
 
 
@@ -139,17 +139,17 @@ def test_strengths_at_ports_are_those_of_the_tracer(xml):
     rows = np.array([*CARRIERS_HZ, BETWEEN_HZ]).repeat(3)
     tracer = RayTracer(xml, Instrument("power", (array(),), np.array([CARRIERS_HZ[0]])), OPTIONS)
     expected = tracer.observe(tracer.trace(transmitters(12), carriers_hz=rows))[0]
-    found = Predictor(graph_of(xml, replace(PORTS, receiver="power")), {})(transmitters(12), 0, carriers_hz=rows)
-    np.testing.assert_allclose(found, expected, atol=STRENGTH_DB)
+    predicted = Predictor(graph_of(xml, replace(PORTS, receiver="power")), {})(transmitters(12), 0, carriers_hz=rows)
+    np.testing.assert_allclose(predicted, expected, atol=STRENGTH_DB)
 
 
 def assert_restored(run, record):
     """Predictions of a stored field depend on the carrier, which need not have training rows."""
     again, positions = wrf_mi.open_run(run.folder, record), np.tile(record.tx_pos_m[:2], (2, 1))
     at = np.repeat([CARRIERS_HZ[0], CARRIERS_HZ[1]], 2)
-    found = again.predict(positions, 0, carriers_hz=at).mean
-    np.testing.assert_array_equal(found, run.predict(positions, 0, carriers_hz=at).mean)
-    assert np.abs(found[:2] - found[2:]).max() > 1e-3
+    predicted = again.predict(positions, 0, carriers_hz=at).mean
+    np.testing.assert_array_equal(predicted, run.predict(positions, 0, carriers_hz=at).mean)
+    assert np.abs(predicted[:2] - predicted[2:]).max() > 1e-3
     with pytest.raises(wrf_mi.InputError, match=r"give frequency_hz for each position|carrier"):
         again.predict(positions, 0)
 
@@ -177,10 +177,10 @@ def test_networks_learn_from_the_carrier_and_are_restored(tmp_path):
 def test_paths_are_calibrated_at_several_carriers(xml, tmp_path):
     """All surfaces are stated as wood: one permittivity and conductivity of each serve all carriers."""
     record, parts = spectra(xml, 16), {**WALLS, **CEILING, **PARTITION}
-    stated = write_xml(tmp_path / "stated", {name: ("itu_wood", mesh) for name, (_, mesh) in parts.items()})
+    uncorrected_scene = write_xml(tmp_path / "stated", {name: ("itu_wood", mesh) for name, (_, mesh) in parts.items()})
 
     def trained(name, *settings):
-        how: dict[str, Any] = {"scene": str(stated), "split": "frequency:1"}
+        how: dict[str, Any] = {"scene": str(uncorrected_scene), "split": "frequency:1"}
         common = ("depth=2", "rays=4096", "transmission=true", *settings)
         return wrf_mi.train(record, "ray-tracing", out=tmp_path / name, settings=common, **how)
 

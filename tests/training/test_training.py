@@ -34,8 +34,8 @@ FLOAT32_TOLERANCE = 1e-4
 @pytest.mark.parametrize("model", FIELDS)
 def test_loss_falls_and_similarity_rises(model, one_gateway):
     received = list[Any]()
-    split, own = official(one_gateway), ("steps=120", "holdout_steps_fraction=0.5", "validate_every=40")
-    trainer = Trainer(one_gateway, split, settings(*own, model=model))
+    split, extra_settings = official(one_gateway), ("steps=120", "holdout_steps_fraction=0.5", "validate_every=40")
+    trainer = Trainer(one_gateway, split, settings(*extra_settings, model=model))
     assert trainer.run(received.append)
     assert [p.step for p in received] == list(range(5, 121, 5))
     assert received[-1].loss < 0.8 * received[0].loss
@@ -162,11 +162,11 @@ def test_nothing_is_compiled_after_the_first_steps(model, two_gateways):
 
 def test_garbage_collector_is_off_during_recording(one_gateway):
     """A user's array that wraps NumPy's memory, freed then by Python's collector, would end the process."""
-    seen = []
+    flags = []
 
     def watch(phase, info):
         if phase == "start":
-            seen.append(dr.flag(dr.JitFlag.FreezingScope))
+            flags.append(dr.flag(dr.JitFlag.FreezingScope))
 
     trainer = trainer_of(one_gateway, "steps=2", "log_every=1", "validate_every=1")
     before = gc.get_threshold()
@@ -177,8 +177,8 @@ def test_garbage_collector_is_off_during_recording(one_gateway):
     finally:
         gc.set_threshold(*before)
         gc.callbacks.remove(watch)
-    assert len(seen) > 100
-    assert not any(seen)
+    assert len(flags) > 100
+    assert not any(flags)
 
 
 def test_field_initial_values_and_loss_can_be_replaced(one_gateway):
@@ -190,8 +190,8 @@ def test_field_initial_values_and_loss_can_be_replaced(one_gateway):
         calls.append((batch, height, width))
         return dr.mean(dr.square(prediction - truth))
 
-    own = {"field": small_field("wrf-gs"), "initial": start, "loss": squares}
-    trainer = trainer_of(one_gateway, "steps=1", "batch=2", "log_every=1", "holdout_steps_fraction=1", **own)
+    replacements = {"field": small_field("wrf-gs"), "initial": start, "loss": squares}
+    trainer = trainer_of(one_gateway, "steps=1", "batch=2", "log_every=1", "holdout_steps_fraction=1", **replacements)
     np.testing.assert_allclose(trainer.state.params()["position"].T, start.position_m, rtol=1e-6)
     rows = trainer.schedule.rows[0]
     greys = trainer.predictor()(one_gateway.tx_pos_m[rows])
@@ -240,8 +240,8 @@ def test_non_finite_parameter_group_is_named(one_gateway):
     before = trainer.state.params(), trainer.state.mean_params()
     with pytest.raises(NumericsError, match=f"^step 3: not finite: {name};"):
         trainer.run()
-    for group, kept in zip((trainer.state.params(), trainer.state.mean_params()), before, strict=True):
-        np.testing.assert_equal(group, kept)
+    for group, saved in zip((trainer.state.params(), trainer.state.mean_params()), before, strict=True):
+        np.testing.assert_equal(group, saved)
 
 
 def _break_gradient_of(trainer, name):
@@ -250,11 +250,11 @@ def _break_gradient_of(trainer, name):
 
     class Broken(type(trainer.field)):  # type: ignore[misc]
         def gaussians(self, params, tx_pos):
-            found = gaussians(params, tx_pos)
-            own = params[name].array
-            zero = dr.sum(dr.sqrt(own - dr.detach(own)))  # 0, and 1 / 0 in reverse
-            found.signal = [s + zero for s in found.signal]
-            return found
+            field_gaussians = gaussians(params, tx_pos)
+            parameter = params[name].array
+            zero = dr.sum(dr.sqrt(parameter - dr.detach(parameter)))  # 0, and 1 / 0 in reverse
+            field_gaussians.signal = [s + zero for s in field_gaussians.signal]
+            return field_gaussians
 
     trainer.graph.field = Broken(**{f: getattr(trainer.field, f) for f in trainer.field.__dataclass_fields__})
     trainer.record_functions()
@@ -283,9 +283,9 @@ GROUPS = ("network", "position", "scale", "rotation", "opacity", "signal")
 def test_fits_of_any_learning_rates_and_start_end_finite_or_name_step_and_group(
     one_gateway, model, rates, signal, size_deg
 ):
-    own = [f"optimiser.{group}={10**rate:.3e}" for group, rate in rates.items()]
-    own += [f"initial.signal={10**signal:.3e}", f"initial.size_deg={size_deg:g}"]
-    trainer, saved = trainer_of(one_gateway, *SHORT, *own, model=model), []
+    extra_settings = [f"optimiser.{group}={10**rate:.3e}" for group, rate in rates.items()]
+    extra_settings += [f"initial.signal={10**signal:.3e}", f"initial.size_deg={size_deg:g}"]
+    trainer, saved = trainer_of(one_gateway, *SHORT, *extra_settings, model=model), []
     message = ""
     try:
         trainer.run(save=lambda: saved.append(trainer.state.params()))
@@ -334,7 +334,7 @@ def test_predictions_are_recorded_once(one_gateway):
     assert np.abs(after - before).max() > 0
     evaluate: Any = predictor.evaluate
     recorded = evaluate.recordings.values()
-    assert 1 <= sum(one.frozen.n_recordings for one in recorded) <= 2  # new ones for other memory layouts are no harm
+    assert 1 <= sum(step.frozen.n_recordings for step in recorded) <= 2  # new ones for other memory layouts are no harm
 
 
 RECOVERED = 0.97
@@ -373,8 +373,8 @@ def recover(model, steps, rows, **size):
 
     before = score()
     trainer.run()
-    known = split.all_train
-    blend = InverseDistance().fit(tx[known], record.observation[0, known]).predict(tx[split.test])
+    training_rows = split.all_train
+    blend = InverseDistance().fit(tx[training_rows], record.observation[0, training_rows]).predict(tx[split.test])
     return before, score(), float(np.median(ssim(blend, truth)))
 
 

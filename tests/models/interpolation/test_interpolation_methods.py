@@ -67,8 +67,8 @@ def test_settings_are_listed_and_accept_null(flat_folder: Path, command: Command
 def test_settings_round_trip_through_the_configuration_and_the_list(name: str) -> None:
     """As ``config.yaml`` keeps them and as ``--help-settings`` shows them, lists, choices and null included."""
     settings = SETTINGS[name]()
-    kept = yaml.safe_load(yaml.safe_dump(json.loads(json.dumps(asdict(settings)))))
-    assert settings_from(type(settings), kept, "config.yaml") == settings
+    reloaded = yaml.safe_load(yaml.safe_dump(json.loads(json.dumps(asdict(settings)))))
+    assert settings_from(type(settings), reloaded, "config.yaml") == settings
     assert with_settings(settings, describe(settings).splitlines()) == settings
 
 
@@ -124,14 +124,14 @@ def test_runs_with_headings_equal_the_library(flat_folder: Path, tmp_path: Path)
     """Kriging about each receiver's log-distance law, and trees, as the library alone has them."""
     record = load(flat_folder)
     (split,) = make_splits(record, "official")
-    place, turned, known = record.tx_pos_m, record.tx_heading_rad, split.all_train
+    place, turned, training_rows = record.tx_pos_m, record.tx_heading_rad, split.all_train
     kriging, trees = ("length_m=0.5", "noise=0.1", "heading_length=1.5"), ("trees=20", "leaf_rows=2")
     for name, settings in (("kriging", kriging), ("trees", trees)):
         predicted = stored(train(flat_folder, name, out=tmp_path / name, settings=settings).folder)["prediction"]
         for r, receiver in enumerate(record.receivers):
             law = Trend(receiver.position_m)
             model = Kriging(0.5, 0.1, 1.5, trend=law, trend_fit="ols") if name == "kriging" else Trees(20, 2)
-            expected = model.fit(place[known], record.observation[r, known], turned[known])
+            expected = model.fit(place[training_rows], record.observation[r, training_rows], turned[training_rows])
             at_test = expected.predict(place[split.test], turned[split.test])
             np.testing.assert_allclose(predicted[r], at_test, atol=ROUNDING)
 
@@ -144,13 +144,15 @@ def test_grown_trees_predict_as_scikit_learn(flat_folder: Path) -> None:
         values, columns = np.sin(positions[:, 0]).astype(np.float32), [positions]
         columns += [] if turned_by is None else [np.cos(heading)[:, None], np.sin(heading)[:, None]]
         model = ExtraTreesRegressor(30, min_samples_leaf=2, random_state=0).fit(np.hstack(columns), values)
-        kept = from_arrays(GrownTrees, to_arrays(Trees(30, 2).fit(positions, values, turned_by)))
+        stored_trees = from_arrays(GrownTrees, to_arrays(Trees(30, 2).fit(positions, values, turned_by)))
         # At thresholds, where single precision decides the side.
         edge = np.resize(record.tx_pos_m, (300, 3))
-        edge[:, 0] = np.resize(kept.threshold[(kept.feature == 0) & (kept.left != kept.right)], 300)
+        edge[:, 0] = np.resize(
+            stored_trees.threshold[(stored_trees.feature == 0) & (stored_trees.left != stored_trees.right)], 300
+        )
         asked = edge, None if turned_by is None else np.resize(record.tx_heading_rad, 300)
         columns = [edge] if asked[1] is None else [edge, np.cos(asked[1])[:, None], np.sin(asked[1])[:, None]]
-        np.testing.assert_allclose(kept.predict(*asked), model.predict(np.hstack(columns)), atol=1e-6)
+        np.testing.assert_allclose(stored_trees.predict(*asked), model.predict(np.hstack(columns)), atol=1e-6)
 
 
 @needs("flat-ble")
@@ -193,8 +195,10 @@ def area(seed: int, shadow_m: float, extent_m: float = 400.0, receivers: int = 1
 
 def errors_db(record: Record, model: str, folder: Path, *settings: str) -> tuple[np.ndarray, np.ndarray]:
     """Absolute errors of the test rows, and the same in standard deviations."""
-    known, test = record.official
-    split = Split("official", 0, known[len(known) // 10 :], known[: len(known) // 10], test)
+    training_rows, test = record.official
+    split = Split(
+        "official", 0, training_rows[len(training_rows) // 10 :], training_rows[: len(training_rows) // 10], test
+    )
     entry = MODELS[model].serving("rssi", False)
     with threadpool_limits(1, "blas"):  # as in runs
         fitted = entry.fit(Problem(record, default_settings(entry, settings, {})), split, Session(folder, folder))

@@ -44,9 +44,9 @@ def test_universal_kriging_solves_the_augmented_system():
     model = Kriging(0.8, 0.3, 1.5, trend=trend).fit(positions, values, heading)
     assert chosen(model) == {"length_m": 0.8, "heading_length": 1.5, "noise": 0.3}
     b, k = trend(positions), covariance(positions, heading, positions, heading) + 0.3 * np.eye(25)
-    whole = np.block([[k, b], [b.T, np.zeros((2, 2))]])
+    augmented = np.block([[k, b], [b.T, np.zeros((2, 2))]])
     right = np.concatenate([covariance(positions, heading, at, turned), trend(at).T])
-    weights = np.linalg.solve(whole, right)
+    weights = np.linalg.solve(augmented, right)
     np.testing.assert_allclose(model.predict(at, turned), weights[:25].T @ values, atol=EXACT)
     variance = KrigingSystem(k, 0.0, b).variance(1.0, right[:25].T, trend(at))
     np.testing.assert_allclose(variance, 1 - (weights * right).sum(axis=0), atol=EXACT)
@@ -167,9 +167,9 @@ def test_trees_use_the_heading():
     truth = np.where(np.cos(heading) > 0, -50.0, -70.0)
     values = (truth + rng.normal(0, 2, 2000)).astype(np.float32)
     values[:100] = np.nan
-    found = Trees(40).fit(positions[:1500], values[:1500], heading[:1500]).predict(positions[1500:], heading[1500:])
-    assert found.dtype == np.float32
-    assert np.median(np.abs(found - truth[1500:])) < 1
+    predicted = Trees(40).fit(positions[:1500], values[:1500], heading[:1500]).predict(positions[1500:], heading[1500:])
+    assert predicted.dtype == np.float32
+    assert np.median(np.abs(predicted - truth[1500:])) < 1
     blind = Trees(40).fit(positions[:1500], values[:1500])
     assert np.median(np.abs(blind.predict(positions[1500:]) - truth[1500:])) > 5
 
@@ -197,8 +197,8 @@ def test_published_figures_of_signal_strengths():
     np.testing.assert_array_equal(rows, few.test)
     for receiver, observed in zip(record.receivers, record.observation, strict=True):
         kriged = Kriging(trend=Trend(receiver.position_m)).fit(where[few.all_train], observed[few.all_train])
-        known = every.all_train
-        trees = Trees(40).fit(where[known], observed[known], heading[known])
+        training_rows = every.all_train
+        trees = Trees(40).fit(where[training_rows], observed[training_rows], heading[training_rows])
         predicted = kriged.predict(where[rows]), trees.predict(where[rows], heading[rows])
         errors.append([score(values, observed[rows]) for values in predicted])
     kriged_db, grown_db = (summary(of_method)["median"] for of_method in np.concatenate(errors, axis=1))

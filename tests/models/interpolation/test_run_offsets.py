@@ -72,15 +72,15 @@ def test_rows_without_a_run_and_runs_that_nobody_received_change_no_offset(recor
 def test_another_run_is_as_uncertain_as_runs_differ(fitted: Strengths, record: Record) -> None:
     assert fitted.offsets is not None
     where = record.tx_pos_m[:4]
-    other, mean, known = (
+    other, mean, same_run = (
         fitted.predict(Inputs(where, runs=runs), 0) for runs in (None, np.full(4, ""), np.full(4, "a"))
     )
     assert other.std is not None
     assert mean.std is not None
     np.testing.assert_allclose(other.mean, mean.mean)
     np.testing.assert_allclose(other.std**2 - mean.std**2, (fitted.offsets.sd_db * fitted.widen[0]) ** 2)
-    np.testing.assert_allclose(known.mean - mean.mean, fitted.offsets.offset_db[0])
-    np.testing.assert_allclose(fitted.predict_mean(Inputs(where, runs=np.full(4, "a")), 0), known.mean)
+    np.testing.assert_allclose(same_run.mean - mean.mean, fitted.offsets.offset_db[0])
+    np.testing.assert_allclose(fitted.predict_mean(Inputs(where, runs=np.full(4, "a")), 0), same_run.mean)
     again = from_arrays(RunOffsets, to_arrays(fitted.offsets))
     np.testing.assert_array_equal(again.of(np.array(["b", "", "z"]), 3), fitted.offsets.of(np.array(["b", "", "z"]), 3))
 

@@ -173,9 +173,13 @@ def test_prediction_is_that_of_a_gaussian_process_and_restored(tmp_path: Path) -
     components = process.signals @ process.basis.conj()
     for c in range(3):
         covariance = np.tensordot(process.weight[c], each_covariance(DICTIONARY, every), 1)
-        known, cross = covariance[:30, :30] + process.noise[c] * np.eye(30), covariance[30:, :30]
-        mean = cross @ np.linalg.solve(known, components[:, c])
-        left = covariance[0, 0] - np.diagonal(cross @ np.linalg.solve(known, cross.conj().T)) + process.noise[c]
+        training_covariance, cross = covariance[:30, :30] + process.noise[c] * np.eye(30), covariance[30:, :30]
+        mean = cross @ np.linalg.solve(training_covariance, components[:, c])
+        left = (
+            covariance[0, 0]
+            - np.diagonal(cross @ np.linalg.solve(training_covariance, cross.conj().T))
+            + process.noise[c]
+        )
         np.testing.assert_allclose(posterior.mean @ process.basis.conj()[:, c], mean, atol=1e-8)
         np.testing.assert_allclose(posterior.variance[:, c], left.real, atol=1e-8)
     write_arrays(tmp_path / "process.npz", to_arrays(process))
@@ -195,8 +199,8 @@ def test_held_out_is_a_fit_without_those_rows_or_the_prior_without_any(radius_m:
         assert far.any() == (radius_m < 100)
         mean, variance = np.zeros(3), process.prior
         if far.any():
-            kept = replace(process, tx_pos_m=process.tx_pos_m[far], signals=process.signals[far])
-            without = kept.predict(process.tx_pos_m[[row]])
+            far_process = replace(process, tx_pos_m=process.tx_pos_m[far], signals=process.signals[far])
+            without = far_process.predict(process.tx_pos_m[[row]])
             mean, variance = without.mean[0], without.variance[0]
         np.testing.assert_allclose(posterior.mean[number], mean, atol=1e-8)
         np.testing.assert_allclose(posterior.variance[number], variance, atol=1e-8)
@@ -243,7 +247,7 @@ def test_realignment_corrects_single_rows(monkeypatch: pytest.MonkeyPatch) -> No
     angle = np.angle(np.einsum("nm,nm->n", right.signals.conj(), turned))
     np.testing.assert_allclose(turned, right.signals * np.exp(1j * angle)[:, None], atol=ROUNDING)
     assert np.ptp(angle) < 0.5  # all are turned a little by what was wrong
-    monkeypatch.setattr(module, "align_signals", lambda *known: rows)
+    monkeypatch.setattr(module, "align_signals", lambda *arguments: rows)
     assert overlaps(fit_signals(truth, where, ELEMENTS_M, DICTIONARY).signals, truth).min() > 1 - ROUNDING
 
 

@@ -102,8 +102,8 @@ def test_constant_fields_are_reproduced_and_coincident_rows_fitted() -> None:
     np.testing.assert_allclose(same.predict(positions(2, seed=1)), 0.5, atol=SINGLE)
     one_place = np.repeat(where[:1], 10, axis=0)
     observed = np.random.default_rng(0).uniform(size=(10, 30)).astype(np.float32)
-    found = fit_anisotropic(one_place, observed, RECEIVER_M, WAVELENGTH_M)
-    np.testing.assert_allclose(found.predict(where[:1])[0], observed.mean(axis=0), atol=SINGLE)
+    fitted = fit_anisotropic(one_place, observed, RECEIVER_M, WAVELENGTH_M)
+    np.testing.assert_allclose(fitted.predict(where[:1])[0], observed.mean(axis=0), atol=SINGLE)
 
 
 @pytest.mark.parametrize("radius_m", [0.0, 0.1, 0.3, 100.0])
@@ -111,14 +111,14 @@ def test_held_out_is_kriging_without_those_rows_or_the_mean_without_any(radius_m
     process, rows = process_of(), np.array([0, 7, 24])
     mean, deviation = process.held_out(radius_m, rows)
     for number, row in enumerate(rows):
-        kept = np.flatnonzero(cdist(process.tx_pos_m[[row]], process.tx_pos_m)[0] > radius_m)
-        assert len(kept) < 25
-        assert (len(kept) == 0) == (radius_m == 100.0)
+        far_rows = np.flatnonzero(cdist(process.tx_pos_m[[row]], process.tx_pos_m)[0] > radius_m)
+        assert len(far_rows) < 25
+        assert (len(far_rows) == 0) == (radius_m == 100.0)
         weights, variance = np.full((1, 25), 1 / 25), np.array([1 + NOISE])
-        if len(kept):
-            weights, variance = kriged(process, kept, process.tx_pos_m[[row]])
-        known = process.observed[kept] if len(kept) else process.observed
-        np.testing.assert_allclose(mean[number], np.tensordot(weights[0], known, 1), atol=SINGLE)
+        if len(far_rows):
+            weights, variance = kriged(process, far_rows, process.tx_pos_m[[row]])
+        far_values = process.observed[far_rows] if len(far_rows) else process.observed
+        np.testing.assert_allclose(mean[number], np.tensordot(weights[0], far_values, 1), atol=SINGLE)
         np.testing.assert_allclose(deviation[number], np.sqrt(variance[0]) * process.scale, atol=SINGLE)
 
 
@@ -184,12 +184,12 @@ def test_mixture_beats_kriging_and_states_its_error(record: Record, model: ByRec
 
 
 def test_deviation_is_that_of_the_grey_values_far_away(record: Record, model: ByReceiver) -> None:
-    known, far = record.observation[0, record.official[0]], np.array([[100.0, 100.0, 0.0]])
+    training_values, far = record.observation[0, record.official[0]], np.array([[100.0, 100.0, 0.0]])
     away, near = (model.predict(Inputs(where), 0) for where in (far, record.tx_pos_m[record.official[0]]))
     np.testing.assert_allclose(away.mean[0], coherent(model).nearby.predict(far)[0], atol=1e-3)
-    assert np.sqrt(np.square(away.std).mean()) > 0.7 * known.std(axis=0).mean()
+    assert np.sqrt(np.square(away.std).mean()) > 0.7 * training_values.std(axis=0).mean()
     assert near.std.mean() < 0.2 * away.std.mean()
-    assert np.abs(near.mean - known).mean() < 0.02
+    assert np.abs(near.mean - training_values).mean() < 0.02
 
 
 def test_fit_reports_progress_and_what_it_found(model, progress) -> None:
@@ -265,8 +265,8 @@ def test_deviations_of_generic_kriging_are_those_of_universal_kriging() -> None:
         others = np.arange(12) != row
         single = Kriging(length_m=0.3, noise=0.05).fit(where[others], observed[others]).predict(where[[row]])
         np.testing.assert_allclose(left[row], observed[row] - single[0], atol=1e-9)
-    one = UncertainKriged.of(Kriging(length_m=0.3, noise=0.05).fit(where[:1], observed[:1]), observed[:1])
-    assert (one.prediction(asked).std > 0).all()  # a single row says nothing about the spread
+    single_row = UncertainKriged.of(Kriging(length_m=0.3, noise=0.05).fit(where[:1], observed[:1]), observed[:1])
+    assert (single_row.prediction(asked).std > 0).all()  # a single row says nothing about the spread
 
 
 def test_weights_keep_their_defaults_without_gaps(record: Record) -> None:
@@ -274,9 +274,9 @@ def test_weights_keep_their_defaults_without_gaps(record: Record) -> None:
     first = of_one_receiver(record)
     model = fit(replace(first, tx_pos_m=np.zeros_like(first.tx_pos_m)), np.arange(16))
     assert (coherent(model).half, coherent(model).spread) == (1.0, 1.0)
-    estimate, known = model.predict(Inputs(np.zeros((1, 3))), 0), first.observation[0, :16]
-    np.testing.assert_allclose(estimate.mean[0], known.mean(axis=0), atol=0.3)
-    assert estimate.std.mean() == pytest.approx(known.std(axis=0).mean(), rel=0.5)
+    estimate, training_values = model.predict(Inputs(np.zeros((1, 3))), 0), first.observation[0, :16]
+    np.testing.assert_allclose(estimate.mean[0], training_values.mean(axis=0), atol=0.3)
+    assert estimate.std.mean() == pytest.approx(training_values.std(axis=0).mean(), rel=0.5)
     close = coherent(fit(replace(first, tx_pos_m=first.tx_pos_m / 10), np.arange(16)))
     assert np.ptp(close.nearby.tx_pos_m, axis=0).max() < GAPS[-2] * WAVELENGTH_M
     assert 0.3 < close.spread < 1.5
@@ -316,8 +316,8 @@ def test_arrays_on_a_line_and_too_many_rows_are_kriged_generically_with_a_warnin
 def test_unknown_instruments_and_stated_covariances_are_kriged_generically(settings, change, record, two_gateways):
     if change is None and settings is QUICK:
         record = two_gateways  # an instrument of which nothing is known
-    unknown = {"array": without_array, "frequencies_hz": lambda known: replace(known, frequencies_hz=None)}
-    model = fit(unknown.get(change or "", lambda known: known)(record), np.arange(12), settings)
+    unknown = {"array": without_array, "frequencies_hz": lambda original: replace(original, frequencies_hz=None)}
+    model = fit(unknown.get(change or "", lambda original: original)(record), np.arange(12), settings)
     assert all(type(kriged) is Kriged for kriged in model.models)
     assert model.predict(Inputs(record.tx_pos_m[:2]), 0).std is None
 

@@ -63,14 +63,14 @@ def test_predictions_are_equivariant_to_the_level_of_the_data(level_db: float, r
     """Transmitters of 30 dBm, or strengths in other units."""
     record = made(60, noise_db=1.0)
     shifted = replace(record, observation=record.observation + np.float32(level_db))
-    plain, moved = (fit_strengths(one, np.arange(rows)) for one in (record, shifted))
+    plain, moved = (fit_strengths(data, np.arange(rows)) for data in (record, shifted))
     inputs = Inputs(record.tx_pos_m, record.tx_heading_rad)
     for receiver in range(3):
         before, after = (model.predict(inputs, receiver) for model in (plain, moved))
         np.testing.assert_allclose(after.mean, before.mean + level_db, atol=1e-3)  # float32 observations
         np.testing.assert_allclose(after.std, before.std, atol=1e-3)
-    known = replace(DEFAULTS, transmit_dbm=0.0)
-    assert fit_strengths(shifted, np.arange(rows), settings=known).field.prior.transmit_dbm == 0
+    stated_power = replace(DEFAULTS, transmit_dbm=0.0)
+    assert fit_strengths(shifted, np.arange(rows), settings=stated_power).field.prior.transmit_dbm == 0
 
 
 def test_posterior_and_likelihood_equal_those_of_one_dense_covariance_matrix() -> None:
@@ -96,21 +96,23 @@ def test_posterior_and_likelihood_equal_those_of_one_dense_covariance_matrix() -
         dense[7:, 7:] += kernel.covariance(places[1], places[1])
         cross = basis @ np.diag(prior**2) @ all_bases.T
         cross[:, 7:] += kernel.covariance(asked, places[1])
-        own = np.square(basis) @ prior**2 + kernel.variance(True)
+        prior_variance = np.square(basis) @ prior**2 + kernel.variance(True)
         # Both are float64; the jitter on the diagonal is 1e-8 of the noise.
         np.testing.assert_allclose(mean, cross @ np.linalg.solve(dense, y), rtol=1e-6)
-        np.testing.assert_allclose(variance, own - (cross @ np.linalg.solve(dense, cross.T)).diagonal(), rtol=1e-6)
+        np.testing.assert_allclose(
+            variance, prior_variance - (cross @ np.linalg.solve(dense, cross.T)).diagonal(), rtol=1e-6
+        )
         assert process.cost == pytest.approx(y @ np.linalg.solve(dense, y) + np.linalg.slogdet(dense)[1], rel=1e-6)
         # Without two and one of the observations, and without all of the second receiver.
         folds = [[np.array([0, 2]), np.array([1])], [np.array([], int), np.arange(5)]]
-        for fold, found in zip(folds, process.without(folds), strict=True):
+        for fold, conditional in zip(folds, process.without(folds), strict=True):
             left = np.concatenate([fold[0], 7 + fold[1]])
-            known = np.setdiff1d(np.arange(12), left)
-            gain = dense[np.ix_(left, known)] @ np.linalg.inv(dense[np.ix_(known, known)])
-            np.testing.assert_allclose(np.concatenate(found.mean), gain @ y[known], rtol=1e-6)
-            unknown = (dense[np.ix_(left, left)] - gain @ dense[np.ix_(known, left)]).diagonal()
+            remaining_rows = np.setdiff1d(np.arange(12), left)
+            gain = dense[np.ix_(left, remaining_rows)] @ np.linalg.inv(dense[np.ix_(remaining_rows, remaining_rows)])
+            np.testing.assert_allclose(np.concatenate(conditional.mean), gain @ y[remaining_rows], rtol=1e-6)
+            unknown = (dense[np.ix_(left, left)] - gain @ dense[np.ix_(remaining_rows, left)]).diagonal()
             unknown = unknown - np.concatenate(noise)[left]
-            np.testing.assert_allclose(np.concatenate(found.variance), unknown, rtol=1e-6)
+            np.testing.assert_allclose(np.concatenate(conditional.variance), unknown, rtol=1e-6)
 
 
 @pytest.mark.parametrize("twins", [True, False])
@@ -127,12 +129,12 @@ def test_coefficients_of_receivers_are_those_of_one_dense_precision(twins: bool)
     for basis, block, value in zip(bases, blocks, values, strict=True):
         dense[np.ix_(basis.used, basis.used)] += block
         right[basis.used] += value
-    found, covariance = Coefficients(prior_sd, bases, blocks, values), np.linalg.inv(dense)
-    np.testing.assert_allclose(found.mean, covariance @ right, rtol=1e-9, atol=1e-12)
-    assert found.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-9)
+    coefficients, covariance = Coefficients(prior_sd, bases, blocks, values), np.linalg.inv(dense)
+    np.testing.assert_allclose(coefficients.mean, covariance @ right, rtol=1e-9, atol=1e-12)
+    assert coefficients.log_determinant == pytest.approx(np.linalg.slogdet(dense)[1], rel=1e-9)
     for receiver, basis in enumerate(bases):
         expected = covariance[np.ix_(basis.used, basis.used)]
-        np.testing.assert_allclose(found.covariance(receiver), expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(coefficients.covariance(receiver), expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("trees", [0, 10])
@@ -212,7 +214,7 @@ def test_stated_noise_lowers_the_error() -> None:
     std = rng.choice([0.5, 9.0], record.observation.shape)
     noisy = replace(record, observation=(record.observation + std * rng.normal(size=std.shape)).astype(np.float32))
     train, test = np.arange(200), np.arange(200, 300)
-    plain, weighted = (fit_strengths(one, train) for one in (noisy, replace(noisy, std=std)))
+    plain, weighted = (fit_strengths(data, train) for data in (noisy, replace(noisy, std=std)))
     # Half of the rows have a noise of 9 dB.
     assert np.median(np.abs(errors(weighted, record, test))) < 0.75 * np.median(np.abs(errors(plain, record, test)))
 
@@ -267,11 +269,14 @@ def test_search_lowers_the_held_out_error() -> None:
     record = made(120, noise_db=1.0, body_db=3.0)
     wrong = replace(DEFAULTS, shadow_db=12.0, shadow_m=0.2)
     settings = wrong, replace(wrong, shadowing="searched")
-    before, after = (fit_strengths(record, np.arange(120), None, one, stated=()).facts()["fitted"] for one in settings)
+    before, after = (
+        fit_strengths(record, np.arange(120), None, trial_settings, stated=()).facts()["fitted"]
+        for trial_settings in settings
+    )
     assert after["held_out_db"] < before["held_out_db"] - 0.1
     assert after["shadow_m"] > 0.2
-    held = replace(wrong, shadowing="searched")
-    fitted = fit_strengths(record, np.arange(120), None, held, stated=("shadow_m",)).facts()["fitted"]
+    fixed_settings = replace(wrong, shadowing="searched")
+    fitted = fit_strengths(record, np.arange(120), None, fixed_settings, stated=("shadow_m",)).facts()["fitted"]
     assert fitted["shadow_m"] == 0.2
 
 
@@ -302,23 +307,23 @@ def test_stops_are_thinned_where_factors_would_fill_the_memory(turning, monkeypa
 
 def test_folds_exclude_neighbours_in_time() -> None:
     count = 700
-    held = np.zeros(count, int)
+    held_out_counts = np.zeros(count, int)
     for train, out in folds(np.arange(count)[:, None] * [[1.0, 0.0, 0.0]]):
-        held[out] += 1
+        held_out_counts[out] += 1
         nearest = np.abs(train[:, None] - out[None]).min()
         assert nearest > 12  # a quarter of a stretch of 50
-    assert (held == 1).all()
+    assert (held_out_counts == 1).all()
 
 
 @pytest.mark.parametrize("visits", ["in turn", "again"])
 def test_folds_hold_all_readings_of_a_place_out(visits: str) -> None:
     """As in a corridor where a phone reads three times at each place, or passes three times."""
     places = np.repeat(np.arange(40), 3) if visits == "in turn" else np.tile(np.arange(40), 3)
-    held = np.zeros(len(places), int)
+    held_out_counts = np.zeros(len(places), int)
     for train, out in folds(places[:, None] * [[0.5, 0.0, 0.0]]):
-        held[out] += 1
+        held_out_counts[out] += 1
         assert not {*places[train]} & {*places[out]}
-    assert (held == 1).all()
+    assert (held_out_counts == 1).all()
 
 
 def test_rows_of_one_place_hold_nothing_out() -> None:

@@ -99,12 +99,12 @@ def test_fits_do_not_depend_on_held_out_rows(name: str, two_gateways: Record):
     """Other spectra in held-out rows, and a row that one receiver did not receive, change nothing and break nothing."""
     settings = replace(SMALL[name][1], steps=4)
     split = Split("some", 0, np.arange(8), np.arange(8, 10), np.arange(10, 24))
-    known = two_gateways.observation.copy()
-    known[1, 3] = np.nan
-    other = known.copy()
+    incomplete = two_gateways.observation.copy()
+    incomplete[1, 3] = np.nan
+    other = incomplete.copy()
     other[:, 10:] = 1 - other[:, 10:]
     asked, both = inputs_of(two_gateways, np.arange(3)), []
-    for observation in (known, other):
+    for observation in (incomplete, other):
         fitted = fit(name, replace(two_gateways, observation=observation), split, settings)
         both.append([fitted.predict(asked, receiver).mean for receiver in (0, 1)])
     np.testing.assert_allclose(both[0], both[1], atol=1e-3)

@@ -239,10 +239,10 @@ def test_gradients_of_the_evidence_bound():
     vae = Vae(VAE, 4, (2, 3), rng)
     weights = {path: rng.standard_normal(weight.shape) for path, weight in vae.state().items()}
     data = {name: doubles(rng.uniform(size=(n, 3))) for name, n in {"cells": 4, "where": 3, "pixels": 6}.items()}
-    given = {"rows": mi.UInt32([2, 0])} | {name: doubles(rng.standard_normal((2, 2))) for name in ("noise", "prior")}
+    inputs = {"rows": mi.UInt32([2, 0])} | {name: doubles(rng.standard_normal((2, 2))) for name in ("noise", "prior")}
 
     def function(tensors: list[Any]) -> Any:
-        return elbo_loss(vae.with_state(dict(zip(weights, tensors, strict=True))), data, given, VAE.latent)
+        return elbo_loss(vae.with_state(dict(zip(weights, tensors, strict=True))), data, inputs, VAE.latent)
 
     assert_gradients(function, list(weights.values()), rng)
 

@@ -57,18 +57,18 @@ def test_known_lengths_carry_close_paths_into_the_next_band():
     up, down = (waves.evaluate(theta, gains[..., None], part) for part in (HZ[:HALF], HZ[HALF:]))
     deviation = np.array([0.03, 0.003, 0.003])
     off = theta + deviation * rng.standard_normal(theta.shape)
-    known = Start(off, np.ones((8, 6), bool), np.broadcast_to(deviation**-2.0, theta.shape))
+    known_start = Start(off, np.ones((8, 6), bool), np.broadcast_to(deviation**-2.0, theta.shape))
     median = {}
-    for name, start in (("searched", None), ("known", known)):
-        found = find_paths(waves, noisy(up, rng), 12, 1, 15, start)
-        median[name] = np.median(cea_db(waves.evaluate(found.theta, found.gains, HZ[HALF:]), down))
+    for name, start in (("searched", None), ("known", known_start)):
+        fitted = find_paths(waves, noisy(up, rng), 12, 1, 15, start)
+        median[name] = np.median(cea_db(waves.evaluate(fitted.theta, fitted.gains, HZ[HALF:]), down))
     assert median["known"] > median["searched"] + GAIN_DB
 
 
 def test_distinct_paths_are_the_strongest_of_those_that_are_alike():
     theta = np.array([[5.0, 0.1, 0.2], [5.01, 0.105, 0.2], [5.0, 0.3, 0.2], [9.0, 0.1, 0.2], [7.0, 0, 0]])
-    found = distinct(theta, np.array([0.5, 1.0, 0.2, 1e-4, 0.0]))
-    assert found == pytest.approx(theta[[1, 2]])
+    distinct_theta = distinct(theta, np.array([0.5, 1.0, 0.2, 1e-4, 0.0]))
+    assert distinct_theta == pytest.approx(theta[[1, 2]])
 
 
 def test_scene_raises_the_accuracy_of_the_downlink(room: Record, tmp_path: Path):

@@ -324,15 +324,15 @@ def test_exact_on_a_noise_free_linear_relation_and_zero_for_zeros() -> None:
     fitted = fit_linear(record, split)
     assert fitted.penalty == PENALTIES[0]
     np.testing.assert_allclose(fitted.matrix, matrix, atol=EXACT)
-    found, truth = fitted.predict(inputs_of(record, split.test), 0).mean, record.observation[0, split.test]
-    assert found.dtype == np.complex64
-    assert relative_error(found, truth).max() < EXACT**2
+    predicted, truth = fitted.predict(inputs_of(record, split.test), 0).mean, record.observation[0, split.test]
+    assert predicted.dtype == np.complex64
+    assert relative_error(predicted, truth).max() < EXACT**2
     record, _ = linear_record()
     uplink = np.ones((2, ANTENNAS, UP), np.complex64)
     uplink[1, 2] = 0
-    found = fit_linear(record, split_made()).predict(Inputs(np.full((2, 3), np.nan), uplink=uplink), 0).mean
-    assert not found[1, 2].any()
-    assert found[1, 1].all()
+    predicted = fit_linear(record, split_made()).predict(Inputs(np.full((2, 3), np.nan), uplink=uplink), 0).mean
+    assert not predicted[1, 2].any()
+    assert predicted[1, 1].all()
 
 
 def test_penalty_is_chosen_on_validation_rows_and_fitted_to_all_training_rows() -> None:
@@ -356,8 +356,8 @@ def test_penalty_is_chosen_on_validation_rows_and_fitted_to_all_training_rows() 
 
     def error(penalty: float) -> float:
         truth = record.observation[0, split.validation]
-        found = record.uplink[split.validation] @ solved(split.train, penalty)
-        return float(np.median(relative_error(found.reshape(len(truth), -1), truth.reshape(len(truth), -1))))
+        predicted = record.uplink[split.validation] @ solved(split.train, penalty)
+        return float(np.median(relative_error(predicted.reshape(len(truth), -1), truth.reshape(len(truth), -1))))
 
     assert fitted.penalty == min(PENALTIES, key=error)
     assert PENALTIES[0] < fitted.penalty < PENALTIES[-1], "something is chosen"

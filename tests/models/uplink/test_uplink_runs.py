@@ -93,11 +93,11 @@ def test_methods_are_fitted_to_measurements_and_scored_by_the_truth(turned: None
 
 def test_receivers_and_antennas_are_distinguished(tmp_path: Path) -> None:
     """[receivers, rows, antennas, subcarriers] and [receivers, rows, subcarriers] of as many axes."""
-    one = channels()
-    stations = (*one.receivers, replace(one.receivers[0], name="b"))
-    two = replace(one, receivers=stations, observation=one.observation.repeat(2, 0))
+    single_station = channels()
+    stations = (*single_station.receivers, replace(single_station.receivers[0], name="b"))
+    two = replace(single_station, receivers=stations, observation=single_station.observation.repeat(2, 0))
     single = replace(two, observation=two.observation[:, :, 0], uplink=two.uplink[:, :1])
-    for record, shape in ((one, (1, 10, 3, 4)), (two, (2, 10, 3, 4)), (single, (2, 10, 4))):
+    for record, shape in ((single_station, (1, 10, 3, 4)), (two, (2, 10, 3, 4)), (single, (2, 10, 4))):
         run = read_run(train(record, "idw", out=tmp_path / "x".join(map(str, shape))).folder)
         assert (run.prediction.shape, run.score.shape) == (shape, shape[:2])
 
