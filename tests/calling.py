@@ -91,10 +91,10 @@ def scored_again_as_before(run: Path, capsys: pytest.CaptureFixture[str]) -> dic
 def damaged_models_refused(run: Path, key: str, capsys: pytest.CaptureFixture[str]) -> None:
     """``evaluate`` refuses a model that is cut, lacks the array ``key``, or is of another format."""
     model, asked = run / "model.npz", ["evaluate", run]
-    whole = model.read_bytes()
-    with np.load(model) as held:
-        arrays = {name: values for name, values in held.items() if name != CHECKSUM}
-    model.write_bytes(whole[: len(whole) // 2])
+    content = model.read_bytes()
+    with np.load(model) as archive:
+        arrays = {name: values for name, values in archive.items() if name != CHECKSUM}
+    model.write_bytes(content[: len(content) // 2])
     refused(asked, "model.npz: not readable .*; train the run anew", capsys)
     np.savez(model, **{name: value for name, value in arrays.items() if name != key})
     refused(asked, f"model.npz: not readable .*{key.partition('/')[2]}.*; train the run anew", capsys)

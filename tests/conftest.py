@@ -112,9 +112,9 @@ def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     counts, search = list[int](), solve._search
 
-    def counted(shared: Any, sources: Any, targets: Any, *rest: Any) -> Any:
+    def counted(shared: Any, sources: Any, targets: Any, *arguments: Any) -> Any:
         counts.append(len(targets))
-        return search(shared, sources, targets, *rest)
+        return search(shared, sources, targets, *arguments)
 
     monkeypatch.setattr(solve, "_search", counted)
     return counts

@@ -49,13 +49,13 @@ def computed(folder: Path) -> Counter[str]:
     return Counter((folder / "begun").read_text().split())
 
 
-def _begin(folder: Path, deadly: int, function: Callable[..., Any], *given: Any) -> Any:
-    index, part = given[-1]
+def _begin(folder: Path, deadly: int, function: Callable[..., Any], *arguments: Any) -> Any:
+    index, part = arguments[-1]
     with (folder / "begun").open("a") as stream:
         stream.write(f"{index}\n")
     if index == deadly and computed(folder)[str(index)] == 1:
         os.kill(os.getpid(), signal.SIGKILL)
-    return function(*given[:-1], part)
+    return function(*arguments[:-1], part)
 
 
 class Lossy:

@@ -48,10 +48,10 @@ def test_amplitudes_are_calibrated_whatever_the_phases():
     waves, rows = unit_waves([0.0, 2e-8]), 12
     phases = RNG.uniform(-np.pi, np.pi, (rows, 2))
     channels = np.exp(1j * phases) * np.array([1.0, 0.5]) @ waves
-    found, prior = calibrated(
+    log_gains, prior = calibrated(
         lambda x: [np.exp(x)[:, None] * waves] * rows, channels, np.log([0.7, 0.7]), np.full(rows, 1e-3)
     )
-    np.testing.assert_allclose(np.exp(found), [1.0, 0.5], rtol=0.02)
+    np.testing.assert_allclose(np.exp(log_gains), [1.0, 0.5], rtol=0.02)
     assert prior < 1.5
     certain = [np.full(4, 10.0 + 0.0j)]
     assert resultant(np.array(prior_concentration(certain))) == pytest.approx(float(resultant(np.array(10.0))))
@@ -86,8 +86,8 @@ def test_channel_of_a_dipole_in_free_space(tmp_path):
             file[f"rxs/rx{number}/Ez"] = ez.astype(np.float32)
     wavenumber = 2 * np.pi * fdtd.WIDE_HZ / c
     expected = np.exp(-1j * wavenumber * distance_m[:, None]) / (2 * wavenumber * distance_m[:, None])
-    found = fdtd.measured_channels(tmp_path / "toy.out", fdtd.WIDE_HZ)
-    np.testing.assert_allclose(found / expected, 1, atol=2e-3)
+    channels = fdtd.measured_channels(tmp_path / "toy.out", fdtd.WIDE_HZ)
+    np.testing.assert_allclose(channels / expected, 1, atol=2e-3)
 
 
 def test_tables_have_a_line_for_each_row():

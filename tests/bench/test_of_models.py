@@ -45,8 +45,8 @@ def test_table_names_the_kept_stages_and_the_best_part():
         gain = dict(zip(("gain", "gain_low", "gain_high"), gains, strict=False))
         return {"model": model, "score": score, "block": "ssim", "inside_90": None, "crps": None} | gain | more
 
-    kept = [("mean", True, 0.7, None), ("correction", False, 0.695, 3.0), ("field", True, None, 1.0)]
-    in_turn = [dict(zip(("stage", "kept", "held_out", "seconds"), values, strict=True)) for values in kept]
+    stage_values = [("mean", True, 0.7, None), ("correction", False, 0.695, 3.0), ("field", True, None, 1.0)]
+    in_turn = [dict(zip(("stage", "kept", "held_out", "seconds"), values, strict=True)) for values in stage_values]
     results = [
         measured("hybrid", 0.9, inside_90=0.88, crps=0.02, stages=in_turn),
         measured("kriging", 0.92, (-0.02, -0.03, -0.01)),
@@ -62,8 +62,10 @@ def test_table_names_the_kept_stages_and_the_best_part():
 
 def test_few_rows_are_judged_by_the_means_of_their_draws():
     def draw(gain: float, *names: str) -> list[dict[str, Any]]:
-        kept = [{"stage": name, "kept": name in names, "held_out": None, "seconds": 1.0} for name in ("mean", "field")]
-        hybrid = {"model": "hybrid", "score": {"median": 0.5 + gain}, "inside_90": 0.8 + gain, "stages": kept}
+        stage_rows = [
+            {"stage": name, "kept": name in names, "held_out": None, "seconds": 1.0} for name in ("mean", "field")
+        ]
+        hybrid = {"model": "hybrid", "score": {"median": 0.5 + gain}, "inside_90": 0.8 + gain, "stages": stage_rows}
         part = {"model": "kriging", "score": {"median": 0.5}, "inside_90": None}
         return [hybrid, part | {"gain": gain, "gain_low": gain - 0.1, "gain_high": gain + 0.1}]
 
@@ -131,9 +133,9 @@ def test_new_receivers_alone_see_the_rows_left_to_them():
     assert [receiver.name for receiver in alone.receivers] == ["rx1"]
     np.testing.assert_array_equal(rows.train, split.left[:, 1])
     np.testing.assert_array_equal(rows.test, split.test)
-    known = np.flatnonzero(np.isfinite(alone.observation[0]))
-    np.testing.assert_array_equal(known, np.union1d(split.left[:, 1], split.test))
-    np.testing.assert_array_equal(alone.observation[0, known], observed[1, known])
+    received = np.flatnonzero(np.isfinite(alone.observation[0]))
+    np.testing.assert_array_equal(received, np.union1d(split.left[:, 1], split.test))
+    np.testing.assert_array_equal(alone.observation[0, received], observed[1, received])
 
 
 def test_seeds_that_score_the_same_rows_do_not_narrow_an_interval():

@@ -45,7 +45,7 @@ def commands(path: Path) -> list[str]:
 def cell_rows(text: str) -> list[list[str]]:
     """Cells of the table rows that begin with a name in backticks, the backticks taken off."""
     rows = re.findall(r"^\| `([^`]+)` \|(.+)\|$", text, re.MULTILINE)
-    return [[name, *(cell.strip().strip("`") for cell in rest.split(" | "))] for name, rest in rows]
+    return [[name, *(cell.strip().strip("`") for cell in cells.split(" | "))] for name, cells in rows]
 
 
 def test_scripts_of_the_readme_run(tmp_path, monkeypatch, capsys):
@@ -91,9 +91,9 @@ def test_commands_parse(path):
             parsed: argparse.Namespace = build_parser().parse_args(arguments)
         except SystemExit:
             pytest.fail(f"{path.name}: {line}")
-        if given := getattr(parsed, "set", []):
+        if changes := getattr(parsed, "set", []):
             entry = MODELS[parsed.model or "wrf-gs+"]
-            with_settings(TrainConfig() if entry.name in FIELDS else entry.settings(), given)
+            with_settings(TrainConfig() if entry.name in FIELDS else entry.settings(), changes)
         for name in getattr(parsed, "names", []):
             assert name in {*CASES, *CHECKS, TABLES}, line
 

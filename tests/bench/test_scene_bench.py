@@ -84,9 +84,9 @@ def test_confirmation_rejects_moved_and_obstructed_paths(tmp_path):
     moved = replace(paths, vertices_m=paths.vertices_m + np.array([0.01, 0.02, 0.01]))
     np.testing.assert_array_equal(confirm_paths(moved, tx, rx, triangles), paths.bounces == 0)
     divided = scene_surfaces(room(tmp_path / "divided", {**SHOEBOX, **partition})).triangles
-    kept = confirm_paths(paths, tx, rx, divided)
-    assert not kept[0]
-    assert kept.any()
+    confirmed = confirm_paths(paths, tx, rx, divided)
+    assert not confirmed[0]
+    assert confirmed.any()
 
 
 def test_paths_of_the_made_scene_equal_those_of_the_room(tmp_path):

@@ -31,10 +31,10 @@ OTHERS_S = 300
 
 def test_sentinels_are_stored_figures_of_every_task_within_forty_minutes(monkeypatch):
     monkeypatch.chdir(CHECKOUT)
-    known = groups()
-    figures = [figure for group in known for figure in group.figures]
+    sentinel_groups = groups()
+    figures = [figure for group in sentinel_groups for figure in group.figures]
     assert 25 <= len(figures) == len({figure.name for figure in figures})
-    assert len(known) == len({group.name for group in known})
+    assert len(sentinel_groups) == len({group.name for group in sentinel_groups})
     assert all(figure.low <= figure.stored <= figure.high for figure in figures)
     assert {name.partition("-")[0] for name in TABLE_ROWS} == set(TASKS)
     rows = [json.loads((STORED.parent / FOLDER / f"{name}-100-seed0.json").read_text()) for name in TABLE_ROWS]
@@ -68,12 +68,12 @@ class MadeGroups:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, runs: Path) -> None:
         self.asked: list[str] = []
         self.error: float | Exception | type[BaseException] = 3.0
-        known = [
+        test_groups = [
             Group("good", (SSIM,), lambda _: self.measured("good", 0.9)),
             Group("other", (ERROR,), lambda _: self.measured("other", self.error)),
             Group("far", (ERROR,), lambda _: self.measured("far", 3.0), present=False),
         ]
-        monkeypatch.setattr(bench_sentinels, "groups", lambda: known)
+        monkeypatch.setattr(bench_sentinels, "groups", lambda: test_groups)
         monkeypatch.setattr(bench_sentinels, "RUNS", runs)
 
     def measured(self, name: str, value: float | Exception | type[BaseException]) -> list[float]:

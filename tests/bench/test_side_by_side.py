@@ -39,14 +39,14 @@ def test_errors_fall_with_the_number_of_rays(box):
 
 def test_paths_that_one_tracer_lacks_are_confirmed_and_counted(monkeypatch):
     at = Route("laboratory", 2)
-    whole = at.traced(10_000)
+    all_paths = at.traced(10_000)
     solved = at.solved(10_000)
-    monkeypatch.setattr(at, "traced", lambda rays: whole.select(np.arange(3, len(whole))))
+    monkeypatch.setattr(at, "traced", lambda rays: all_paths.select(np.arange(3, len(all_paths))))
     monkeypatch.setattr(at, "solved", lambda rays: solved)
     right, reference = at.reference(1)
     assert reference["ours_lacks"] == 3
     assert reference["theirs_lacks"] == 0
-    np.testing.assert_allclose(right, powers(whole), rtol=1e-4)
+    np.testing.assert_allclose(right, powers(all_paths), rtol=1e-4)
 
 
 def test_map_of_cells_agrees_with_paths_to_their_centres(monkeypatch):

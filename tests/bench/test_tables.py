@@ -231,8 +231,8 @@ def test_rows_of_data_as_they_were_made_before_are_marked(monkeypatch, tmp_path)
     parts = [part_of(name) for name in ("traced-csi-flat", "flat-ble")]
     rows = [Row(part, method, 1.0, 0) for part in parts for method in ("wrf-gs", "wrf-gs+", "kriging")]
     monkeypatch.setattr(table_pages, "plan", lambda quick=False: rows)
-    stated = [{"date": "2026-01-02", "data": "new"}, {"date": "2026-01-01", "data": "old"}, {"date": "2026-01-01"}]
-    stored = {row.name: made_row(row, 5.0, **facts) for row, facts in zip(rows, stated * 2, strict=True)}
+    run_facts = [{"date": "2026-01-02", "data": "new"}, {"date": "2026-01-01", "data": "old"}, {"date": "2026-01-01"}]
+    stored = {row.name: made_row(row, 5.0, **facts) for row, facts in zip(rows, run_facts * 2, strict=True)}
     remade, measured = (table_pages.part_table(part, table_pages.grouped(part, stored), PUBLISHED) for part in parts)
     labels = [line.split("|")[2].strip() for line in remade.splitlines()[2:5]]
     assert labels == ["WRF-GS", "WRF-GS+ †", "kriging, from positions †"]

@@ -95,9 +95,9 @@ def test_without_linux_memory_is_watched(monkeypatch, tmp_path):
     monkeypatch.setattr(timing, "RESET_PEAK", tmp_path / "missing")
 
     def call() -> None:
-        kept = array()
+        allocated = array()
         time.sleep(BUSY_S)  # at least one look
-        del kept
+        del allocated
 
     assert ARRAY_MB - PAGES_MB <= memory_mb(call) < ARRAY_MB + SLACK_MB
 

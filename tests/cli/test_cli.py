@@ -51,9 +51,9 @@ def commands(parser: argparse.ArgumentParser, name: tuple[str, ...] = ()) -> Ite
 
 
 def training(folder: Path, out: Path, *more: Any, model: str = "wrf-gs+", **changed: float) -> list[Any]:
-    stated = [word for word in SET if word != "--set" and word.partition("=")[0] not in changed]
-    stated += [f"{name}={value}" for name, value in changed.items()]
-    settings = [word for setting in stated for word in ("--set", setting)]
+    assignments = [word for word in SET if word != "--set" and word.partition("=")[0] not in changed]
+    assignments += [f"{name}={value}" for name, value in changed.items()]
+    settings = [word for setting in assignments for word in ("--set", setting)]
     return ["train", folder, "--model", model, "--out", out, *settings, *more]
 
 
@@ -112,12 +112,12 @@ def test_train_prints_a_table_and_progress_elsewhere(folder: Path, tmp_path: Pat
     out_folder = tmp_path / "run"
     status, out, err = command(training(folder, out_folder, "--seed", 3, model="wrf-gs"))
     assert status == 0
-    head, own, blend, facts, counts, verdict, worse, where = out.splitlines()
+    head, model_line, blend, facts, counts, verdict, worse, where = out.splitlines()
     assert head.split() == ["SSIM", "on", "5", "test", "rows", "median", "mean", "p10", "p90"]
     metrics = json.loads((out_folder / "metrics.json").read_text())
-    for line, block in ((own, metrics["ssim"]), (blend, metrics["reference"]["idw"])):
+    for line, block in ((model_line, metrics["ssim"]), (blend, metrics["reference"]["idw"])):
         assert line.split()[-4:] == [f"{block[k]:.3f}" for k in ("median", "mean", "p10", "p90")]
-    assert own.startswith("wrf-gs ")
+    assert model_line.startswith("wrf-gs ")
     assert facts.startswith("split official, 19 training rows,")
     tiles = metrics["evaluated"]["tiles of Gaussians"]
     assert tiles["skipped"] > 0

@@ -21,8 +21,8 @@ def test_correct_data(flat: Path, command: Command) -> None:
     command.done(["data", "check", flat, "--strict"])
     status, out, err = command(["data", "check", flat, "--json"])
     assert (status, err) == (0, "")
-    known = {"dataset": str(flat), "ok": True, "source": str(flat), "task": "rssi", "rows": 30}
-    assert json.loads(out) == known | {"faults": [], "suspicions": [], "notes": []}
+    summary = {"dataset": str(flat), "ok": True, "source": str(flat), "task": "rssi", "rows": 30}
+    assert json.loads(out) == summary | {"faults": [], "suspicions": [], "notes": []}
 
 
 def test_faults_end_with_status_2(flat: Path, command: Command) -> None:

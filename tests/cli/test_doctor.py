@@ -72,19 +72,19 @@ def apt(system: System) -> System:
 
 
 def test_report_of_this_machine() -> None:
-    found = json.loads(json.dumps(doctor.report()))
+    report = json.loads(json.dumps(doctor.report()))
     expected = backend.choose()
-    assert found["ok"]
-    assert found["backend"] == vars(expected)
+    assert report["ok"]
+    assert report["backend"] == vars(expected)
     if expected.llvm_path:
-        (used,) = [library for library in found["llvm"] if library["path"] == expected.llvm_path]
+        (used,) = [library for library in report["llvm"] if library["path"] == expected.llvm_path]
         assert used["usable"]
         assert used["version"] == expected.llvm_version
-    assert found["threads"] >= 1
-    assert found["versions"]["drjit"] == "1.5.0"
-    text = doctor.render(found)
+    assert report["threads"] >= 1
+    assert report["versions"]["drjit"] == "1.5.0"
+    text = doctor.render(report)
     assert expected.variant in text
-    assert all(library["path"] in text for library in found["llvm"])
+    assert all(library["path"] in text for library in report["llvm"])
 
 
 def test_report_without_any_llvm(apt: System, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,25 +92,25 @@ def test_report_without_any_llvm(apt: System, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(libraries, "_linker_cache", lambda start: [])
     for part in (backend, doctor):
         monkeypatch.setattr(part, "find_cuda", lambda: None)
-    found = doctor.report()
-    assert not found["ok"]
-    assert found["backend"] is None
+    report = doctor.report()
+    assert not report["ok"]
+    assert report["backend"] is None
     remedy = libraries.install_line()
-    assert {"problem": "no usable LLVM (none was found)", "remedy": remedy} in found["problems"]
-    assert f"remedy: {remedy}" in doctor.render(found)
+    assert {"problem": "no usable LLVM (none was found)", "remedy": remedy} in report["problems"]
+    assert f"remedy: {remedy}" in doctor.render(report)
 
 
 def test_report_names_data_that_can_be_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WRF_MI_DATA", str(tmp_path / "data"))
     monkeypatch.setattr("wrf_mi.datasets.registry.user_cache", lambda: tmp_path / "none")
-    found = doctor.report()
-    assert [entry["remedy"] for entry in found["problems"]] == ["unset WRF_MI_DATA"]
-    assert "not on this machine (wrf-mi data fetch rfid-lab)" in doctor.render(found)
+    report = doctor.report()
+    assert [entry["remedy"] for entry in report["problems"]] == ["unset WRF_MI_DATA"]
+    assert "not on this machine (wrf-mi data fetch rfid-lab)" in doctor.render(report)
     (tmp_path / "data" / "rfid-lab").mkdir(parents=True)
-    found = doctor.report()
-    folders = {entry["name"]: entry["folder"] for entry in found["data"]["sets"]}
+    report = doctor.report()
+    folders = {entry["name"]: entry["folder"] for entry in report["data"]["sets"]}
     assert folders["rfid-lab"] == str(tmp_path / "data" / "rfid-lab")
-    assert "data fetch rfid-lab" not in doctor.render(found)
+    assert "data fetch rfid-lab" not in doctor.render(report)
 
 
 def test_nothing_is_installed_where_a_backend_works(system: System) -> None:
@@ -206,8 +206,10 @@ def test_command_prints_the_report_and_the_error_of_an_installation(monkeypatch,
 
 
 def test_packages_that_an_extra_lacks_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = doctor.installed_version
-    monkeypatch.setattr(doctor, "installed_version", lambda name: None if name in ("zarr", "numpy") else known(name))
+    installed_version = doctor.installed_version
+    monkeypatch.setattr(
+        doctor, "installed_version", lambda name: None if name in ("zarr", "numpy") else installed_version(name)
+    )
     state = doctor.report()
     assert state["extras"]["maps"] == ["zarr"]
     text = doctor.render(state)

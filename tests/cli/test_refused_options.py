@@ -119,9 +119,9 @@ REFUSED = [  # data set, command and options, and message
 @pytest.fixture(scope="module")
 def data_sets(folder: Path, flat_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Spectra, strengths, channels without positions, and a folder that does not exist."""
-    made = tmp_path_factory.mktemp("data")
-    unplaced = write_nerf2_csi(made / "unplaced", channels(positions=False))
-    return {"spectra": folder, "flat": flat_folder, "unplaced": unplaced, "none": made / "none"}
+    data_folder = tmp_path_factory.mktemp("data")
+    unplaced = write_nerf2_csi(data_folder / "unplaced", channels(positions=False))
+    return {"spectra": folder, "flat": flat_folder, "unplaced": unplaced, "none": data_folder / "none"}
 
 
 @pytest.mark.parametrize(("data", "words", "message"), REFUSED)

@@ -52,11 +52,11 @@ def test_code_with_undefined_names_is_found(tmp_path):
 @pytest.mark.slow
 def test_training_from_python_prints_what_the_page_states(capsys):
     code = script(DOCS / "joint.md")
-    stated = [float(number) for number in re.findall(r"^print\(.*\)  # ([\d.]+)", code, re.MULTILINE)]
-    assert len(stated) == 2
+    documented = [float(number) for number in re.findall(r"^print\(.*\)  # ([\d.]+)", code, re.MULTILINE)]
+    assert len(documented) == 2
     exec(compile(code, "docs/joint.md", "exec"), {})
     printed = [float(line) for line in capsys.readouterr().out.splitlines()]
-    assert printed == pytest.approx(stated, rel=PARALLEL)
+    assert printed == pytest.approx(documented, rel=PARALLEL)
 
 
 def written(page: Path) -> Iterator[str]:
@@ -135,7 +135,7 @@ def unfounded(text: str, figures: list[float]) -> list[str]:
     for shown in re.findall(r"(?<![\w.])\d[\d,]*(?:\.\d+)?(?:e-?\d+)?", text):
         number, decimals = float(shown.replace(",", "")), len(shown.partition("e")[0].partition(".")[2])
         half = 0.5 * 10.0**-decimals * (10 ** float(shown.partition("e")[2]) if "e" in shown else 1) * (1 + 1e-6)
-        if not any(abs(abs(known) * factor - number) <= half for known in figures for factor in (1, 100)):
+        if not any(abs(abs(figure) * factor - number) <= half for figure in figures for factor in (1, 100)):
             missing.append(shown)
     return missing
 

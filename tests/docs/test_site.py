@@ -76,8 +76,8 @@ def test_examples_of_how_to_pages_run(tmp_path, monkeypatch):
         for page in ("own-data", "own-field", "extend"):
             exec("\n".join(blocks(DOCS / "howto" / f"{page}.md", "python")), names)
         run = wrf_mi.train("office", "nearest", out="run")
-        own = wrf_mi.score_predictions("laboratory", "mine.npz", "own", "mine", split="blocked")
-        assert own.metrics["n_test"] == 200
+        scored_run = wrf_mi.score_predictions("laboratory", "mine.npz", "own", "mine", split="blocked")
+        assert scored_run.metrics["n_test"] == 200
         assert wrf_mi.check_data("office").suspicions == ()
         assert wrf_mi.open_run("run").predict([[2.0, 3.0, 1.2]], "kitchen").mean.shape == (1,)
         assert run.metrics["abs_error_db"]["median"] < 5
@@ -87,8 +87,8 @@ def test_examples_of_how_to_pages_run(tmp_path, monkeypatch):
         assert names["main"]()["rows"]
         names["test_nearest_is_better_than_a_constant"](tmp_path / "test")
     finally:
-        for registry, known in ((models.MODELS, before[0]), (receivers.RECEIVERS, before[1])):
-            for name in set(registry) - known:
+        for registry, registered in ((models.MODELS, before[0]), (receivers.RECEIVERS, before[1])):
+            for name in set(registry) - registered:
                 del registry._known[name]
 
 

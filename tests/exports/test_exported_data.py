@@ -114,10 +114,10 @@ def assert_same_paths(read: Paths, written: Paths) -> None:
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
     for name in ("departure", "arrival"):
         np.testing.assert_allclose(getattr(read, name), getattr(written, name), rtol=0, atol=ROUNDED)
-    names, known = (
+    names, written_names = (
         [[paths.object_names[k] for k in row if k >= 0] for row in paths.objects] for paths in (read, written)
     )
-    assert names == known
+    assert names == written_names
 
 
 def test_table_of_a_run_reads_back(run: Path, tmp_path: Path) -> None:

@@ -53,25 +53,25 @@ def exported(run: Path, out: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("model", FIELDS)
 def test_ply_has_the_properties_of_3dgs_and_the_gaussians(runs: dict[str, Path], tmp_path: Path, model: str) -> None:
-    found, read = gaussians(runs[model]), exported(runs[model], tmp_path / "field.ply")
-    known = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    known += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    assert list(read.dtype.names)[: len(known)] == known
+    trained_gaussians, read = gaussians(runs[model]), exported(runs[model], tmp_path / "field.ply")
+    properties = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    properties += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert list(read.dtype.names)[: len(properties)] == properties
     for k, axis in enumerate("xyz"):
-        np.testing.assert_array_equal(read[axis], found.position[k].numpy())
-        np.testing.assert_allclose(np.exp(read[f"scale_{k}"]), found.scale[k].numpy(), rtol=SINGLE)
-    np.testing.assert_array_equal(read["signal_re_0"], found.signal[0].numpy())
-    np.testing.assert_array_equal(read["signal_im_0"], found.signal[1].numpy())
+        np.testing.assert_array_equal(read[axis], trained_gaussians.position[k].numpy())
+        np.testing.assert_allclose(np.exp(read[f"scale_{k}"]), trained_gaussians.scale[k].numpy(), rtol=SINGLE)
+    np.testing.assert_array_equal(read["signal_re_0"], trained_gaussians.signal[0].numpy())
+    np.testing.assert_array_equal(read["signal_im_0"], trained_gaussians.signal[1].numpy())
     alpha = 1 / (1 + np.exp(-read["opacity"].astype(float)))
     if model == "wrf-gs":
-        delta = np.array(found.attenuation)
+        delta = np.array(trained_gaussians.attenuation)
         np.testing.assert_array_equal(np.stack([read["attenuation_re"], read["attenuation_im"]]), delta)
         np.testing.assert_allclose(alpha, 1 - np.hypot(*delta), rtol=0, atol=SINGLE)
     else:
-        np.testing.assert_allclose(alpha, found.opacity.numpy(), rtol=0, atol=SINGLE)
+        np.testing.assert_allclose(alpha, trained_gaussians.opacity.numpy(), rtol=0, atol=SINGLE)
     # Of the order w, x, y, z, normalised: the same rotations.
     ours = rotation_matrix(np.stack([read[f"rot_{k}"] for k in (1, 2, 3, 0)], axis=-1))
-    np.testing.assert_allclose(ours, rotation_matrix(np.array(found.rotation).T), rtol=0, atol=SINGLE)
+    np.testing.assert_allclose(ours, rotation_matrix(np.array(trained_gaussians.rotation).T), rtol=0, atol=SINGLE)
     np.testing.assert_allclose(sum(np.square(read[f"rot_{k}"]) for k in range(4)), 1, atol=SINGLE)
 
 
@@ -125,8 +125,8 @@ def test_splat_transform_converts_it_and_back(runs: dict[str, Path], tmp_path: P
 
 def assert_rounded(rounded: np.ndarray, read: np.ndarray) -> None:
     """Whether vertices of a compressed PLY are others in another order, to the precision of its bits."""
-    there, back = (np.stack([part[axis] for axis in "xyz"], axis=-1) for part in (read, rounded))
-    distance_m = np.linalg.norm(there[:, None] - back, axis=-1)
+    read_positions, back = (np.stack([part[axis] for axis in "xyz"], axis=-1) for part in (read, rounded))
+    distance_m = np.linalg.norm(read_positions[:, None] - back, axis=-1)
     assert distance_m.min(axis=1).max() < COMPRESSED_M
     same = distance_m.argmin(axis=1)
     alpha = [1 / (1 + np.exp(-part["opacity"].astype(float))) for part in (rounded[same], read)]

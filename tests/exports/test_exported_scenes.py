@@ -72,11 +72,11 @@ def test_plain_sionna_has_the_same_materials_and_mesh(scene: Path, tmp_path: Pat
     for name, values in constants(plain).items():
         assert values == pytest.approx(expected.pop(name), rel=SINGLE), name
     assert not expected
-    theirs, known = scene_surfaces(plain), scene_surfaces(ours)
-    assert theirs.names == known.names
-    for index in range(len(known.names)):
-        faces = slice(known.first_face[index], known.first_face[index + 1])
-        np.testing.assert_array_equal(theirs.triangles[faces], known.triangles[faces])
+    theirs, our_surfaces = scene_surfaces(plain), scene_surfaces(ours)
+    assert theirs.names == our_surfaces.names
+    for index in range(len(our_surfaces.names)):
+        faces = slice(our_surfaces.first_face[index], our_surfaces.first_face[index + 1])
+        np.testing.assert_array_equal(theirs.triangles[faces], our_surfaces.triangles[faces])
     facts = json.loads((tmp_path / "out" / "materials.json").read_text())["materials"]
     assert facts["panel"]["conductivity_exponent"] == 0.8
     assert facts["panel"]["follows_frequency"] is False
@@ -104,20 +104,20 @@ def test_sionna_merging_shapes_and_mitsuba_without_sionna_open_it(scene: Path, t
 def test_glb_has_named_surfaces_and_materials_and_is_the_scene_again(scene: Path, tmp_path: Path) -> None:
     """In its place and upright, as a bare mesh and as a scene folder."""
     export(scene, "glb", tmp_path / "scene.glb")
-    read, known = trimesh.load_scene(tmp_path / "scene.glb"), open_scene(scene, 2.4e9)
-    assert set(read.geometry) == set(known.objects)
-    surfaces = scene_surfaces(known)
+    read, opened_scene = trimesh.load_scene(tmp_path / "scene.glb"), open_scene(scene, 2.4e9)
+    assert set(read.geometry) == set(opened_scene.objects)
+    surfaces = scene_surfaces(opened_scene)
     for index, name in enumerate(surfaces.names):
         mesh = read.geometry[name]
-        assert mesh.visual.material.name == known.objects[name].radio_material.name
+        assert mesh.visual.material.name == opened_scene.objects[name].radio_material.name
         x, y, z = mesh.vertices.T
         theirs = np.stack([x, -z, y], axis=-1)[mesh.faces]  # from glTF's y up to z up
         ours = surfaces.triangles[surfaces.first_face[index] : surfaces.first_face[index + 1]]
         np.testing.assert_array_equal(triangles(theirs), triangles(ours))
     bare = open_scene(tmp_path / "scene.glb", 2.4e9, material="concrete")
     again = open_scene(make_scene(tmp_path / "scene.glb", tmp_path / "again").folder, 2.4e9)
-    np.testing.assert_array_equal(triangles(bare), triangles(known))
-    np.testing.assert_array_equal(triangles(again), triangles(known))
+    np.testing.assert_array_equal(triangles(bare), triangles(opened_scene))
+    np.testing.assert_array_equal(triangles(again), triangles(opened_scene))
 
 
 def test_ply_has_colours_materials_and_is_a_scene_again(scene: Path, tmp_path: Path) -> None:
@@ -130,14 +130,14 @@ def test_ply_has_colours_materials_and_is_a_scene_again(scene: Path, tmp_path: P
         for kind in ("material", "surface")
     }
     stored = mesh.metadata["_ply_raw"]["face"]["data"]
-    known = open_scene(scene, 2.4e9)
+    opened_scene = open_scene(scene, 2.4e9)
     for surface, material in zip(stored["surface"].ravel(), stored["material"].ravel(), strict=True):
-        assert names["material"][material] == known.objects[names["surface"][surface]].radio_material.name
+        assert names["material"][material] == opened_scene.objects[names["surface"][surface]].radio_material.name
     assert isinstance(mesh.visual, ColorVisuals)
     assert mesh.visual.face_colors[0][:3].tolist() == [115, 115, 115]  # concrete
-    np.testing.assert_array_equal(triangles(np.array(mesh.triangles)), triangles(known))
+    np.testing.assert_array_equal(triangles(np.array(mesh.triangles)), triangles(opened_scene))
     again = open_scene(make_scene(tmp_path / "scene.ply", tmp_path / "again").folder, 2.4e9)
-    np.testing.assert_array_equal(triangles(again), triangles(known))
+    np.testing.assert_array_equal(triangles(again), triangles(opened_scene))
 
 
 def test_corrected_scene_of_a_run_is_exported(flat_folder: Path, room: Path, tmp_path: Path) -> None:
@@ -192,11 +192,11 @@ def test_names_of_other_scenes_are_written_as_names_of_files(frequency_hz: float
     ]
     path = tmp_path / "scene.xml"
     path.write_text("\n".join(['<scene version="3.0.0">', *bsdfs, *shapes, "</scene>"]))
-    stated = open_scene(path, frequency_hz)
+    original_scene = open_scene(path, frequency_hz)
     export(path, "sionna", tmp_path / "for-sionna", ExportOptions(frequency_hz=frequency_hz))
-    write_corrected_scene(tmp_path / "corrected", stated, {})
+    write_corrected_scene(tmp_path / "corrected", original_scene, {})
     for written in (tmp_path / "for-sionna" / "scene.xml", tmp_path / "corrected"):
         again = open_scene(written, frequency_hz)
         assert list(again.objects) == [".._.._up", "a_b", "a_b_2", "a_b_3"]
-        np.testing.assert_allclose([*constants(again).values()], [*constants(stated).values()], rtol=1e-4)
+        np.testing.assert_allclose([*constants(again).values()], [*constants(original_scene).values()], rtol=1e-4)
     assert not (tmp_path.parent / "up.ply").exists()

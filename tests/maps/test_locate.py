@@ -59,8 +59,11 @@ def law(candidates: Candidates, std_db: float) -> np.ndarray:
 def record_of(tx_pos_m: np.ndarray, rssi_dbm: np.ndarray, train_rows: int) -> Record:
     receivers = tuple(Receiver(f"anchor{number}", place, UPRIGHT) for number, place in enumerate(CORNERS_M))
     rows = np.arange(len(tx_pos_m))
-    known: dict[str, Any] = {"frequencies_hz": np.array([2.44e9]), "official": (rows[:train_rows], rows[train_rows:])}
-    return Record("made-up", "rssi", tx_pos_m, receivers, rssi_dbm.astype(np.float32), **known)
+    record_fields: dict[str, Any] = {
+        "frequencies_hz": np.array([2.44e9]),
+        "official": (rows[:train_rows], rows[train_rows:]),
+    }
+    return Record("made-up", "rssi", tx_pos_m, receivers, rssi_dbm.astype(np.float32), **record_fields)
 
 
 @given(st.integers(0, 23), st.integers(0, 23))
@@ -133,10 +136,10 @@ def test_mass_of_regions_covers_where_stated_deviations_are_too_large() -> None:
         region = densest(probability, 0.7)
         assert region[truth] == (ranks[-1][0] < 0.7)  # a region holds the truth if it holds more than its rank
     for by_density in np.array(ranks).T:
-        known, further = by_density[: DRAWS // 2], by_density[DRAWS // 2 :]
+        calibration_draws, further = by_density[: DRAWS // 2], by_density[DRAWS // 2 :]
         assert np.mean(further < 0.9) > 0.97
         # The ranks of a posterior that is right join them: a little more is held than stated.
-        assert abs(np.mean(further <= mass_of(known, 0.9)) - 0.92) < COVERED
+        assert abs(np.mean(further <= mass_of(calibration_draws, 0.9)) - 0.92) < COVERED
 
 
 def test_few_ranks_leave_the_mass_near_the_level() -> None:

@@ -60,13 +60,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     )
     traced = np.asarray(RayTracer(scene, Instrument("power", receivers, HZ), PLAIN)(tx_pos_m), float)
     observed = traced + rng.normal(0, NOISE_DB, traced.shape)
-    known: dict[str, Any] = {"frequencies_hz": HZ, "official": (np.arange(TRAINED), np.arange(TRAINED, ROWS))}
-    record = Record("room", "rssi", tx_pos_m, receivers, observed.astype(np.float32), **known)
+    record_fields: dict[str, Any] = {"frequencies_hz": HZ, "official": (np.arange(TRAINED), np.arange(TRAINED, ROWS))}
+    record = Record("room", "rssi", tx_pos_m, receivers, observed.astype(np.float32), **record_fields)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(of_strengths, "TRACE", PLAIN)
         # Of a single room, held-out rows do not tell power at positions from its local means.
         options = of_strengths.Mean.options
-        patch.setattr(of_strengths.Mean, "options", lambda *given: options(*given)[-1:])
+        patch.setattr(of_strengths.Mean, "options", lambda *arguments: options(*arguments)[-1:])
         data = write_ble_folder(folder / "data", record)
         settings = ("stages=mean,residual",)
         trained = train(data, "hybrid", out=folder / "run", scene=str(scene), settings=settings)
@@ -138,7 +138,9 @@ def test_chunks_of_a_map_are_small_only_where_paths_are_traced(run, tmp_path, mo
     """Paths of all receivers are traced together; of a local mean that many chunks would take most of the time."""
     with pytest.MonkeyPatch.context() as patch:
         direct = of_strengths.DIRECT
-        patch.setattr(of_strengths.Mean, "options", lambda self, *given: [Option(direct, partial(self._fit, direct))])
+        patch.setattr(
+            of_strengths.Mean, "options", lambda self, *arguments: [Option(direct, partial(self._fit, direct))]
+        )
         data, scene = run.folder.parent / "data", str(run.problem.scene)
         settings = ("stages=mean,residual",)
         local = train(data, "hybrid", out=tmp_path / "run", scene=scene, settings=settings)
@@ -245,6 +247,6 @@ def test_map_traces_a_chunk_for_all_receivers_together(anew: Run, traced: list) 
     mapped = anew.map(step_m=STEP_M)
     assert {count for _, count in traced} == {3}
     assert sum(len(tx_pos_m) for tx_pos_m, _ in traced) <= mapped["power_dbm"][0].size
-    one = anew.map(step_m=STEP_M, receivers=["anchor1"])
-    np.testing.assert_allclose(one["power_dbm"][0], mapped["power_dbm"][1], atol=SINGLE_DB)
+    single_map = anew.map(step_m=STEP_M, receivers=["anchor1"])
+    np.testing.assert_allclose(single_map["power_dbm"][0], mapped["power_dbm"][1], atol=SINGLE_DB)
     assert {count for _, count in traced} == {1, 3}

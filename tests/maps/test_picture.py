@@ -40,8 +40,8 @@ def mapped(data: Any, folder: Path, command: Command, *more: Any) -> tuple[xr.Da
 
 def dots(figure: Figure, panel: int) -> dict[str, np.ndarray]:
     """Levels of the measured rows of a panel: those of training rows and all others."""
-    drawn = [one for one in figure.axes[panel].collections if isinstance(one, PathCollection)]
-    squares, circles = (np.asarray(one.get_array()) for one in drawn)
+    drawn = [collection for collection in figure.axes[panel].collections if isinstance(collection, PathCollection)]
+    squares, circles = (np.asarray(collection.get_array()) for collection in drawn)
     return {"trained": circles, "other": squares}
 
 
@@ -122,7 +122,7 @@ def test_picture_of_a_scene_draws_the_walls_at_its_height(tmp_path: Path) -> Non
     record = strengths_in_a_room()
     run = wrf_mi.train(record, "ray-tracing", scene=scene, out=tmp_path / "run", settings={"depth": 1, "rays": 1000})
     figure = map_figure(radio_map(run, step_m=1.0), run)
-    (walls,) = (one for one in figure.axes[0].collections if isinstance(one, LineCollection))
+    (walls,) = (collection for collection in figure.axes[0].collections if isinstance(collection, LineCollection))
     lines = np.array(walls.get_segments())
     low, high = lines.min(axis=(0, 1)), lines.max(axis=(0, 1))
     along = [(lines[:, :, axis] == end[axis]).all(axis=1) for axis in (0, 1) for end in (low, high)]
@@ -148,9 +148,9 @@ def two_bands() -> Record:
     carriers = np.array(BANDS_HZ)[rows % 2]
     receiver = wrf_mi.Receiver("wall", np.array([0.0, 0, 2]), np.array([0.0, 0, 0, 1]))
     observed = np.where(rows % 2, -60.0, -40.0) + rng.normal(0, 0.5, 40)
-    known: dict[str, Any] = {"carriers_hz": carriers, "official": (rows[:30], rows[30:])}
+    record_fields: dict[str, Any] = {"carriers_hz": carriers, "official": (rows[:30], rows[30:])}
     positions = np.column_stack([rng.uniform(1, 4, (40, 2)), np.full(40, 1.3)])
-    return Record("bands", "rssi", positions, (receiver,), observed[None].astype(np.float32), **known)
+    return Record("bands", "rssi", positions, (receiver,), observed[None].astype(np.float32), **record_fields)
 
 
 def test_picture_of_a_carrier_has_the_rows_of_that_carrier(two_bands: Record, tmp_path: Path, command: Command) -> None:
@@ -158,9 +158,9 @@ def test_picture_of_a_carrier_has_the_rows_of_that_carrier(two_bands: Record, tm
     dataset, figure, run = mapped(data, tmp_path, command, "--frequency", BANDS_HZ[1])
     assert dataset.attrs["frequency_hz"] == BANDS_HZ[1]
     assert "2400 MHz" in heading(figure)
-    found = dots(figure, 0)
-    assert (len(found["trained"]), len(found["other"])) == (15, 5)
-    assert np.concatenate(list(found.values())).max() < -50
+    drawn_dots = dots(figure, 0)
+    assert (len(drawn_dots["trained"]), len(drawn_dots["other"])) == (15, 5)
+    assert np.concatenate(list(drawn_dots.values())).max() < -50
     command.refused(["map", run.folder, "--out", tmp_path / "none.nc"], "900000000, 2400000000 Hz")
     assert "other measured rows" in marks(figure)
     sure = map_figure(radio_map(run, step_m=1.0, frequency_hz=BANDS_HZ[1], threshold_dbm=-200), run)

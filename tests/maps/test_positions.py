@@ -58,9 +58,9 @@ def test_bad_steps_of_a_grid_are_refused(size_m: float, step: float, message: st
 def test_positions_are_the_centres_of_the_faces(suffix: str, tmp_path: Path) -> None:
     mesh = trimesh.creation.box((2.0, 1.0, 0.5))
     mesh.copy().apply_transform(Y_UP if suffix == "glb" else np.eye(4)).export(tmp_path / f"box.{suffix}")
-    found = surface_of(tmp_path / f"box.{suffix}")
+    surface = surface_of(tmp_path / f"box.{suffix}")
     expected = mesh.triangles_center[np.lexsort(mesh.triangles_center.round(4).T)]
-    positions = found.positions_m[np.lexsort(found.positions_m.round(4).T)]
+    positions = surface.positions_m[np.lexsort(surface.positions_m.round(4).T)]
     np.testing.assert_allclose(positions, expected, atol=FLOAT32_M)
 
 

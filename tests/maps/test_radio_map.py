@@ -50,8 +50,8 @@ def strengths() -> Record:
     )
     observed = np.stack([free_space_db(positions, receiver) + TRANSMIT_DBM for receiver in receivers])
     rows = np.arange(60)
-    known: dict[str, Any] = {"frequencies_hz": np.array([HZ]), "official": (rows[:45], rows[45:])}
-    return Record("open", "rssi", positions, receivers, observed.astype(np.float32), **known)
+    record_fields: dict[str, Any] = {"frequencies_hz": np.array([HZ]), "official": (rows[:45], rows[45:])}
+    return Record("open", "rssi", positions, receivers, observed.astype(np.float32), **record_fields)
 
 
 def free_space_db(positions_m: np.ndarray, receiver: wrf_mi.Receiver) -> np.ndarray:
@@ -117,11 +117,11 @@ def test_table_has_a_row_for_each_receiver_and_position(mapped: xr.Dataset, tmp_
 
 
 def test_chunks_and_choices_of_receivers_do_not_change_values(law, mapped, monkeypatch):
-    given: dict[str, Any] = {"step_m": 0.5, "transmit_dbm": TRANSMIT_DBM, "threshold_dbm": -32.0}
-    kitchen = radio_map(law, receivers=["kitchen"], **given)
+    options: dict[str, Any] = {"step_m": 0.5, "transmit_dbm": TRANSMIT_DBM, "threshold_dbm": -32.0}
+    kitchen = radio_map(law, receivers=["kitchen"], **options)
     np.testing.assert_array_equal(kitchen["power_dbm"][0], mapped["power_dbm"][1])
     monkeypatch.setattr(api, "CHUNK_SIZE", 7)
-    xr.testing.assert_allclose(radio_map(law, **given), mapped, rtol=FLOAT32)
+    xr.testing.assert_allclose(radio_map(law, **options), mapped, rtol=FLOAT32)
 
 
 def box(size_m: tuple[float, ...], at_m: tuple[float, ...]) -> trimesh.Trimesh:
@@ -153,9 +153,9 @@ def test_cells_have_the_strength_that_is_predicted_at_their_centres(name: str, r
     parts = radio_map(run, step_m=0.7, height_m=1.3)
     power = parts["power_dbm"][-1].values
     predicted = run.predict(grid_positions(parts).reshape(-1, 3), len(run.receivers) - 1).mean.reshape(power.shape)
-    known = ~np.isnan(power)
-    assert known.sum() > 20
-    np.testing.assert_allclose(power[known], predicted[known], rtol=FLOAT32)
+    finite = ~np.isnan(power)
+    assert finite.sum() > 20
+    np.testing.assert_allclose(power[finite], predicted[finite], rtol=FLOAT32)
 
 
 def test_headings_are_averaged_by_the_law_of_total_variance(flat_folder: Path, tmp_path: Path) -> None:
@@ -163,7 +163,10 @@ def test_headings_are_averaged_by_the_law_of_total_variance(flat_folder: Path, t
     parts = radio_map(run, step_m=1.5)
     positions = grid_positions(parts).reshape(-1, 3)
     each = [run.predict(positions, 0, np.full(len(positions), turn)) for turn in np.arange(8) * np.pi / 4]
-    means, stds = np.array([found.mean for found in each]), np.array([found.stated_std for found in each])
+    means, stds = (
+        np.array([prediction.mean for prediction in each]),
+        np.array([prediction.stated_std for prediction in each]),
+    )
     std = np.sqrt((stds**2).mean(axis=0) + means.var(axis=0))
     np.testing.assert_allclose(parts["power_dbm"][0].values.ravel(), means.mean(axis=0), rtol=FLOAT32)
     np.testing.assert_allclose(parts["power_std_db"][0].values.ravel(), std, rtol=FLOAT32)
@@ -180,8 +183,8 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Record]:
     positions = rng.uniform([0.5, 0.5, 1.3], [2.5, 4.5, 1.3], (30, 3))
     receiver = wrf_mi.Receiver("rx", np.array([5.0, 4.0, 2.0]), np.array([0.0, 0, 0, 1]))
     observed = (free_space_db(positions, receiver) + 3)[None].astype(np.float32)
-    known: dict[str, Any] = {"frequencies_hz": np.array([HZ]), "official": (np.arange(22), np.arange(22, 30))}
-    return write_xml(folder, parts), Record("room", "rssi", positions, (receiver,), observed, **known)
+    record_fields: dict[str, Any] = {"frequencies_hz": np.array([HZ]), "official": (np.arange(22), np.arange(22, 30))}
+    return write_xml(folder, parts), Record("room", "rssi", positions, (receiver,), observed, **record_fields)
 
 
 @pytest.fixture(scope="module")
@@ -228,8 +231,8 @@ def test_map_outside_of_a_closed_room_is_refused_and_outside_of_the_data_told(tr
 def test_map_above_a_scene_without_a_ceiling_is_told(room, tmp_path, caplog):
     _, record = room
     parts = {name: part for name, part in SHOEBOX.items() if name != "ceiling"}
-    known: dict[str, Any] = {"scene": write_xml(tmp_path / "open", parts), "settings": ["depth=0"]}
-    run = wrf_mi.train(record, "ray-tracing", out=tmp_path / "run", **known)
+    options: dict[str, Any] = {"scene": write_xml(tmp_path / "open", parts), "settings": ["depth=0"]}
+    run = wrf_mi.train(record, "ray-tracing", out=tmp_path / "run", **options)
     radio_map(run, step_m=2.0, height_m=20.0)
     assert "height 20 m: outside of the scene" in caplog.text
 
@@ -265,9 +268,9 @@ def test_sides_of_a_joint_model_add_up_as_amplitudes(room: tuple[Path, Record], 
     np.testing.assert_allclose(parts.prediction.mean, run.predict(positions).mean, atol=FIT_DB)
     assert parts.traced is not None
     assert parts.learned is not None
-    whole, traced, learned = (10 ** (x / 20) for x in (parts.prediction.mean, parts.traced, parts.learned))
-    assert (whole <= (traced + learned) * (1 + FIT_DB)).all()
-    assert (whole >= np.abs(traced - learned) * (1 - FIT_DB)).all()
+    total, traced, learned = (10 ** (x / 20) for x in (parts.prediction.mean, parts.traced, parts.learned))
+    assert (total <= (traced + learned) * (1 + FIT_DB)).all()
+    assert (total >= np.abs(traced - learned) * (1 - FIT_DB)).all()
     assert parts.paths is not None
     line_of_sight = free_space_db(positions, record.receivers[0])
     # The cabinet hides one of the positions.
@@ -296,7 +299,7 @@ def test_bad_input_is_one_line(law: Run, tmp_path: Path, command: Command) -> No
         ([tmp_path / "none", "--out", out], "none"),
     ):
         command.refused(["map", *words], message)
-    for given, message in (
+    for arguments, message in (
         ({"step_m": 0.0}, "positive number"),
         ({"height_m": float("nan")}, "height nan"),
         ({"receivers": ["attic"]}, "no receiver 'attic'"),
@@ -306,7 +309,7 @@ def test_bad_input_is_one_line(law: Run, tmp_path: Path, command: Command) -> No
         ({"surface": "none.ply", "height_m": float("inf")}, "height inf"),
     ):
         with pytest.raises(InputError, match=message):
-            radio_map(law, **given)
+            radio_map(law, **arguments)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -337,23 +340,23 @@ def test_levels_drawn_as_predicted_are_reliable_and_narrower_statements_are_not(
     mean, std = rng.uniform(-95, -60, 20_000), rng.uniform(2, 9, 20_000)
     measured = rng.normal(mean, std)
     measured[::7] = np.nan
-    found = reliability(mean, std, measured)
-    assert found.error < CHANCE
-    np.testing.assert_allclose(found.observed, found.predicted, atol=3 * CHANCE)
-    assert found.count.sum() == 9 * np.isfinite(measured).sum()
+    result = reliability(mean, std, measured)
+    assert result.error < CHANCE
+    np.testing.assert_allclose(result.observed, result.predicted, atol=3 * CHANCE)
+    assert result.count.sum() == 9 * np.isfinite(measured).sum()
     narrow = reliability(mean, std / 4, measured)
     assert narrow.error > 5 * CHANCE
-    assert narrow.brier > found.brier
-    assert len(reliability_figure({"drawn": found}).axes[0].lines) == 2
+    assert narrow.brier > result.brier
+    assert len(reliability_figure({"drawn": result}).axes[0].lines) == 2
 
 
 def test_reliability_of_a_run_is_that_of_its_test_rows(plain_flat_folder: Path, tmp_path: Path) -> None:
     run = train(plain_flat_folder, "kriging", out=tmp_path / "run", intervals=True)
-    found = run_reliability(run.folder, np.array([-55.0]))
+    result = run_reliability(run.folder, np.array([-55.0]))
     stored = arrays_in(run.folder / "predictions.npz")
     p, above = norm.sf(-55, stored["prediction"], stored["std"]), stored["truth"] > -55
-    assert found.brier == pytest.approx(np.square(p - above).mean(), rel=1e-5)
-    assert found.count.sum() == above.size
+    assert result.brier == pytest.approx(np.square(p - above).mean(), rel=1e-5)
+    assert result.count.sum() == above.size
     without = train(plain_flat_folder, "mri", out=tmp_path / "without")
     with pytest.raises(InputError, match="states no standard deviation; train with --intervals"):
         run_reliability(without.folder)

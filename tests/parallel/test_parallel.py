@@ -53,7 +53,7 @@ def test_map_returns_results_in_order_and_calls_each_once(two: Scheduler, capsys
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 10
     assert lines[-1] == "doubling: 20 of 20, 2 workers"
-    assert two.map(worker_tasks.double, range(5), each=lambda *one: received.append(one)) == [0, 2, 4, 6, 8]
+    assert two.map(worker_tasks.double, range(5), each=lambda *arguments: received.append(arguments)) == [0, 2, 4, 6, 8]
     assert sorted(received) == [(k, 2 * k) for k in range(5)]
     assert two.map(worker_tasks.double, []) == []
 
@@ -61,7 +61,7 @@ def test_map_returns_results_in_order_and_calls_each_once(two: Scheduler, capsys
 def test_scheduler_without_workers_computes_in_this_process() -> None:
     received: list[tuple[int, int]] = []
     with open_scheduler(None) as serial:
-        assert serial.map(worker_tasks.double, [3, 1], each=lambda *one: received.append(one)) == [6, 2]
+        assert serial.map(worker_tasks.double, [3, 1], each=lambda *arguments: received.append(arguments)) == [6, 2]
         assert serial.map(pow, [2, 3], lambda: 2) == [4, 8]
     assert received == [(0, 6), (1, 2)]
 
@@ -69,11 +69,11 @@ def test_scheduler_without_workers_computes_in_this_process() -> None:
 def test_workers_adopt_folder_variables_and_backend_and_open_once(two, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WRF_MI_DATA", "elsewhere")
-    found = two.map(worker_tasks.place_of, range(12), partial(worker_tasks.opened, tmp_path))
-    processes = {process for process, *_ in found}
+    places = two.map(worker_tasks.place_of, range(12), partial(worker_tasks.opened, tmp_path))
+    processes = {process for process, *_ in places}
     assert os.getpid() not in processes
     assert len(processes) <= two.workers
-    assert {tuple(rest) for _, *rest in found} == {(str(tmp_path), "elsewhere", init().variant)}
+    assert {tuple(environment) for _, *environment in places} == {(str(tmp_path), "elsewhere", init().variant)}
     assert len(list(tmp_path.glob("opened-*"))) == len(processes)
 
 

@@ -93,10 +93,10 @@ def test_parallel_prediction_of_a_field_equals_serial(model, two_gateways, two, 
 
 def test_parallel_trace_and_its_prediction_equal_serial(flat: Path, room: Path, two: Scheduler, tmp_path: Path) -> None:
     """The number of rays is chosen by the search, which uses all positions."""
-    known: dict[str, Any] = {"scene": room, "settings": TraceOptions(depth=1, rays="auto")}
-    serial = train(flat, "ray-tracing", out=tmp_path / "serial", **known).folder
+    options: dict[str, Any] = {"scene": room, "settings": TraceOptions(depth=1, rays="auto")}
+    serial = train(flat, "ray-tracing", out=tmp_path / "serial", **options).folder
     lossy: Any = Lossy(two, tmp_path)
-    parallel = train(flat, "ray-tracing", out=tmp_path / "parallel", scheduler=lossy, **known).folder
+    parallel = train(flat, "ray-tracing", out=tmp_path / "parallel", scheduler=lossy, **options).folder
     lossy.assert_one_was_lost()
     for file in ("paths.npz", "predictions.npz", "split.npz"):
         assert_same_bits(arrays_in(serial / file), arrays_in(parallel / file))
@@ -108,12 +108,12 @@ def test_parallel_trace_of_random_paths_equals_serial(flat, room, two, tmp_path,
     """Diffuse reflections and diffraction, both searched for from transmitters."""
     monkeypatch.setattr(ray_tracing, "TRACED_AT_LEAST", 4)  # one part for each worker
     for kind, code in (("scattering", 2), ("diffraction", 8)):
-        known: dict[str, Any] = {
+        options: dict[str, Any] = {
             "scene": room,
             "settings": TraceOptions(depth=1, rays=1 << 8, scattering_coefficient=0.3, **{kind: True}),
         }
-        serial = train(flat, "ray-tracing", out=tmp_path / f"{kind}-serial", **known).folder
-        parallel = train(flat, "ray-tracing", out=tmp_path / f"{kind}-parallel", scheduler=two, **known).folder
+        serial = train(flat, "ray-tracing", out=tmp_path / f"{kind}-serial", **options).folder
+        parallel = train(flat, "ray-tracing", out=tmp_path / f"{kind}-parallel", scheduler=two, **options).folder
         arrays = arrays_in(serial / "paths.npz")
         assert (arrays["interactions"] == code).any()
         assert_same_bits(arrays, arrays_in(parallel / "paths.npz"))
@@ -121,9 +121,9 @@ def test_parallel_trace_of_random_paths_equals_serial(flat, room, two, tmp_path,
 
 def test_parallel_prediction_of_kriging_equals_serial(flat: Path, two: Scheduler, tmp_path: Path) -> None:
     waves = write_spectrum_folder(tmp_path / "waves", wave_record(24, 6))
-    for name, data, given in (("strengths", flat, ()), ("spectra", waves, ("directions=20", "lengths=2"))):
+    for name, data, model_settings in (("strengths", flat, ()), ("spectra", waves, ("directions=20", "lengths=2"))):
         folder = tmp_path / name
-        run = train(data, "kriging", out=folder / "run", settings=given).folder
+        run = train(data, "kriging", out=folder / "run", settings=model_settings).folder
         places = positions(load(data))
         heading = np.linspace(-3, 3, len(places)) if name == "strengths" else None
         serial, parallel = both(run, places, two, folder, heading)
@@ -138,19 +138,19 @@ def test_errors_of_parts_name_the_row_of_the_whole_input(flat, two, tmp_path, co
     box = trimesh.creation.box((0.3, 0.3, 0.3))
     box.apply_translation((50.0, 50.0, 1.0))
     box.export(tmp_path / "box.ply")
-    known: dict[str, Any] = {"scene": tmp_path / "box.ply", "material": "concrete"}
+    options: dict[str, Any] = {"scene": tmp_path / "box.ply", "material": "concrete"}
     direct = TraceOptions(reflection=False, depth=0)
-    run = train(flat, "ray-tracing", out=tmp_path / "run", settings=direct, **known).folder
+    run = train(flat, "ray-tracing", out=tmp_path / "run", settings=direct, **options).folder
     places = np.concatenate([positions(load(flat)), [[50.0, 50.0, 1.0]]])
     with pytest.raises(InputError, match=f"^transmitter {POSITIONS + 1} at .* is inside the solid 'box'"):
         predict_to_file(run, places, tmp_path / "p.npz", scheduler=two)
     assert not (tmp_path / "p.npz").exists()
     np.savez(tmp_path / "tx.npz", tx_pos=places[-1:])
     monkeypatch.setattr(parallel, "open_scheduler", lambda text: nullcontext(two))
-    given = ["--input", tmp_path / "tx.npz", "--out", tmp_path / "p.npz", "--scheduler", "local"]
-    command.refused(["predict", run, *given], "transmitter 1 at .* is inside the solid 'box'; move one of them")
+    words = ["--input", tmp_path / "tx.npz", "--out", tmp_path / "p.npz", "--scheduler", "local"]
+    command.refused(["predict", run, *words], "transmitter 1 at .* is inside the solid 'box'; move one of them")
     np.savez(tmp_path / "tx.npz", tx_pos=places[:3])
-    status, out, err = command(["predict", run, *given])
+    status, out, err = command(["predict", run, *words])
     assert status == 0
     assert re.fullmatch("predicting: 3 of 3, [12] workers?", err.splitlines()[-1])
     assert out.startswith("3 predictions: ")

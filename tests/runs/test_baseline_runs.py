@@ -34,9 +34,9 @@ def test_stored_models_reproduce_the_scored_predictions(name: str, flat_folder: 
     assert [receiver.name for receiver in opened.receivers] == ["anchor1", "anchor2"]
     heading = record.tx_heading_rad[arrays["row"]]
     for r in range(2):
-        found = opened.predict(arrays["tx_pos"], r, heading).mean
-        assert found.dtype == np.float32
-        np.testing.assert_array_equal(found, arrays["prediction"][r])
+        predicted = opened.predict(arrays["tx_pos"], r, heading).mean
+        assert predicted.dtype == np.float32
+        np.testing.assert_array_equal(predicted, arrays["prediction"][r])
     if name == "idw":
         np.testing.assert_array_equal(arrays["prediction"], arrays["reference_idw"])
     elif name != "mri":
@@ -90,7 +90,7 @@ def test_resumed_network_is_bit_identical(name: str, two_gateways: Record, tmp_p
     data, settings, networks = TRAINED[name]
     record = two_gateways if data == "spectra" else channels()
     ends: dict[str, Any] = {"settings": (*SHORT, *settings), "deterministic": True}
-    whole = train(record, name, out=tmp_path / "whole", **ends).folder
+    uninterrupted = train(record, name, out=tmp_path / "whole", **ends).folder
     told: list[tuple[str, int]] = []
 
     def on_progress(stage: str, share: float, progress: Progress | None = None) -> None:
@@ -106,14 +106,14 @@ def test_resumed_network_is_bit_identical(name: str, two_gateways: Record, tmp_p
     assert min(step for _, step in told) > 12, "no step is taken again"
     assert {stage for stage, _ in told} == {networks[-1]}
     assert not (out / "checkpoint.npz").exists()
-    assert_same_model(whole, out)
+    assert_same_model(uninterrupted, out)
 
 
 def assert_same_model(whole: Path, resumed: Path) -> None:
-    with np.load(whole / "model.npz") as expected, np.load(resumed / "model.npz") as found:
-        assert set(expected) == set(found)
+    with np.load(whole / "model.npz") as expected, np.load(resumed / "model.npz") as resumed_arrays:
+        assert set(expected) == set(resumed_arrays)
         for key in set(expected) - {"run/train_seconds", CHECKSUM}:
-            np.testing.assert_array_equal(found[key], expected[key], err_msg=key)
+            np.testing.assert_array_equal(resumed_arrays[key], expected[key], err_msg=key)
 
 
 def test_sweep_and_comparison_show_baselines_and_the_reference(flat_folder, run, tmp_path, command):

@@ -174,8 +174,8 @@ def test_several_receivers_are_pooled_and_named(tmp_path, monkeypatch):
     assert score.shape == (2, 6)
     compare([run], tmp_path / "out")
     np.testing.assert_array_equal(np.sort(np.ravel(calls[-1][0]["two"])), np.sort(score.ravel()))
-    found = rows_of(tmp_path / "out" / "compare.csv")[0]
-    assert float(found["median"]) == pytest.approx(np.median(score), abs=1e-3)
+    row = rows_of(tmp_path / "out" / "compare.csv")[0]
+    assert float(row["median"]) == pytest.approx(np.median(score), abs=1e-3)
     assert all(re.fullmatch(r"row \d, gateway[01]", name) for name, _ in pictures[-1][0])
 
 

@@ -64,14 +64,14 @@ def strengths(
     metrics = {"abs_error_db": block, "split": "official", "model": name}
     names = tuple(f"anchor{k}" for k in range(receivers))
     positions_m = np.zeros((len(rows), 3)) if positions_m is None else positions_m
-    stated = (Path(path) / name, name, "rssi", "flat", metrics, seed, names)
+    header = (Path(path) / name, name, "rssi", "flat", metrics, seed, names)
     split = Split("official", seed, np.array(train, np.int64), np.zeros(0, np.int64), rows)
     idw: dict[str, Any] = {"idw": truth + idw_db}
-    return Results(*stated, rows, positions_m, prediction, truth, idw, None, None, {}, splits=[split])
+    return Results(*header, rows, positions_m, prediction, truth, idw, None, None, {}, splits=[split])
 
 
 def verdicts(runs: list[Results]) -> dict[tuple[str, str], str]:
-    return {(one.run, one.against): one.verdict for one in differences(runs)}
+    return {(difference.run, difference.against): difference.verdict for difference in differences(runs)}
 
 
 def test_differences_have_the_sign_of_the_score_and_the_rule_of_the_interval() -> None:
@@ -79,15 +79,17 @@ def test_differences_have_the_sign_of_the_score_and_the_rule_of_the_interval() -
     good, bad = strengths("good", rng.uniform(0.5, 1.5, 40)), strengths("bad", rng.uniform(3.5, 4.5, 40))
     close = strengths("close", np.abs(good.prediction - good.truth)[0] + rng.normal(0, 0.1, 40) + 0.001)
     runs = [bad, good, close]
-    found = verdicts(runs)
+    verdict_of = verdicts(runs)
     best = best_run(runs).name
     assert best in ("good", "close")
     other = {"good": "close", "close": "good"}[best]
-    assert found["bad", best] == "worse"
-    assert found[other, best] == "tie"
+    assert verdict_of["bad", best] == "worse"
+    assert verdict_of[other, best] == "tie"
     reference = "IDW"
-    assert {name: found[name, reference] for name in ("bad", "good")} == {"bad": "worse", "good": "better"}
-    against = next(one for one in differences(runs) if (one.run, one.against) == ("bad", best))
+    assert {name: verdict_of[name, reference] for name in ("bad", "good")} == {"bad": "worse", "good": "better"}
+    against = next(
+        difference for difference in differences(runs) if (difference.run, difference.against) == ("bad", best)
+    )
     expected = np.mean(np.abs(best_run(runs).prediction - good.truth) - np.abs(bad.prediction - bad.truth))
     assert against.low is not None
     assert against.high is not None
@@ -96,25 +98,25 @@ def test_differences_have_the_sign_of_the_score_and_the_rule_of_the_interval() -
 
 
 def test_only_rows_with_the_same_truth_and_both_predictions_are_compared() -> None:
-    one, other = strengths("one", 1.0), strengths("other", 2.0, rows=range(30, 70))
-    assert [row for _, row in common([one, strengths("equal", 2.0, rows=range(30, 70))])] == list(range(30, 40))
+    first_run, other = strengths("one", 1.0), strengths("other", 2.0, rows=range(30, 70))
+    assert [row for _, row in common([first_run, strengths("equal", 2.0, rows=range(30, 70))])] == list(range(30, 40))
     other.truth[0, 0] = 7.0  # row 30 is another measurement
     other.truth[0, 1] = np.nan  # row 31 was not received
-    shared = [row for _, row in common([one, other])]
+    shared = [row for _, row in common([first_run, other])]
     assert shared == list(range(32, 40))
-    assert {found.rows for found in differences([one, other]) if found.against == "one"} == {8}
-    assert common_means([one, other]) == pytest.approx({"one": 1.0, "other": 2.0})
+    assert {difference.rows for difference in differences([first_run, other]) if difference.against == "one"} == {8}
+    assert common_means([first_run, other]) == pytest.approx({"one": 1.0, "other": 2.0})
     apart = strengths("apart", 2.0, rows=range(90, 99))
-    assert common_means([one, apart]) == {}
-    assert verdicts([one, apart])["apart", "one"] == "too few rows"
+    assert common_means([first_run, apart]) == {}
+    assert verdicts([first_run, apart])["apart", "one"] == "too few rows"
 
 
 def test_runs_of_other_training_rows_have_no_verdict() -> None:
     good, bad, few = strengths("good", 1.0), strengths("bad", 2.0), strengths("few", 3.0, train=[1000])
-    found = verdicts([good, bad, few])
-    assert found["bad", "good"] == "worse"
-    assert (found["few", "good"], found["bad", "few"]) == (OTHER_ROWS, OTHER_ROWS)
-    assert found["few", "IDW"] == "tie"  # the reference of the same training rows
+    verdict_of = verdicts([good, bad, few])
+    assert verdict_of["bad", "good"] == "worse"
+    assert (verdict_of["few", "good"], verdict_of["bad", "few"]) == (OTHER_ROWS, OTHER_ROWS)
+    assert verdict_of["few", "IDW"] == "tie"  # the reference of the same training rows
     assert all(gain.low is None for gain in differences([good, bad, few]) if gain.verdict == OTHER_ROWS)
 
 
@@ -171,13 +173,13 @@ def test_all_seeds_must_agree(seeds: list[Path]) -> None:
         for k, (path, error) in enumerate(zip(seeds, (1.0, 1.0, 3.5), strict=True))
     ]
     runs.append(strengths("worst", 5.0))
-    found = verdicts(runs)
+    verdict_of = verdicts(runs)
     reference = "IDW"
-    assert {found[path.name, reference] for path in seeds} == {"tie"}  # one of three seeds is worse
-    assert found["worst", reference] == "worse"
-    assert found["worst", "seed0"] == "worse"
-    assert found["seed2", "seed0"] == "another seed"
-    assert ("seed1", "seed2") not in found  # a method is not compared with itself
+    assert {verdict_of[path.name, reference] for path in seeds} == {"tie"}  # one of three seeds is worse
+    assert verdict_of["worst", reference] == "worse"
+    assert verdict_of["worst", "seed0"] == "worse"
+    assert verdict_of["seed2", "seed0"] == "another seed"
+    assert ("seed1", "seed2") not in verdict_of  # a method is not compared with itself
     best, worst = method_rows(runs)
     assert (best["method"], best["seeds"]) == ("seed0, seed1, seed2", 3)
     assert (worst["method"], worst["mean_sd"]) == ("worst", None)

@@ -55,8 +55,8 @@ def record(task: str, receivers: int, subcarriers: int = 3) -> Record:
         shape = (*shape, subcarriers)
         observation = (rng.normal(size=shape) + 1j * rng.normal(size=shape)).astype(np.complex64)
     receiver = [Receiver(f"anchor{r}", rng.normal(size=3), np.array([0.0, 0, 0, 1])) for r in range(receivers)]
-    known: dict[str, Any] = {"official": (np.arange(30), np.arange(30, ROWS)), "folds": np.arange(ROWS) % 4}
-    return Record("made-up", task, rng.normal(size=(ROWS, 3)), tuple(receiver), observation, **known)
+    record_fields: dict[str, Any] = {"official": (np.arange(30), np.arange(30, ROWS)), "folds": np.arange(ROWS) % 4}
+    return Record("made-up", task, rng.normal(size=(ROWS, 3)), tuple(receiver), observation, **record_fields)
 
 
 class Off:
@@ -329,8 +329,8 @@ def test_the_best_reference_is_compared_with() -> None:
     truth = np.zeros((1, 4), np.float32)
     references: dict[str, Any] = {"idw": truth + 3, "law": truth + 2}
     no_metrics: dict[str, Any] = {}
-    stated = (Path(), "name", "rssi", "data", no_metrics, 0, ("anchor0",), np.arange(4), np.zeros((4, 3)))
-    results = Results(*stated, truth, truth, references, None, None, no_metrics)
+    result_fields = (Path(), "name", "rssi", "data", no_metrics, 0, ("anchor0",), np.arange(4), np.zeros((4, 3)))
+    results = Results(*result_fields, truth, truth, references, None, None, no_metrics)
     assert results.best_reference == "law"
     np.testing.assert_array_equal(results.reference, references["law"])
     assert results.reference_name == "one path-loss law of all receivers"

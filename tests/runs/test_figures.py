@@ -43,8 +43,8 @@ def outlines_of(figure: Figure) -> list[FloatArray]:
 @pytest.mark.parametrize(("azimuth", "elevation"), [(90, 60), (0, 10), (200, 89), (359.5, 0)])
 def test_outline_of_a_round_gaussian_is_a_circle_on_the_sky(azimuth: float, elevation: float) -> None:
     """The angular radius is the scale seen from the receiver with the low-pass added, also at seam and zenith."""
-    seen = footprints(placed(azimuth, elevation, 4.0)[None], np.full((1, 3), 0.4))
-    (outline,) = outlines_of(figures.footprint_sky(np.zeros((9, 36)), seen, [1.0]))
+    projected = footprints(placed(azimuth, elevation, 4.0)[None], np.full((1, 3), 0.4))
+    (outline,) = outlines_of(figures.footprint_sky(np.zeros((9, 36)), projected, [1.0]))
     angle = np.arccos(outline @ unit_vectors(np.radians(azimuth), np.radians(elevation)))
     assert angle == pytest.approx(np.arctan(np.hypot(0.4 / 4.0, LOW_PASS_RAD)), abs=OUTLINE_TOLERANCE)
 
@@ -52,16 +52,16 @@ def test_outline_of_a_round_gaussian_is_a_circle_on_the_sky(azimuth: float, elev
 def test_outline_is_where_the_footprint_is_one_deviation() -> None:
     position, scale = placed(40, 70, 2.0)[None], np.array([[0.1, 0.3, 0.5]])
     (outline,) = outlines_of(figures.footprint_sky(np.zeros((9, 36)), footprints(position, scale), [1.0]))
-    seen = field_oracle.project(position, scale, ROUND, RECEIVER)
-    assert field_oracle.footprint(seen, 0, outline) == pytest.approx(np.exp(-0.5), abs=OUTLINE_TOLERANCE)
+    projected = field_oracle.project(position, scale, ROUND, RECEIVER)
+    assert field_oracle.footprint(projected, 0, outline) == pytest.approx(np.exp(-0.5), abs=OUTLINE_TOLERANCE)
 
 
 def test_largest_weight_is_drawn_last_and_absent_footprints_are_omitted() -> None:
     directions = unit_vectors(np.radians([0, 90, 180, 270]), np.radians(45))
     distance = np.array([3.0, 3.0, 3.0, NEAR_M / 2])
     position = RECEIVER.position_m + (distance[:, None] * directions) @ RECEIVER.to_world.T
-    seen = footprints(position, np.full((4, 3), 0.1))
-    figure = figures.footprint_sky(np.zeros((9, 36)), seen, [0.5, 0.9, 0.1, 2.0])
+    projected = footprints(position, np.full((4, 3), 0.1))
+    figure = figures.footprint_sky(np.zeros((9, 36)), projected, [0.5, 0.9, 0.1, 2.0])
     centres = [outline[:-1].mean(axis=0) for outline in outlines_of(figure)]
     azimuth = [round(np.degrees(np.arctan2(y, x))) % 360 for x, y, _ in centres]
     assert azimuth == [180, 0, 90]
@@ -70,8 +70,8 @@ def test_largest_weight_is_drawn_last_and_absent_footprints_are_omitted() -> Non
 
 
 def test_stages_name_what_is_drawn() -> None:
-    def report(stage: str, kept: bool, score: float) -> dict[str, object]:
-        return {"stage": stage, "kept": kept, "held_out": score}
+    def report(stage: str, is_kept: bool, score: float) -> dict[str, object]:
+        return {"stage": stage, "kept": is_kept, "held_out": score}
 
     reports = [report("mean", True, 3.0), report("residual", True, 2.0)]
     (axes,) = figures.stage_steps({"run": reports}).axes

@@ -199,10 +199,10 @@ def assert_noted(error: BaseException, folder: Path) -> None:
 
 @pytest.mark.parametrize("kind", [InputError, KeyboardInterrupt])
 def test_folds_that_are_fitted_stay_where_a_later_one_fails(kind, strengths: Record, tmp_path: Path):
-    known: dict[str, Any] = {"model": "mri", "split": "none"}
-    folder, plain = tmp_path / "run", api.train(strengths, out=tmp_path / "plain", **known)
+    options: dict[str, Any] = {"model": "mri", "split": "none"}
+    folder, plain = tmp_path / "run", api.train(strengths, out=tmp_path / "plain", **options)
     with pytest.raises(kind) as raised:
-        api.train(strengths, out=folder, on_progress=failing_at("fold 3", kind("a fault")), **known)
+        api.train(strengths, out=folder, on_progress=failing_at("fold 3", kind("a fault")), **options)
     assert_noted(raised.value, folder)
     resumed, stages = stages_of(lambda **how: api.resume(folder, record=strengths, **how))
     assert not any(stage.startswith(("fold 1", "fold 2")) for stage in stages)
@@ -211,10 +211,10 @@ def test_folds_that_are_fitted_stay_where_a_later_one_fails(kind, strengths: Rec
 
 def test_stages_that_are_fitted_stay_where_a_later_one_fails(walked: Record, room: Path, tmp_path: Path):
     """The scene's stages take minutes; then interpolation without the scene fails."""
-    known: dict[str, Any] = {"scene": room, "settings": QUICK, "deterministic": True}
-    folder, plain = tmp_path / "run", api.train(walked, out=tmp_path / "plain", **known)
+    options: dict[str, Any] = {"scene": room, "settings": QUICK, "deterministic": True}
+    folder, plain = tmp_path / "run", api.train(walked, out=tmp_path / "plain", **options)
     with pytest.raises(InputError, match="a fault") as raised:
-        api.train(walked, out=folder, on_progress=failing_at("kriging", InputError("a fault")), **known)
+        api.train(walked, out=folder, on_progress=failing_at("kriging", InputError("a fault")), **options)
     assert_noted(raised.value, folder)
     stored = {path: path.stat().st_mtime_ns for path in (folder / "parts" / "paths").rglob("*.*")}
     # Predictions by the options of each stage, and by the chosen ones.
@@ -228,7 +228,7 @@ def test_stages_that_are_fitted_stay_where_a_later_one_fails(walked: Record, roo
 @pytest.mark.parametrize("intervals", [False, True])
 def test_no_part_is_fitted_again_where_the_model_could_not_be_stored(intervals, walked, room, tmp_path, monkeypatch):
     """The disk is full; parts without a weight are removed only after the model is stored."""
-    known: dict[str, Any] = {"model": "kriging"} if intervals else {"scene": room, "settings": QUICK}
+    options: dict[str, Any] = {"model": "kriging"} if intervals else {"scene": room, "settings": QUICK}
 
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -236,7 +236,7 @@ def test_no_part_is_fitted_again_where_the_model_could_not_be_stored(intervals, 
     with monkeypatch.context() as patched:
         patched.setattr(api, "write_fitted", full)
         with pytest.raises(OSError, match="No space left") as raised:
-            api.train(walked, out=tmp_path / "run", intervals=intervals, **known)
+            api.train(walked, out=tmp_path / "run", intervals=intervals, **options)
     assert_noted(raised.value, tmp_path / "run")
     _, stages = stages_of(lambda **how: api.resume(tmp_path / "run", record=walked, **how))
     assert not [stage for stage in stages if ", held-out rows" in stage]

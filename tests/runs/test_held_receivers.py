@@ -41,8 +41,11 @@ def law() -> Record:
     receivers = tuple(Receiver(f"anchor{k}", place, np.array([0.0, 0, 0, 1])) for k, place in enumerate(places))
     distance = np.linalg.norm(positions_m - places[:, None], axis=2)
     observation = LAW_DBM - 10 * EXPONENT * np.log10(distance) + np.array([-3.0, 1, 2, 9])[:, None]
-    known: dict[str, Any] = {"frequencies_hz": np.array([2.44e9]), "official": (np.arange(40), np.arange(40, 60))}
-    return Record("law", "rssi", positions_m, receivers, observation.astype(np.float32), **known)
+    record_fields: dict[str, Any] = {
+        "frequencies_hz": np.array([2.44e9]),
+        "official": (np.arange(40), np.arange(40, 60)),
+    }
+    return Record("law", "rssi", positions_m, receivers, observation.astype(np.float32), **record_fields)
 
 
 Fit = Callable[..., Run]
@@ -57,11 +60,11 @@ def fitted(law: Record, tmp_path_factory: pytest.TempPathFactory) -> Fit:
 def test_a_held_out_receiver_takes_the_law_of_the_others(law: Record, tmp_path: Path) -> None:
     folder = write_ble_folder(tmp_path / "law", law)
     run = train(folder, "mri", out=tmp_path / "run", split="receiver:3")
-    found = read_run(run.folder)
-    assert np.isnan(found.truth[:3]).all()
-    assert np.isnan(found.prediction[:3]).all()
-    np.testing.assert_array_equal(found.truth[3], law.observation[3, found.row])
-    np.testing.assert_array_equal(found.prediction[3], found.references["law"][3])
+    results = read_run(run.folder)
+    assert np.isnan(results.truth[:3]).all()
+    assert np.isnan(results.prediction[:3]).all()
+    np.testing.assert_array_equal(results.truth[3], law.observation[3, results.row])
+    np.testing.assert_array_equal(results.prediction[3], results.references["law"][3])
     assert run.metrics["n_test"] == 20
     assert run.metrics["receivers"]["anchor3"]["n_test"] == 20
     # The mean offset of the three others, to which distances are not exactly alike, is 9 dB below.
@@ -83,10 +86,12 @@ def test_what_new_receivers_observed_changes_no_fit_but_in_rows_left(name, split
     observation[3, hidden] = 1e6 * (1 + hidden)
     expected = fitted(name, split)
     broken = train(replace(law, observation=observation), name, out=tmp_path / "broken", split=split)
-    arrays, found = (arrays_in(run.folder / "model.npz") for run in (expected, broken))
+    arrays, broken_arrays = (arrays_in(run.folder / "model.npz") for run in (expected, broken))
     for key in arrays:
         if not key.startswith("run/") and key != CHECKSUM:
-            np.testing.assert_array_equal(without_seconds(found[key]), without_seconds(arrays[key]), err_msg=key)
+            np.testing.assert_array_equal(
+                without_seconds(broken_arrays[key]), without_seconds(arrays[key]), err_msg=key
+            )
     np.testing.assert_array_equal(read_run(broken.folder).prediction, read_run(expected.folder).prediction)
     assert broken.metrics["reference"] == expected.metrics["reference"]
 
@@ -108,9 +113,9 @@ def test_the_hybrid_chooses_on_receivers_that_are_held_out(law: Record, fitted: 
     assert set(run.metrics["held_out"]) == {"kriging", "hybrid"}
     assert run.metrics["held_out"]["hybrid"] < 10  # an offset of 9 dB
     assert run.metrics["inside_90"] == 1
-    found = read_run(run.folder)
-    again = open_run(run.folder, law).predict(law.tx_pos_m[found.row], "anchor1")
-    np.testing.assert_allclose(again.mean, found.prediction[1], atol=ROUNDING_DB)
+    results = read_run(run.folder)
+    again = open_run(run.folder, law).predict(law.tx_pos_m[results.row], "anchor1")
+    np.testing.assert_allclose(again.mean, results.prediction[1], atol=ROUNDING_DB)
     fold = hold_out(law, make_splits(law, "receiver:1")[0])
     assert fold is not None
     assert fold.held_receivers in ((1, 0), (1, 2), (1, 3))
@@ -129,19 +134,19 @@ def test_a_part_of_the_rows_left_to_new_receivers_is_held_out(law: Record) -> No
     record = law.seen(split)
     fold = hold_out(record, split)
     assert fold is not None
-    held = HeldOut.of(record, fold, 0)
-    (other,) = (one for one in fold.held_receivers if one != 3)
+    held_out = HeldOut.of(record, fold, 0)
+    (other,) = (receiver for receiver in fold.held_receivers if receiver != 3)
     assert (fold.left[:, 0] == other).sum() == 12
-    kept = {tuple(pair) for pair in fold.left.tolist()}
-    assert not kept & set(zip(held.receiver.tolist(), held.row.tolist(), strict=True))
-    assert set(held.receiver.tolist()) == {3, other}
-    own = held.row[held.receiver == 3]
-    assert set(own) < set(split.left[:, 1])  # the others train
+    training_pairs = {tuple(pair) for pair in fold.left.tolist()}
+    assert not training_pairs & set(zip(held_out.receiver.tolist(), held_out.row.tolist(), strict=True))
+    assert set(held_out.receiver.tolist()) == {3, other}
+    left_rows = held_out.row[held_out.receiver == 3]
+    assert set(left_rows) < set(split.left[:, 1])  # the others train
 
 
 def test_held_out_predictions_are_those_of_their_receivers(law: Record, tmp_path: Path) -> None:
     """Two receivers a fold, in an order of its own: a prediction stands beside what its receiver observed."""
-    places = np.concatenate([[one.position_m for one in law.receivers], [[3.0, 0, 1], [0, 3, 1], [3, 6, 1]]])
+    places = np.concatenate([[receiver.position_m for receiver in law.receivers], [[3.0, 0, 1], [0, 3, 1], [3, 6, 1]]])
     receivers = tuple(replace(law.receivers[0], name=f"anchor{k}", position_m=place) for k, place in enumerate(places))
     distance = np.linalg.norm(law.tx_pos_m - places[:, None], axis=2)
     observed = (LAW_DBM - 10 * EXPONENT * np.log10(distance)).astype(np.float32)
@@ -152,9 +157,9 @@ def test_held_out_predictions_are_those_of_their_receivers(law: Record, tmp_path
     assert fold is not None
     assert len(fold.held_receivers) > 2
     fold = replace(fold, held_receivers=tuple(reversed(fold.held_receivers)))
-    held = HeldOut.of(problem.record, fold, 0)
-    found = held_out_predictions(entry, problem, fold, held, Session(tmp_path, tmp_path), "mri").mean
-    np.testing.assert_allclose(found, held.observed(record), atol=0.05)  # one law without noise; dB
+    held_out = HeldOut.of(problem.record, fold, 0)
+    predicted = held_out_predictions(entry, problem, fold, held_out, Session(tmp_path, tmp_path), "mri").mean
+    np.testing.assert_allclose(predicted, held_out.observed(record), atol=0.05)  # one law without noise; dB
 
 
 def test_intervals_of_any_model_at_new_receivers(law: Record, tmp_path: Path) -> None:
@@ -200,8 +205,8 @@ def test_gaussians_are_seen_from_the_pose_of_a_new_receiver(law: Record, tmp_pat
     level = arrays_in(run.folder / "model.npz")["params/level"][0]
     assert level[4] == pytest.approx(level[:4].mean(), rel=1e-6)
     model = open_run(run.folder, record)
-    clone, known = (model.predict(law.tx_pos_m[40:], receiver).mean for receiver in ("copy", "anchor1"))
-    np.testing.assert_allclose(clone - known, 20 / np.log(10) * (level[4] - level[1]), atol=1e-2)
+    clone, original = (model.predict(law.tx_pos_m[40:], receiver).mean for receiver in ("copy", "anchor1"))
+    np.testing.assert_allclose(clone - original, 20 / np.log(10) * (level[4] - level[1]), atol=1e-2)
     broken = np.where(np.arange(5)[:, None] == 4, 1e6, record.observation).astype(np.float32)
     record = replace(record, observation=broken)
     again = train(record, "wrf-gs+", out=tmp_path / "broken", split=split, settings=settings)
@@ -210,9 +215,9 @@ def test_gaussians_are_seen_from_the_pose_of_a_new_receiver(law: Record, tmp_pat
 
 def test_offsets_of_receivers_that_heard_nothing() -> None:
     traced = np.array([[-50.0, -60], [-50, -60], [-50, np.nan]])
-    found = fit_offsets(traced, [[-53.0, -63], [np.nan, np.nan], [-59.0, -80]])
-    np.testing.assert_allclose(found.offset_db, [-3, -6, -9])
-    np.testing.assert_allclose(found.floor_dbm, [-63, -80, -80])
+    offsets = fit_offsets(traced, [[-53.0, -63], [np.nan, np.nan], [-59.0, -80]])
+    np.testing.assert_allclose(offsets.offset_db, [-3, -6, -9])
+    np.testing.assert_allclose(offsets.floor_dbm, [-63, -80, -80])
     with pytest.raises(InputError, match="receiver 0: no training row is both received and reached"):
         fit_offsets([[np.nan], [-50.0]], [[-53.0], [-50.0]])
 
@@ -242,9 +247,9 @@ def test_receivers_of_spectra_are_not_held_out(tmp_path: Path) -> None:
 
 def test_all_receivers_held_out_are_refused(law: Record, tmp_path: Path) -> None:
     rows = np.arange(40), np.zeros(0, np.int64), np.arange(40, 60)
-    for held in ((0, 1, 2, 3), (4,)):
+    for held_receivers in ((0, 1, 2, 3), (4,)):
         with pytest.raises(InputError, match=r"split mine holds out receivers .* of 4; leave some to train on"):
-            train(law, "mri", out=tmp_path / "run", split=Split("mine", 0, *rows, held))
+            train(law, "mri", out=tmp_path / "run", split=Split("mine", 0, *rows, held_receivers))
 
 
 def test_pictures_of_a_comparison_show_the_receivers_that_were_held_out(fitted, tmp_path, monkeypatch):

@@ -75,7 +75,7 @@ def test_training_goes_on_after_a_fault_with_equal_results(model, folder, flat_f
     fit, out = ["train", data, "--model", model, "--deterministic", *more, "--out"], tmp_path / "run"
     changes.folder, changes.number, changes.fault = str(tmp_path), 0, lambda number: None
     assert call([*fit, tmp_path / "whole"], capsys)[0] == 0
-    whole, count = results(tmp_path / "whole"), changes.number
+    expected, count = results(tmp_path / "whole"), changes.number
     assert count > 10
 
     @settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
@@ -97,7 +97,7 @@ def test_training_goes_on_after_a_fault_with_equal_results(model, folder, flat_f
         changes.fault = lambda number: None
         begun = (out / "config.yaml").exists()
         assert call(["train", "--resume", out] if begun else [*fit, out], capsys)[0] == 0
-        assert results(out) == whole
+        assert results(out) == expected
 
     try:
         goes_on()

@@ -41,9 +41,16 @@ def run(waves: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_run_folder_holds_model_and_standard_deviation(waves: Path, run: Path) -> None:
     assert contents(run) == FILES
     config = yaml.safe_load((run / "config.yaml").read_text())
-    known = {"model": "kriging", "dataset": str(waves), "scene": None, "split": "official", "n_train": None, "seed": 0}
-    known |= {"format": FORMAT, "task": "spectrum", "material": None, "deterministic": False}
-    assert known.items() <= config.items()
+    expected = {
+        "model": "kriging",
+        "dataset": str(waves),
+        "scene": None,
+        "split": "official",
+        "n_train": None,
+        "seed": 0,
+    }
+    expected |= {"format": FORMAT, "task": "spectrum", "material": None, "deterministic": False}
+    assert expected.items() <= config.items()
     assert (config["settings"]["directions"], config["settings"]["lengths"]) == (20, 2)
     record, arrays = load(waves), stored(run)
     assert record.official is not None
@@ -128,12 +135,12 @@ def test_models_work_without_headings(model: str, runs: dict[str, Path], tmp_pat
     assert list(json.loads((run / "metrics.json").read_text())["receivers"]) == NAMES
     command.done(["evaluate", run])
     np.testing.assert_array_equal(stored(run)["prediction"], before["prediction"])
-    found = command.predicted(run, positions_file(tmp_path / "tx.csv", before["tx_pos"]))
-    assert found["receiver_name"].tolist() == NAMES
-    np.testing.assert_allclose(found["prediction"], before["prediction"], atol=1e-4)
+    outputs = command.predicted(run, positions_file(tmp_path / "tx.csv", before["tx_pos"]))
+    assert outputs["receiver_name"].tolist() == NAMES
+    np.testing.assert_allclose(outputs["prediction"], before["prediction"], atol=1e-4)
     if model != "mri":  # the others use the height
-        found = command.predicted(run, positions_file(tmp_path / "tx.csv", [[0.6, 0.6, 0.3], [0.6, 0.6, 1.9]]))
-        assert (np.abs(np.diff(found["prediction"], axis=1)) > 1e-3).any()
+        outputs = command.predicted(run, positions_file(tmp_path / "tx.csv", [[0.6, 0.6, 0.3], [0.6, 0.6, 1.9]]))
+        assert (np.abs(np.diff(outputs["prediction"], axis=1)) > 1e-3).any()
 
 
 @pytest.mark.parametrize("model", ["mri", "kriging"])
@@ -147,8 +154,8 @@ def test_csv_predictions_equal_npz_predictions(model, runs, tmp_path, command):
     assert ("std" in arrays) == (model == "kriging")
     units = {"prediction": "dbm"} | ({"std": "std_db", "std_mean": "std_mean_db"} if model == "kriging" else {})
     table = read_csv(out)
-    given = positions.read_text().splitlines()[0].split(",")
-    assert table.header == [*given, *(f"{name}_{unit}" for unit in units.values() for name in NAMES)]
+    columns = positions.read_text().splitlines()[0].split(",")
+    assert table.header == [*columns, *(f"{name}_{unit}" for unit in units.values() for name in NAMES)]
     for key, unit in units.items():
         for r, name in enumerate(NAMES):
             np.testing.assert_array_equal(table.numbers(f"{name}_{unit}").astype(arrays[key].dtype), arrays[key][r])
@@ -199,6 +206,6 @@ def test_comparison_shows_names_without_formulas(runs: dict[str, Path], tmp_path
 
 def test_length_over_headings_is_refused(plain_flat_folder: Path, tmp_path: Path, command: Command) -> None:
     assert load(plain_flat_folder).tx_heading_rad is None
-    given = ["train", plain_flat_folder, "--model", "kriging", "--out", tmp_path / "run", "--set", "heading_length=1"]
-    command.refused(given, "setting heading_length=1.0: no effect on kriging of .*: the data have no headings; omit it")
+    words = ["train", plain_flat_folder, "--model", "kriging", "--out", tmp_path / "run", "--set", "heading_length=1"]
+    command.refused(words, "setting heading_length=1.0: no effect on kriging of .*: the data have no headings; omit it")
     assert not (tmp_path / "run").exists()

@@ -52,8 +52,8 @@ def test_where_no_receiver_has_two_rows_one_is_enough() -> None:
 
 @pytest.mark.parametrize("model", FITS)
 def test_a_run_is_as_without_the_receivers(model: str, tmp_path: Path) -> None:
-    known: dict[str, Any] = {"settings": FITS[model], "intervals": model in WITH_INTERVALS, "min_rows": 2}
-    with_them = train(building(attic=(3, 45, 46), cellar=()), model, out=tmp_path / "run", **known)
+    options: dict[str, Any] = {"settings": FITS[model], "intervals": model in WITH_INTERVALS, "min_rows": 2}
+    with_them = train(building(attic=(3, 45, 46), cellar=()), model, out=tmp_path / "run", **options)
     without = fitted(model)
     assert with_them.metrics["receivers_left_out"] == {"attic": 1, "cellar": 0}
     assert with_them.metrics.keys() - {"receivers_left_out"} == without.metrics.keys()
@@ -64,8 +64,8 @@ def test_a_run_is_as_without_the_receivers(model: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(stored(with_them.folder)[name], arrays[name], rtol=0, atol=ROUNDING_DB)
     again = open_run(with_them.folder, building(attic=(3, 45, 46), cellar=()))
     assert [receiver.name for receiver in again.receivers] == NAMES
-    found, expected = (run.predict([[1, 2, 1.3]], "lab").mean for run in (again, without))
-    np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING_DB)
+    predicted, expected = (run.predict([[1, 2, 1.3]], "lab").mean for run in (again, without))
+    np.testing.assert_allclose(predicted, expected, rtol=0, atol=ROUNDING_DB)
 
 
 @pytest.mark.parametrize("split", ["blocked", "random", "receiver", "receiver+2", "trajectory"])

@@ -60,9 +60,9 @@ def test_local_mean_is_that_of_milliwatts_within_the_window() -> None:
 def test_scores_are_of_the_averages_of_each_receiver(tmp_path: Path) -> None:
     record, wavelengths = faded(rows=120), 2.0
     run = run_of(record, tmp_path)
-    found = local_mean_scores(run, wavelengths)
+    scores = local_mean_scores(run, wavelengths)
     window_m = wavelengths * speed_of_light / CARRIER_HZ
-    assert found.diameter_m == pytest.approx((window_m, window_m))
+    assert scores.diameter_m == pytest.approx((window_m, window_m))
     with np.load(run / "predictions.npz") as stored:
         place_m, both = stored["tx_pos"], np.stack([stored["prediction"], stored["truth"]]).astype(float)
     pairs = []
@@ -71,11 +71,11 @@ def test_scores_are_of_the_averages_of_each_receiver(tmp_path: Path) -> None:
         mean_dbm, count = local_mean_dbm(both[:, receiver, rows], place_m[rows], window_m)
         pairs.append(mean_dbm[:, count > 1])
     predicted, measured = np.concatenate(pairs, axis=1)
-    assert found.count == len(predicted)
-    assert {key: found.score[key] for key in ("bias", "std", "rmse")} == pytest.approx(
+    assert scores.count == len(predicted)
+    assert {key: scores.score[key] for key in ("bias", "std", "rmse")} == pytest.approx(
         signed_errors_db(predicted, measured), abs=FLOAT32_DB
     )
-    assert found.score["median"] == pytest.approx(np.median(np.abs(predicted - measured)), abs=FLOAT32_DB)
+    assert scores.score["median"] == pytest.approx(np.median(np.abs(predicted - measured)), abs=FLOAT32_DB)
 
 
 def test_fading_averages_out_over_wavelengths(tmp_path: Path) -> None:

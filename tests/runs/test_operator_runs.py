@@ -100,10 +100,10 @@ def test_networks_in_numpy_equal_those_of_the_field(field: Any, monkeypatch: pyt
     expected = recorded_signals(field, params)(tx)
     monkeypatch.setattr("wrf_mi.gaussians.operator.PAIRS_PER_CHUNK", 100)  # three transmitters at a time
     factors, coefficients = static_signals(field, params)
-    found = coefficients(tx)
+    computed = coefficients(tx)
     if factors is not None:
-        found = found @ factors.T
-    assert np.linalg.norm(found - expected) < SIGNALS * np.linalg.norm(expected)
+        computed = computed @ factors.T
+    assert np.linalg.norm(computed - expected) < SIGNALS * np.linalg.norm(expected)
 
 
 @pytest.fixture(scope="module")
@@ -137,14 +137,14 @@ def test_operator_is_stored_with_the_run(run: Path, tmp_path: Path, monkeypatch:
 
 def test_no_operator_option_splats(run: Path, tmp_path: Path, command: Command) -> None:
     """The operator is not built."""
-    stored, found = copied(run, tmp_path / "run") / "operator0.npz", {}
+    stored, predictions = copied(run, tmp_path / "run") / "operator0.npz", {}
     stored.unlink()
     words = ["predict", tmp_path / "run", "--tx", positions_file(tmp_path / "tx.csv", TX)]
     for built, option in ((False, ["--no-operator"]), (True, [])):
         command.done([*words, "--out", tmp_path / "out.npz", *option])
         assert stored.exists() == built
-        found[built] = arrays_in(tmp_path / "out.npz")["prediction"]
-    np.testing.assert_allclose(found[True], found[False], atol=GREYS)
+        predictions[built] = arrays_in(tmp_path / "out.npz")["prediction"]
+    np.testing.assert_allclose(predictions[True], predictions[False], atol=GREYS)
 
 
 PLACE = RECEIVERS[0].position_m
@@ -222,9 +222,9 @@ def test_too_large_operator_is_replaced_by_splatting(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(evaluator, "MOST_BYTES", 1000)
     asked = predictor(field, params, operator=True)
     with pytest.warns(UserWarning, match="operator: weights of 8 Gaussians take more than"):
-        found = asked(TX)
-    np.testing.assert_array_equal(found, predictor(field, params)(TX))
-    np.testing.assert_array_equal(asked(TX), found)  # and says so once
+        predicted = asked(TX)
+    np.testing.assert_array_equal(predicted, predictor(field, params)(TX))
+    np.testing.assert_array_equal(asked(TX), predicted)  # and says so once
 
 
 def test_factorised_field_needs_the_transmitter() -> None:

@@ -33,10 +33,10 @@ def predicted(run: Path) -> dict[str, Any]:
 
 def test_predictions_of_a_run_have_its_scores_under_another_name(flat: tuple[Record, Path], tmp_path: Path) -> None:
     record, run = flat
-    own = open_run(run).metrics
+    metrics = open_run(run).metrics
     copied = score_predictions(record.source, run / "predictions.npz", tmp_path / "copied", "my NeRF")
     for key in ("abs_error_db", "reference", "constant", "inside_90", "crps", "receivers", "n_train", "n_test"):
-        assert copied.metrics[key] == own[key], key
+        assert copied.metrics[key] == metrics[key], key
     assert np.isnan(copied.metrics["train_seconds"])
     page = compare([run, copied.folder], tmp_path / "compare")
     text = unescape(page.read_text())
@@ -48,7 +48,7 @@ def test_predictions_of_a_run_have_its_scores_under_another_name(flat: tuple[Rec
     assert read_config_text(tmp_path / "again") == read_config_text(copied.folder)
     table = {row["run"]: row for row in rows_of(tmp_path / "compare" / "compare.csv")}
     constant = table["median of each receiver's training rows, official"]
-    assert float(constant["median"]) == own["constant"]["median"]
+    assert float(constant["median"]) == metrics["constant"]["median"]
     between = [each for each in differences(read_runs([run, copied.folder])) if each.against == "kriging"]
     assert {(each.difference, each.verdict) for each in between} == {(0.0, TIE)}
 

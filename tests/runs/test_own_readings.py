@@ -71,8 +71,8 @@ def test_command_reads_own_readings(run: Run, tmp_path: Path, command: Command) 
     for name, more in {"without": [], "with": ["--own", tmp_path / "own.csv"]}.items():
         out = tmp_path / f"{name}.csv"
         command.done(["locate", run.folder, "--out", out, "--step", "2", *more])
-        found = np.array([[float(row["x"]), float(row["y"])] for row in rows_of(out)])
-        located[name] = np.linalg.norm(found - record.tx_pos_m[test, :2], axis=1).mean()
+        positions_m = np.array([[float(row["x"]), float(row["y"])] for row in rows_of(out)])
+        located[name] = np.linalg.norm(positions_m - record.tx_pos_m[test, :2], axis=1).mean()
     assert located["with"] < located["without"] + 0.5
 
 

@@ -100,10 +100,10 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
 
 
 def test_damaged_lines_of_the_log_are_dropped(tmp_path: Path) -> None:
-    whole = b'{"step": 2, "loss": 1.0}\n'
-    (tmp_path / "log.jsonl").write_bytes(whole + b'\xff\xfe\n[1]\n{"step": 4}\n{"step": 2, "lo')
+    complete_line = b'{"step": 2, "loss": 1.0}\n'
+    (tmp_path / "log.jsonl").write_bytes(complete_line + b'\xff\xfe\n[1]\n{"step": 4}\n{"step": 2, "lo')
     cut_log(tmp_path, 3)
-    assert (tmp_path / "log.jsonl").read_bytes() == whole
+    assert (tmp_path / "log.jsonl").read_bytes() == complete_line
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -177,14 +177,14 @@ def test_too_many_gaussians_are_refused_at_once(folder: Path, tmp_path: Path) ->
 @pytest.mark.parametrize("largest", [3, 100], ids=["several", "rest at once"])
 def test_chunks_give_the_predictions_of_all_at_once(largest, kriging, tmp_path, monkeypatch):
     positions = np.random.default_rng(0).uniform(0, 3, (7, 3))
-    whole = open_run(kriging).predict(positions, 1).mean
+    expected = open_run(kriging).predict(positions, 1).mean
     monkeypatch.setattr(run_module, "PREDICTED_PER_CHUNK", 2)
     monkeypatch.setattr(run_module, "MOST_PER_CHUNK", largest)
-    np.testing.assert_allclose(open_run(kriging).predict(positions, 1).mean, whole, rtol=1e-6)
+    np.testing.assert_allclose(open_run(kriging).predict(positions, 1).mean, expected, rtol=1e-6)
     for spooled_bytes in (prediction_file.SPOOLED_BYTES, 0):  # in memory, and in a temporary file
         monkeypatch.setattr(prediction_file, "SPOOLED_BYTES", spooled_bytes)
         predict_to_file(kriging, positions, tmp_path / "out.npz")
-        np.testing.assert_allclose(np.load(tmp_path / "out.npz")["prediction"][1], whole, rtol=1e-6)
+        np.testing.assert_allclose(np.load(tmp_path / "out.npz")["prediction"][1], expected, rtol=1e-6)
         assert [path.name for path in tmp_path.iterdir()] == ["out.npz"]
 
 

@@ -66,8 +66,8 @@ def checkpoint_of(run: Path) -> dict[str, np.ndarray]:
 def whole(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with rounds of density control that nothing interrupts."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    known: dict[str, Any] = {"settings": DETERMINISTIC, "on_progress": lambda *told: keep_checkpoint(out, told[2])}
-    return train(folder, "wrf-gs+", out=out, **known).folder
+    options: dict[str, Any] = {"settings": DETERMINISTIC, "on_progress": lambda *told: keep_checkpoint(out, told[2])}
+    return train(folder, "wrf-gs+", out=out, **options).folder
 
 
 def assert_same_arrays(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
@@ -147,8 +147,8 @@ def test_a_fit_that_breaks_keeps_its_last_checkpoint_and_goes_on(folder, whole, 
     paper = Spectrum.loss
 
     def loss(task: Spectrum, prediction: Any, truth: Any, *shape: int, ssim_weight: float) -> Any:
-        found = paper(task, prediction, truth, *shape, ssim_weight=ssim_weight)
-        return dr.select(dr.max(truth) > 1.5, np.nan, found)
+        value = paper(task, prediction, truth, *shape, ssim_weight=ssim_weight)
+        return dr.select(dr.max(truth) > 1.5, np.nan, value)
 
     record, broken = load(folder), tmp_path / "broken"  # keeps its source, which is what a resumed run reads
     reached = Trainer(record, official(record), DETERMINISTIC).schedule.rows[:, 0].tolist()
@@ -175,8 +175,8 @@ def test_run_stopped_before_its_first_checkpoint_starts_anew(folder: Path, tmp_p
 
 
 def test_run_folder_is_complete(folder: Path, tmp_path: Path, one_gateway: Record) -> None:
-    known: dict[str, Any] = {"settings": settings("steps=10", "seed=3"), "split": "random", "n_train": 0.5}
-    run = train(folder, "wrf-gs+", out=tmp_path / "run", **known)
+    options: dict[str, Any] = {"settings": settings("steps=10", "seed=3"), "split": "random", "n_train": 0.5}
+    run = train(folder, "wrf-gs+", out=tmp_path / "run", **options)
     files = {"config.yaml", "log.jsonl", "metrics.json", "model.npz", "predictions.npz", "split.npz"}
     assert contents(run.folder) - {EVENTS} == files
     config = yaml.safe_load((run.folder / "config.yaml").read_text())
@@ -192,16 +192,16 @@ def test_run_folder_is_complete(folder: Path, tmp_path: Path, one_gateway: Recor
     assert m["ms_per_sample"] > 0
     assert m["peak_memory_mb"] > 50
     assert "receivers" not in m
-    held = stored(run.folder)
-    np.testing.assert_array_equal(held["row"], split.test)
-    np.testing.assert_array_equal(held["tx_pos"], one_gateway.tx_pos_m[split.test])
-    assert held["prediction"].shape == (5, *SIZE)
+    run_arrays = stored(run.folder)
+    np.testing.assert_array_equal(run_arrays["row"], split.test)
+    np.testing.assert_array_equal(run_arrays["tx_pos"], one_gateway.tx_pos_m[split.test])
+    assert run_arrays["prediction"].shape == (5, *SIZE)
     # 16 bits a grey.
-    np.testing.assert_allclose(held["truth"], one_gateway.observation[0, split.test], atol=1e-5)
-    assert m["ssim"]["median"] == pytest.approx(float(np.median(ssim(held["prediction"], held["truth"]))))
+    np.testing.assert_allclose(run_arrays["truth"], one_gateway.observation[0, split.test], atol=1e-5)
+    assert m["ssim"]["median"] == pytest.approx(float(np.median(ssim(run_arrays["prediction"], run_arrays["truth"]))))
     # The stored field predicts what was scored.
     again = run.predictor()(one_gateway.tx_pos_m[split.test])
-    np.testing.assert_allclose(again, held["prediction"], atol=FLOAT32_TOLERANCE)
+    np.testing.assert_allclose(again, run_arrays["prediction"], atol=FLOAT32_TOLERANCE)
 
 
 def test_two_gateways_are_scored_each_and_together(two_gateways: Record, tmp_path: Path) -> None:
@@ -209,9 +209,9 @@ def test_two_gateways_are_scored_each_and_together(two_gateways: Record, tmp_pat
     run = train(data, "wrf-gs+", out=tmp_path / "run", settings=settings("steps=10"))
     m = run.metrics
     assert list(m["receivers"]) == ["gateway1", "gateway2"]
-    held = stored(run.folder)
-    prediction, truth = held["prediction"], held["truth"]
-    assert list(held["receiver_name"]) == ["gateway1", "gateway2"]
+    run_arrays = stored(run.folder)
+    prediction, truth = run_arrays["prediction"], run_arrays["truth"]
+    assert list(run_arrays["receiver_name"]) == ["gateway1", "gateway2"]
     assert prediction.shape == truth.shape == (2, 5, *SIZE)
     scores, predictor = ssim(prediction, truth), run.predictor()
     assert m["ssim"]["mean"] == pytest.approx(scores.mean())
@@ -312,9 +312,9 @@ def test_blocked_run_pools_its_folds(folder: Path, tmp_path: Path, one_gateway: 
     parts = [Run(run.folder / f"fold{k}").metrics for k in range(3)]
     assert [p["split"] for p in parts] == ["blocked:0", "blocked:1", "blocked:2"]
     assert m["train_seconds"] == pytest.approx(sum(p["train_seconds"] for p in parts))
-    held = stored(run.folder)
-    assert sorted(held["row"]) == list(range(24))
-    scores, folds = ssim(held["prediction"], held["truth"]), one_gateway.folds[held["row"]]
+    run_arrays = stored(run.folder)
+    assert sorted(run_arrays["row"]) == list(range(24))
+    scores, folds = ssim(run_arrays["prediction"], run_arrays["truth"]), one_gateway.folds[run_arrays["row"]]
     assert m["ssim"]["median"] == pytest.approx(np.median(scores))
     for k, part in enumerate(parts):
         assert part["ssim"]["mean"] == pytest.approx(scores[folds == k].mean())

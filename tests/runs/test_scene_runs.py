@@ -121,8 +121,8 @@ def test_joint_training_predicts_better_than_paths_or_gaussians_alone(rooms, dat
 
 
 def test_run_folder_states_scene_and_trained_parameters(rooms: dict[str, Path], run: Path) -> None:
-    stated = yaml.safe_load((run / "config.yaml").read_text())
-    assert stated["scene"] == str(rooms["known"])
+    run_config = yaml.safe_load((run / "config.yaml").read_text())
+    assert run_config["scene"] == str(rooms["known"])
     params = open_run(run).field.params
     moved = {name for name in params if name.startswith(("material", "receiver", "surface"))}
     # A pose is held unless a rate is given for it, and costs nothing.
@@ -144,9 +144,9 @@ def test_resumed_run_is_bit_identical(fit: Fit, run: Path, tmp_path: Path) -> No
     with pytest.raises(Interrupted):
         fit(tmp_path / "run", stop=stop_after(100))
     resume(tmp_path / "run")
-    whole, resumed = (open_run(folder).field.arrays() for folder in (run, tmp_path / "run"))
-    for key in whole:
-        np.testing.assert_array_equal(whole[key], resumed[key], err_msg=key)
+    uninterrupted, resumed = (open_run(folder).field.arrays() for folder in (run, tmp_path / "run"))
+    for key in uninterrupted:
+        np.testing.assert_array_equal(uninterrupted[key], resumed[key], err_msg=key)
 
 
 def test_run_that_validated_no_step_opens_with_an_infinite_reach(fit: Fit, tmp_path: Path) -> None:

@@ -85,11 +85,11 @@ def test_every_option_of_train_may_vary(tmp_path: Path) -> None:
 
 def option_value(action: argparse.Action) -> list[str]:
     """A value of an option that is not its default, in words."""
-    known = {"model": "ray-tracing", "calibrate": "gain", "n_train": "7", "rays": "64", "paths": "line-of-sight"}
-    known |= {"phase_error": "0.5", "preset": "fast", "set": "stages=mean", "stages": "mean"}
+    values = {"model": "ray-tracing", "calibrate": "gain", "n_train": "7", "rays": "64", "paths": "line-of-sight"}
+    values |= {"phase_error": "0.5", "preset": "fast", "set": "stages=mean", "stages": "mean"}
     if action.nargs == 0:
         return []
-    return [known.get(action.dest) or (str(list(action.choices)[-1]) if action.choices else "9")]
+    return [values.get(action.dest) or (str(list(action.choices)[-1]) if action.choices else "9")]
 
 
 SWEEP: Any = dict(vars(build_parser()._subparsers._group_actions[0])["choices"])["sweep"]
@@ -271,15 +271,15 @@ def test_sweep_refuses_other_data_and_versions(folder: Path, tmp_path: Path, mon
 
 def test_failed_run_is_reported_and_the_others_go_on(folder, tmp_path, monkeypatch, command):
     plan = plan_sweep(tmp_path / "sweep", ["seed=0,1"], {"dataset": str(folder)})
-    seen = []
+    calls = []
 
     def run(name: str, arguments: tuple[str, ...]) -> tuple[int, str]:
-        seen.append(arguments)
+        calls.append(arguments)
         return (1, "wrf-mi: out of | memory") if "0" in arguments else (-6, "")
 
     monkeypatch.setattr(module, "run_module", run)
     rows = run_sweep(plan)
-    assert len(seen) == 2
+    assert len(calls) == 2
     assert [row["status"] for row in rows] == ["out of | memory", "ended with status -6"]
     assert "| out of \\| memory |" in sweep_table(rows, plan.varied)
     with pytest.raises(module.SweepFailed, match=r"2 of 2 runs failed: seed=0: out of \| memory; seed=1: ended"):

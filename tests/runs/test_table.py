@@ -32,7 +32,7 @@ def flat(tmp_path_factory: pytest.TempPathFactory) -> Path:
         wrf_mi.Receiver(f"r{k}", np.array([4.0 * k, 1.0, 2.0]), np.array([0.0, 0, 0, 1])) for k in range(2)
     )
     place_m = RNG.uniform(0, 6, (ROWS, 3)) * [1, 1, 0] + [0, 0, 1.2]
-    range_m = np.linalg.norm(place_m - np.stack([one.position_m for one in receivers])[:, None], axis=2)
+    range_m = np.linalg.norm(place_m - np.stack([receiver.position_m for receiver in receivers])[:, None], axis=2)
     observed = -40 - 20 * np.log10(range_m) + RNG.normal(0, 1, range_m.shape)
     official = np.arange(30), np.arange(30, ROWS)
     record = Record(
@@ -104,15 +104,15 @@ def test_what_differs_from_the_table_is_found(table: Path, flat: Path, predictio
         patch.chdir(home)
         before = check_table(table)
         assert (before.entries, before.scored, before.absent, before.faults) == (1, 1, [], [])
-        stated = source.read_text()
-        source.write_text(re.sub(r"(official: )\w+", r"\g<1>0123456789abcdef", stated))
+        text = source.read_text()
+        source.write_text(re.sub(r"(official: )\w+", r"\g<1>0123456789abcdef", text))
         content = json.loads(path.read_text())
         content["score"]["median"] += 0.01
         path.write_text(json.dumps(content))
-        found = check_table(table).faults
-    assert any("split official" in fault and "0123456789abcdef" in fault for fault in found)
-    assert any("median" in fault and "its predictions score" in fault for fault in found)
-    assert len(found) == 2
+        faults = check_table(table).faults
+    assert any("split official" in fault and "0123456789abcdef" in fault for fault in faults)
+    assert any("median" in fault and "its predictions score" in fault for fault in faults)
+    assert len(faults) == 2
 
 
 def test_other_observations_and_unknown_data_are_refused(table: Path, flat: Path, predictions: Path) -> None:

@@ -88,9 +88,9 @@ def test_the_largest_triangles_are_kept(room):
     surfaces, looks = surfaces_in(open_scene(room, 2.4e9))
     content, note = scene_content(surfaces, looks, most=4)
     every = np.concatenate([surface.vertices_m[surface.faces] for surface in surfaces])
-    kept = np.concatenate([mesh.corners_m for mesh in content.meshes])
+    corners_m = np.concatenate([mesh.corners_m for mesh in content.meshes])
     areas = np.sort(trimesh.triangles.area(every))[-4:]
-    assert np.sort(trimesh.triangles.area(kept)) == pytest.approx(areas)
+    assert np.sort(trimesh.triangles.area(corners_m)) == pytest.approx(areas)
     assert note == f"Mesh: the largest 4 of {len(every)} triangles."
 
 
@@ -114,11 +114,11 @@ def test_a_traced_run_shows_its_held_out_rows_and_stored_paths(traced):
 
 def test_the_strongest_paths_of_each_pair_are_kept(traced):
     stored = load_trace(traced / "paths.npz")
-    kept, every = path_layer(stored, 2), path_layer(stored, 10**6)
+    strongest, every = path_layer(stored, 2), path_layer(stored, 10**6)
     for tx in range(stored.paths.n_tx):
         for rx in range(stored.paths.n_rx):
             best = np.sort(every.gain_db[(every.tx == tx) & (every.rx == rx)])[-2:]
-            assert np.sort(kept.gain_db[(kept.tx == tx) & (kept.rx == rx)]) == pytest.approx(best)
+            assert np.sort(strongest.gain_db[(strongest.tx == tx) & (strongest.rx == rx)]) == pytest.approx(best)
 
 
 def test_a_joint_run_shows_gaussians_and_paths_of_its_settings(joint):
