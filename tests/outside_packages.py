@@ -40,7 +40,7 @@ class NearestModel(Model):
     name, source, settings, tasks = "nearest", "this test", NearestSettings, ("rssi",)
 
     def fit(self, problem, split, session):
-        session.report("nearest rows", 0.0)
+        session.progress("nearest rows", 0.0)
         record, rows = problem.record, problem.rows(split)
         return self.load({"tx_pos": record.tx_pos_m[rows], "observation": record.observation[:, rows]}, problem, None)
 

@@ -69,7 +69,7 @@ def test_progress_names_the_fold_and_a_stop_in_a_part_the_run_to_resume() -> Non
     folders = [Path("run/fold0"), Path("run/fold1"), Path("run")]
     for folder in folders:
         with pytest.raises(Interrupted, match=r"--resume run$"):
-            inside(session.of_part(folder, folders), "parts", "paths").report("tracing", 0.0)
+            inside(session.of_part(folder, folders), "parts", "paths").progress("tracing", 0.0)
     assert stages == ["fold 1 of 2: tracing", "fold 2 of 2: tracing", "all rows: tracing"]
 
 

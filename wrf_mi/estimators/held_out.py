@@ -46,7 +46,7 @@ def hold_out_once(problem: Problem, split: Split) -> HoldOut | None:
 
 
 def labelled(session: Session, label: str) -> Session:
-    """A session that reports progress under a label, without that of optimiser steps."""
+    """A session whose progress has a label, without that of optimiser steps."""
     on_progress = session.on_progress
     return replace(
         session, on_progress=lambda stage, share, *_: on_progress(f"{label}: {stage.rpartition(': ')[2]}", share)
@@ -70,7 +70,7 @@ def fold_of(entry: Model | None, problem: Problem, fold: Split, session: Session
         problem = replace(problem, dataset=problem.record.at_receivers(numbers), antennas=AS_STATED)
         fold = fold.at_receivers(numbers)
     problem = problem.seen(fold)
-    return problem if entry is None else placed_problem(problem, fold, entry, session.report), fold, numbers
+    return problem if entry is None else placed_problem(problem, fold, entry, session.progress), fold, numbers
 
 
 def fit_fold(entry: Model, problem: Problem, fold: Split, session: Session) -> tuple[Fitted, IntArray]:

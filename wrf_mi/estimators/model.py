@@ -109,7 +109,7 @@ class Session(FitSession):
     folder: Path
     run: Path
     scheduler: Scheduler | None = None  #: scheduler of parts of the work; None: this process
-    progress: bool = False  #: show bars on standard error where the tracer takes time
+    show_progress: bool = False  #: show bars on standard error where the tracer takes time
 
 
 @dataclass(frozen=True)
@@ -273,7 +273,7 @@ class Model(ABC):
         """Fit to the rows ``problem.rows(split)`` alone, of which ``split.validation`` may choose settings.
 
         Training step by step keeps a checkpoint in ``session.folder`` and continues from it; all other fits call
-        ``session.report``.
+        ``session.progress``.
         """
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> Fitted:

@@ -221,7 +221,7 @@ def _trace(tracer: RayTracer, problem: Problem, session: Session) -> TraceResult
     record, scheduler = problem.record, session.scheduler
     tx_pos_m, carriers = record.tx_pos_m, record.carriers_hz
     if scheduler is None:
-        return tracer.trace(tx_pos_m, session.progress, carriers_hz=carriers)
+        return tracer.trace(tx_pos_m, session.show_progress, carriers_hz=carriers)
     assert problem.scene is not None
     rays, least = tracer.rays(tx_pos_m), TRACED_AT_LEAST
     if not tracer.options.sampled:

@@ -217,7 +217,7 @@ def _lacking(record: Record) -> list[int]:
 
 
 def placed(
-    record: Record, rows: IntArray, height_m: tuple[float, float] = (-np.inf, np.inf), report: OnProgress = quiet
+    record: Record, rows: IntArray, height_m: tuple[float, float] = (-np.inf, np.inf), on_progress: OnProgress = quiet
 ) -> Record:
     """The record with estimated positions of receivers that have none, by some rows; NaN remains without any row."""
     lacking = _lacking(record)
@@ -235,11 +235,11 @@ def placed(
             with one_blas_thread():  # of matrices of a hundred rows threads would mostly wait for each other
                 place_m, std_m = place_of_receiver(*of_rows, extent_m, stated_m, height_m)
             receivers[number] = replace(receiver, position_m=place_m, position_std_m=std_m)
-        report("places of receivers", done / len(lacking))
+        on_progress("places of receivers", done / len(lacking))
     return replace(record, receivers=tuple(receivers)) if lacking else record
 
 
-def placed_problem(problem: Problem, split: Split, model: Model, report: OnProgress = quiet) -> Problem:
+def placed_problem(problem: Problem, split: Split, model: Model, on_progress: OnProgress = quiet) -> Problem:
     """The problem of `placed` receivers by a split's training rows, in a scene outside of its solids.
 
     The problem itself where all are surveyed, and for a model that does not use their places.
@@ -247,7 +247,7 @@ def placed_problem(problem: Problem, split: Split, model: Model, report: OnProgr
     if not _lacking(problem.record) or not model.uses_places(problem, [split]):
         return problem
     if problem.scene is None:
-        return _with_record(problem, placed(problem.record, split.all_train, report=report))
+        return _with_record(problem, placed(problem.record, split.all_train, on_progress=on_progress))
     from ..scene.mesh.surfaces import bounds  # imported where there is a scene
     from ..tracing.paths.solve import Prepared
 
@@ -264,7 +264,7 @@ def placed_problem(problem: Problem, split: Split, model: Model, report: OnProgr
     # A ceiling above all rows is above their receivers, too; the height of the ground bounds nothing.
     if low <= np.nanmin(tx_m) and np.nanmax(tx_m) < high:
         height_m = float(low), float(high)
-    located = placed(problem.record, split.all_train, height_m, report)
+    located = placed(problem.record, split.all_train, height_m, on_progress)
     return _with_record(opened, _outside_solids(located, surfaces))
 
 

@@ -118,12 +118,12 @@ class Scheduler:
             InputError: raised by a part; the parts that are left are cancelled.
             SchedulerFailed: the scheduler, or several workers in a row that computed the same part, were lost.
         """
-        report = each or (lambda index, result: None)
+        on_result = each or (lambda index, result: None)
         if self._client is None:
             opened, results = () if opener is None else (opener(),), []
             for k, part in enumerate(parts):
                 results.append(function(*opened, part))
-                report(k, results[k])
+                on_result(k, results[k])
             return results
         token = uuid.uuid4().hex
         task = partial(run_part, worker_environment(), token, opener, function)
@@ -132,7 +132,7 @@ class Scheduler:
         sizes = [1] * len(parts) if sizes is None else sizes
         try:
             with PartsProgress(what, sum(sizes), lines=each is None if lines is None else lines) as progress:
-                return self._collect(futures, keys, sizes, what, progress, report)
+                return self._collect(futures, keys, sizes, what, progress, on_result)
         except BaseException:
             self._client.cancel(list(futures.values()), force=True)
             raise
@@ -144,9 +144,9 @@ class Scheduler:
         sizes: Sequence[int],
         what: str,
         progress: PartsProgress,
-        report: Callable[[int, Any], None],
+        on_result: Callable[[int, Any], None],
     ) -> list[Any]:
-        """Results of futures in the order of their keys; they are reported in the order in which they are done."""
+        """Results of futures in the order of their keys; ``on_result`` gets them as they are done."""
         client: Any = self._client
         done, results = queue.SimpleQueue[str](), [None] * len(keys)
         index = {key: k for k, key in enumerate(keys)}
@@ -171,7 +171,7 @@ class Scheduler:
             # Dask forgets a result that was fetched: a worker that is lost later takes none with it.
             results[k] = _result(futures.pop(key), what)
             progress.add(sizes[k], self.workers)
-            report(k, results[k])
+            on_result(k, results[k])
         return results
 
     def __enter__(self) -> Self:

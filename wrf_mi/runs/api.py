@@ -217,7 +217,7 @@ def resume(
     run = open_run(folder, record)
     if run.config.deterministic:
         init("llvm", threads=1)
-    session = Session(run.folder, run.folder, on_progress, stop, progress=progress)
+    session = Session(run.folder, run.folder, on_progress, stop, show_progress=progress)
     with locked_folder(run.folder), _noting_resumption(run.folder):
         _complete(run.folder, run.config, run.problem, session)
     return open_run(folder, record)
@@ -228,7 +228,7 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
     folders = run_parts(folder)
     splits = [load_rows(part, problem.record) for part in folders]
     if not all((part / FITTED).exists() for part in folders):
-        placed = placed_problem(problem, splits[0], config.entry, session.report)
+        placed = placed_problem(problem, splits[0], config.entry, session.progress)
         problem.settings = config.entry.prepare(placed, splits, session)
         if problem.settings != config.settings:
             config = replace(config, settings=problem.settings)
@@ -240,7 +240,7 @@ def _complete(folder: Path, config: RunConfig, problem: Problem, session: Sessio
             # Matrices of a few hundred rows: threads of BLAS would mostly wait for each other.
             with threadpool_limits(1, "blas"):
                 of_part = session.of_part(part, folders)
-                placed = placed_problem(problem.seen(rows), rows, config.entry, of_part.report)
+                placed = placed_problem(problem.seen(rows), rows, config.entry, of_part.progress)
                 fitted = config.entry.fit(placed, rows, of_part)
             write_places(part, placed.record)
             spent = fitted.train_seconds

@@ -144,14 +144,14 @@ class Engine:
                 if option.after and (why := self._why_omitted(self._option(number, option.after), scores)):
                     left[option.name] = f"{option.after}, which it goes on from, {why}"
                     continue
-                self._session.report(f"{stage.name}: {option.name}", done / len(options))
+                self._session.progress(f"{stage.name}: {option.name}", done / len(options))
                 try:
                     scores[option.name] = self._scores(fold, (*plan, option.name, *later), stage)
                 except InputError as error:  # the default has to serve the data, others may not
                     if option is first:
                         raise
                     left[option.name] = str(error)
-            self._session.report(f"{stage.name}: chosen", 1.0)
+            self._session.progress(f"{stage.name}: chosen", 1.0)
             best = self._best(options, scores, stage.confidence(rows))
             for option in options:
                 if option.name in left:
@@ -226,10 +226,10 @@ class Engine:
             folder = self._folder.joinpath(*plan)
             on_progress = self._session.on_progress
 
-            def report(stage: str, share: float, _: object = None, /) -> None:
+            def progress(stage: str, share: float, _: object = None, /) -> None:
                 on_progress(f"{stage} ({option.name})", share)
 
-            session = replace(self._session, folder=folder, on_progress=report)
+            session = replace(self._session, folder=folder, on_progress=progress)
             self._states[plan] = option.fit(before, fold.split, session)
         return self._states[plan]
 

@@ -106,8 +106,8 @@ class MixtureFit:
         # Errors are independent between rows, or where receivers are held out, between these.
         unit = held_out.receiver if self._split.held_receivers else held_out.row
         scores_of = by_distance.HeldOutScores(self._score, held_out.distance_m, unit, len(first))
-        report = partial(self._session.report, "choosing weights")
-        return ChosenWeights(*by_distance.choose_weights(scores_of, held_out.group, report, trusted=0))
+        progress = partial(self._session.progress, "choosing weights")
+        return ChosenWeights(*by_distance.choose_weights(scores_of, held_out.group, progress, trusted=0))
 
     @cached_property
     def _score(self) -> by_distance.RowScores:

@@ -139,7 +139,7 @@ class PathsStage(Stage):
     def _as_traced(self, state: State, split: Split, session: Session) -> State:
         config = calibration_config(["gain"], state.problem.record.task.settings_of_paths)
         of_gain = replace(state.problem, settings=config, checked=[])
-        session.report("tracing", 0.0)
+        session.progress("tracing", 0.0)
         return replace(state, fitted=FittedPaths(WRF_GS_PLUS.as_traced(of_gain, split, session), state.problem))
 
     def _unjudged(self, state: State, split: Split, session: Session) -> State:

@@ -67,7 +67,7 @@ class StrengthResidual(Stage):
     def _fit(self, settings: StrengthSettings, state: State, split: Split, session: Session) -> State:
         record, rows = state.problem.record, split.all_train
         runs = bool(state.kept.get(Runs.name))
-        fitted = fit_strengths(record, rows, state.mean, settings, session.report, self.stated, False, runs)
+        fitted = fit_strengths(record, rows, state.mean, settings, session.progress, self.stated, False, runs)
         return replace(state, fitted=fitted)
 
     def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
@@ -89,5 +89,5 @@ class StrengthResidual(Stage):
         assert isinstance(state.fitted, Strengths)
         record = state.problem.record
         new_runs = predicts_new_runs(record, split)
-        fitted = calibrated(state.fitted, record, split.all_train, session.report, self.stated, new_runs)
+        fitted = calibrated(state.fitted, record, split.all_train, session.progress, self.stated, new_runs)
         return replace(state, fitted=fitted)

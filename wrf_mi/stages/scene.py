@@ -150,7 +150,7 @@ class SceneStage(Stage):
         path = session.folder / EDIT
         if not path.exists():
             assert stated.scene is not None
-            how = with_near(state, split, change.near), change.options, stated.material, session.report
+            how = with_near(state, split, change.near), change.options, stated.material, session.progress
             traced, edit = TracedScene(stated.scene, stated.record, *how), before.edit if before else None
             posterior = traced.fitted_posterior(traced.record, traced.split.all_train, edit)
             fitted = fit_edit(posterior, change.parts, edit)
@@ -175,7 +175,7 @@ class SceneStage(Stage):
             problem, place = state.problem, session.folder / SCENE
             if not (place / CORRECTION).exists():  # a resumed fit finds it
                 assert problem.scene is not None
-                how = split, edited.options, problem.material, session.report
+                how = split, edited.options, problem.material, session.progress
                 traced = TracedScene(problem.scene, problem.record, *how)
                 held = {problem.record.receivers[number].name for number in split.held_receivers}
                 names = [name for name in out if name not in held]

@@ -106,7 +106,7 @@ class Mean(Stage):
         return [Option(name, partial(self._fit, name)) for name in names]
 
     def _fit(self, name: str, state: State, split: Split, session: Session) -> State:
-        on_share = partial(session.report, "tracing a map")
+        on_share = partial(session.progress, "tracing a map")
         on_share(0.0)
         return replace(state, mean=_mean(state.problem, name, on_share))
 

@@ -15,7 +15,7 @@ class OnProgress(Protocol):
     """Progress callback: stage, fraction of it that is done (0 to 1), and loss, score and time of optimiser steps."""
 
     def __call__(self, stage: str, share: float, progress: Progress | None = None, /) -> None:
-        """Report progress."""
+        """Show progress."""
 
 
 def quiet(stage: str, share: float, progress: Progress | None = None, /) -> None:
@@ -52,8 +52,8 @@ class FitSession:
         on_progress, named = self.on_progress, replace(self, folder=folder, root=self.run)
         return replace(named, on_progress=lambda stage, *more: on_progress(f"{name}: {stage}", *more))
 
-    def report(self, stage: str, share: float, progress: Progress | None = None, /) -> None:
-        """Report progress of a fit without checkpoints (Interrupted: the stop condition holds)."""
+    def progress(self, stage: str, share: float, progress: Progress | None = None, /) -> None:
+        """Call the progress callback in a fit without checkpoints (Interrupted: the stop condition holds)."""
         self.on_progress(stage, share, progress)
         if self.stop():
             raise self.interrupted(f"in {stage}")

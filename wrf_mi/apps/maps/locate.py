@@ -167,8 +167,8 @@ def locate(
     session = Session(run.folder, run.folder, on_progress, stop)
     try:
         fitted = run.fitted.tracing_once()
-        report = partial(session.report, f"predicting {len(candidates.positions_m)} candidates")
-        predicted = predict_candidates(fitted, np.arange(len(observed)), headings_of(run), candidates, report)
+        progress = partial(session.progress, f"predicting {len(candidates.positions_m)} candidates")
+        predicted = predict_candidates(fitted, np.arange(len(observed)), headings_of(run), candidates, progress)
         calibration = calibration_of(run, fitted, candidates, session)
     except InputError as error:
         raise InputError(f"{run.folder}: {error}") from None
@@ -194,7 +194,7 @@ def locate(
         best, radius[number], inside[number] = region_of(probabilities, candidates.distance_m, *masses)
         probability[number] = probabilities
         estimate[number, :2], at_border[number] = candidates.positions_m[best, :2], candidates.at_border[best]
-        session.report("locating", (number + 1) / m)
+        session.progress("locating", (number + 1) / m)
     area = inside.sum(axis=1) * candidates.cell_m2
     of_regions = estimate, radius, area, probability, inside, near_m, level, masses, candidates, calibration
     return LocatedPositions(*of_regions, at_border, int(candidates.outside(record.tx_pos_m[rows]).sum()))

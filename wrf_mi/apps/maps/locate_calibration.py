@@ -82,7 +82,7 @@ class Calibration:
 
 
 def predict_candidates(
-    fitted: Fitted, receivers: IntArray, headings: int, candidates: Candidates, report: Callable[[float], None]
+    fitted: Fitted, receivers: IntArray, headings: int, candidates: Candidates, progress: Callable[[float], None]
 ) -> NDArray[np.float32]:
     """Means in dBm and standard deviations in dB [2, headings, n_rx, p] of a fitted model at the candidates.
 
@@ -91,7 +91,7 @@ def predict_candidates(
     """
     positions = candidates.positions_m
     predicted = np.empty((2, headings, len(receivers), len(positions)), np.float32)
-    report(0.0)
+    progress(0.0)
     # Positions in the outer loop: a chunk's paths to all receivers are traced together and bound the memory.
     for part in slices(len(positions), TOGETHER):
         for number in range(headings):
@@ -103,7 +103,7 @@ def predict_candidates(
                 if prediction.std is None:
                     raise InputError("its model states no standard deviation; train it with --intervals")
                 predicted[:, number, place, part] = prediction.mean, prediction.std
-        report(part.stop / len(positions))
+        progress(part.stop / len(positions))
     return predicted
 
 
@@ -148,17 +148,17 @@ def calibration_of(run: Run, fitted: Fitted, candidates: Candidates, session: Se
     parts, most = [], max(1, MOST_ROWS // len(folds))
     for number, fold in enumerate(folds):
 
-        def report(share: float, number: int = number) -> None:
-            session.report(f"calibrating by {len(folds)} folds", (number + share) / len(folds))
+        def progress(share: float, number: int = number) -> None:
+            session.progress(f"calibrating by {len(folds)} folds", (number + share) / len(folds))
 
-        report(0.0)
+        progress(0.0)
         folder = run.folder / FOLDER / f"fold{number}"
-        receivers, predicted = _predicted_fold(run, fitted, fold, folder, candidates, session, report)
+        receivers, predicted = _predicted_fold(run, fitted, fold, folder, candidates, session, progress)
         test = fold.test[np.isfinite(record.observation[receivers][:, fold.test]).any(axis=0)]
         test = np.sort(np.random.default_rng([run.problem.seed, 11]).permutation(test)[:most])
         near_m = neighbours.locate(record, fold.all_train, np.asarray(record.observation[:, test], float))
         parts.append(Located(predicted, receivers, test, candidates.nearest(record.tx_pos_m[test]), near_m))
-    chosen = choose(record, parts, candidates, lambda share: session.report("choosing the likelihood", share))
+    chosen = choose(record, parts, candidates, lambda share: session.progress("choosing the likelihood", share))
     chosen = replace(chosen, neighbours=neighbours, folds=words)
     write_atomically(file, json.dumps({"key": key, **asdict(chosen)}, indent=1) + "\n")
     shutil.rmtree(run.folder / FOLDER, ignore_errors=True)
@@ -172,7 +172,7 @@ def _predicted_fold(
     folder: Path,
     candidates: Candidates,
     session: Session,
-    report: Callable[[float], None],
+    progress: Callable[[float], None],
 ) -> tuple[IntArray, NDArray[np.float32]]:
     """Receivers of a fold and predictions at the candidates by a model fitted to it; a finished fit is read.
 
@@ -181,17 +181,17 @@ def _predicted_fold(
     record = run.problem.record
     if (refit := fitted.refit(record, fold.all_train)) is not None:
         numbers, _ = fitted_receivers(record, [fold])
-        return numbers, predict_candidates(refit, numbers, headings_of(run), candidates, report)
+        return numbers, predict_candidates(refit, numbers, headings_of(run), candidates, progress)
     file = folder.with_suffix(".npz")
     arrays = stored_arrays(file) if file.exists() else {}
     if "predicted" not in arrays or arrays["positions_m"].shape != candidates.positions_m.shape:
         folder.mkdir(parents=True, exist_ok=True)  # with the files of a stopped fit, if any
         # One line for all folds: a fit may have twenty stages.
-        inner = replace(session, folder=folder, run=folder, on_progress=lambda *_: report(0.0))
+        inner = replace(session, folder=folder, run=folder, on_progress=lambda *_: progress(0.0))
         with threadpool_limits(1, "blas"):
             of_fold, numbers = fit_fold(run.model, run.problem, fold, inner)
             places = np.arange(len(numbers))
-            predicted = predict_candidates(of_fold.tracing_once(), places, headings_of(run), candidates, report)
+            predicted = predict_candidates(of_fold.tracing_once(), places, headings_of(run), candidates, progress)
         arrays = {"predicted": predicted, "positions_m": candidates.positions_m, "receivers": numbers}
         write_arrays(file, arrays)
         shutil.rmtree(folder)
@@ -224,7 +224,7 @@ def folds_of(record: Record, split: Split) -> tuple[list[Split], Neighbours, str
 
 
 def choose(
-    record: Record, parts: Sequence[Located], candidates: Candidates, report: Callable[[float], None]
+    record: Record, parts: Sequence[Located], candidates: Candidates, progress: Callable[[float], None]
 ) -> Calibration:
     """The posterior with the best score on held-out rows, and their ranks.
 
@@ -233,7 +233,7 @@ def choose(
     tried = []
     for number, scale in enumerate(SCALES):
         tried.append(np.concatenate([_scores(record, part, Likelihood(scale), candidates) for part in parts]))
-        report((number + 1) / len(SCALES))
+        progress((number + 1) / len(SCALES))
     scores = {f"{scale:g} standard deviations": float(each.mean()) for scale, each in zip(SCALES, tried, strict=True)}
     return _with_neighbours(record, parts, candidates, Likelihood(widest(SCALES, tried)), scores)
 

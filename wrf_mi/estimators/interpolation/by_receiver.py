@@ -213,15 +213,17 @@ class ByReceiverModel(Model):
                     continue
                 done, name = len(models), receiver.name
 
-                def report(
+                def progress(
                     stage: str, share: float, _: object = None, /, *, done: int = done, name: str = name
                 ) -> None:
-                    session.report(f"{name}: {stage}", (done + share) / enough.size)
+                    session.progress(f"{name}: {stage}", (done + share) / enough.size)
 
-                rows_of = ReceiverRows(problem, split, receiver, record.tx_pos_m[part], observed[part], turned, report)
+                rows_of = ReceiverRows(
+                    problem, split, receiver, record.tx_pos_m[part], observed[part], turned, progress
+                )
                 try:
                     models.append(self.fit_single(rows_of))
                 except InputError as error:
                     raise InputError(f"{record.name}, receiver {name}: {error}") from None
-                session.report(f"{self.name}: receivers", len(models) / enough.size)
+                session.progress(f"{self.name}: receivers", len(models) / enough.size)
         return self.fitted(self.name, models, headings is not None, carriers)

@@ -113,9 +113,9 @@ class LinearModel(UplinkModel):
         if not len(validation):
             picked = np.arange(len(train)) % JUDGES == 0
             train, validation = train[~picked], train[picked]
-        penalty = settings.penalty or choose(record, train, validation, session.report)
+        penalty = settings.penalty or choose(record, train, validation, session.progress)
         matrix = ridge(record, all_train)(penalty)
-        session.report(f"linear: penalty {penalty:.2g}", 1.0)
+        session.progress(f"linear: penalty {penalty:.2g}", 1.0)
         return LinearMap(matrix, record.observation.shape[2], penalty)
 
 

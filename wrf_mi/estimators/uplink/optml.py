@@ -262,9 +262,9 @@ class OptMLModel(R2F2Model):
     def fit(self, problem: Problem, split: Split, session: FitSession) -> OptML:
         """Choose the wave model on validation rows, then learn maps of the paths of simulated channels."""
         settings: OptMLSettings = problem.settings
-        kind, bands = choose(self.known_rows(problem.record, split), problem.record, settings, session.report)
+        kind, bands = choose(self.known_rows(problem.record, split), problem.record, settings, session.progress)
         waves = waves_of(kind, bands, settings.max_distance_m)
-        session.report("simulating channels", 0.0)
+        session.progress("simulating channels", 0.0)
         rng = np.random.default_rng(problem.seed)
         filtered, truth = simulate(waves, settings.simulation, bands, rng)
         channels, cells = filtered.shape[1:]

@@ -276,7 +276,7 @@ class R2F2Model(UplinkModel):
     def fit(self, problem: Problem, split: Split, session: FitSession) -> R2F2:
         """Choose the wave model and, where frequencies are unknown, the bands."""
         settings, rows = problem.settings, self.known_rows(problem.record, split)
-        kind, bands = choose(rows, problem.record, settings, session.report, directions=problem.scene is not None)
+        kind, bands = choose(rows, problem.record, settings, session.progress, directions=problem.scene is not None)
         return R2F2(problem, kind, bands, settings)
 
 
