@@ -222,12 +222,12 @@ def test_reports_of_held_out_rows_are_those_of_a_fit_without_them() -> None:
     reports = HeldOutReports(np.array([0, 0, 1]), rows, report)
     told = dict.fromkeys(("receivers", "uses_heading", "carriers_hz", "run_sd_db"))
     graph: Any = SimpleNamespace(**told, traces=True, held_out=reports)
-    side = paths.FittedPaths(graph, None)
-    assert side.predict_rows(np.array([3, 7]), 0) is None, "a fit to all rows has other predictions"
-    side.reports = reports
-    np.testing.assert_array_equal(side.predict_rows(np.array([3, 7]), 0).mean, [1, 0])
-    assert side.predict_rows(np.array([3, 5]), 0) is None
-    assert side.predict_rows(np.array([3, 8]), 0) is None
+    scene_model = paths.FittedPaths(graph, None)
+    assert scene_model.predict_rows(np.array([3, 7]), 0) is None, "a fit to all rows has other predictions"
+    scene_model.reports = reports
+    np.testing.assert_array_equal(scene_model.predict_rows(np.array([3, 7]), 0).mean, [1, 0])
+    assert scene_model.predict_rows(np.array([3, 5]), 0) is None
+    assert scene_model.predict_rows(np.array([3, 8]), 0) is None
 
 
 @pytest.mark.parametrize("task", ["rssi", "csi"])

@@ -1,4 +1,4 @@
-"""A fitted mixture of models: weighted predictions of its parts and kriging of what the scene's side leaves."""
+"""A fitted mixture of models: weighted predictions of its parts and kriging of what the scene model leaves."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from ..estimators.model import (
 from ..estimators.reception import Reception
 from ..training.by_distance import LEAST, Intervals, Mixture, expected_size
 from ..training.selection import RowDistance, rows_at_receiver
-from .side import FittedInScene, by_stage
+from .scene_model import FittedInScene, by_stage
 
 LEAST_RESIDUALS = 3  # fewest rows of a receiver whose residuals are interpolated
 TrainingResiduals = Mapping[int, tuple[IntArray, NDArray[Any]]]
@@ -55,7 +55,7 @@ def _training_rows(record: Record, split: Split, receiver: int) -> IntArray:
 
 @dataclass(frozen=True)
 class Residuals:
-    """Kriging of what the scene's side leaves at the training rows."""
+    """Kriging of what the scene model leaves at the training rows."""
 
     by_receiver: Mapping[int, Kriged]  # interpolation of each receiver that has enough rows, by its number
 
@@ -122,8 +122,8 @@ class FittedMixture(Fitted):
     problem: Problem = field(metadata=NOT_STORED)  # problem of the fit
     known: IntArray  # training rows that determine distances [n]
     parts: dict[str, Fitted] = field(metadata=NOT_STORED)  # fitted parts with a weight, by name
-    mixture: Mixture  # weights of these parts, and, if there are residuals, of the scene's side with them as the last
-    residuals: Residuals | None  # what the scene's side leaves; None: it has no weight
+    mixture: Mixture  # weights of these parts, and, if there are residuals, of the scene model with them as the last
+    residuals: Residuals | None  # what the scene model leaves; None: it has no weight
     intervals: Intervals | None  # standard deviations; None: none are stated
     deviations: tuple[str, ...]  # parts whose deviations are the sizes of expected errors; none: `expected_size`
     stated: dict[str, Any]  # further entries of ``metrics.json``
@@ -235,7 +235,7 @@ class FittedMixture(Fitted):
         predict: Callable[[Fitted, IntArray, bool], Decomposition],
         std: bool,
     ) -> Decomposition:
-        """Weighted mean of the parts and the residuals, of the deviations that parts state, and both sides of it."""
+        """Weighted mean of the parts and the residuals, of the deviations that parts state, and its components."""
         observed, m = self.problem.record.observation, len(tx_pos_m)
         shape, kind = observed.shape[2:], np.result_type(observed, np.float64)
         weights = self.weights(distance_m)
@@ -243,26 +243,26 @@ class FittedMixture(Fitted):
         of_parts = weights[:, : len(self.parts)]
         # A part may state the deviations of a mixture in which it has no weight.
         of_std = deviation_weights(of_parts, self._states) * std
-        sides, totals = np.zeros((2, m, *shape), kind), np.zeros((2, m))
+        components, totals = np.zeros((2, m, *shape), kind), np.zeros((2, m))
         paths, (size, size_of_mean) = None, np.zeros((2, m, *shape))
         for (name, part), weight, std_weight in zip(self.parts.items(), of_parts.T, of_std.T, strict=True):
-            # Residuals are about the scene's side, which is therefore a part of what they predict.
+            # Residuals are about the scene model, which is therefore a part of what they predict.
             share = weight + residual_weight if name == PATHS else weight
             rows = np.flatnonzero(share + std_weight)
             count("rows of parts", len(rows), len(share) - len(rows))
             if not len(rows):
                 continue
             by_part = predict(part, rows, bool(std_weight.any()))
-            side = int(name in TRACED)
-            sides[side, rows] += _spread(share[rows], shape) * by_part.prediction.mean
-            totals[side, rows] += share[rows]
+            component = int(name in TRACED)
+            components[component, rows] += _spread(share[rows], shape) * by_part.prediction.mean
+            totals[component, rows] += share[rows]
             if std_weight.any():
                 size[rows] += _spread(std_weight[rows], shape) * by_part.prediction.stated_std
                 # NaN of a part that does not state it.
                 of_mean = by_part.prediction.std_mean
                 size_of_mean[rows] += _spread(std_weight[rows], shape) * (np.nan if of_mean is None else of_mean)
             paths = paths or (by_part.paths and by_part.paths.placed(rows, m))
-        mean = sides.sum(axis=0)
+        mean = components.sum(axis=0)
         rows = np.flatnonzero(residual_weight)
         if len(rows) and self.residuals is not None:
             residual = self.residuals(tx_pos_m[rows], receiver, shape)
@@ -274,7 +274,7 @@ class FittedMixture(Fitted):
         if not totals.any(axis=1).all():
             return Decomposition(prediction, paths=paths)
         with np.errstate(divide="ignore", invalid="ignore"):
-            learned, traced = (values / _spread(total, shape) for values, total in zip(sides, totals, strict=True))
+            learned, traced = (values / _spread(total, shape) for values, total in zip(components, totals, strict=True))
         return Decomposition(prediction, traced, learned, paths)
 
     @property
@@ -320,11 +320,13 @@ class FittedMixture(Fitted):
 
     def by_stage(self, split: Split) -> dict[str, PredictAll]:
         """Predictions of the stages up to each but the last."""
-        side, used = (
+        scene_model, used = (
             self.parts.get(PATHS),
             [report["stage"] for report in self.stated.get("stages", []) if report["kept"]],
         )
-        return by_stage(self.problem, split, side, used) if isinstance(side, FittedInScene) and used else {}
+        return (
+            by_stage(self.problem, split, scene_model, used) if isinstance(scene_model, FittedInScene) and used else {}
+        )
 
     def facts(self) -> dict[str, Any]:
         """Entries of ``metrics.json``, and those of the reception."""

@@ -19,7 +19,7 @@ from ..estimators.model import Arrays, Fitted, Model, PredictAll, Problem, Sessi
 from .engine import Engine
 from .fitted import FittedMixture
 from .scene import StageReport, stated_reports
-from .side import at_all_receivers
+from .scene_model import at_all_receivers
 from .stage import Option, Stage, State
 
 FURTHER = "further"  # array of the names of such stages in their order, and beginning of the names of their arrays

@@ -41,7 +41,7 @@ from .further import FURTHER_STAGES, first_of, fit_further, load_further
 from .mixture import MixtureFit, Part
 from .paths import TracedPaths
 from .scene import FAST, FIELD, MEAN, RESIDUAL, STAGES, SURFACES, StageReport, inside, stated_reports
-from .side import FittedInScene
+from .scene_model import FittedInScene
 from .strengths import TracedStrengths
 
 logger = logging.getLogger(__name__)
@@ -79,8 +79,8 @@ class HybridSettings(CheckedSettings):
         return tuple(stage.strip() for stage in self.stages.split(","))
 
 
-def scene_side(record: Record) -> Model:
-    """Entry of the scene's side; a map of strengths is traced at one carrier."""
+def scene_model(record: Record) -> Model:
+    """Entry of the scene model; a map of strengths is traced at one carrier."""
     return TracedStrengths() if record.task.kriged_about_paths and record.frequencies_hz is not None else TracedPaths()
 
 
@@ -91,7 +91,7 @@ def _stages_of(problem: Problem) -> dict[str, str]:
         return dict.fromkeys(set(STAGES) - {MEAN, RESIDUAL}, "data with an uplink have mean and residual alone")
     if problem.scene is None:
         return dict.fromkeys(set(STAGES) - {FIELD, RESIDUAL}, "it is of a scene; give --scene")
-    if isinstance(scene_side(record), TracedStrengths):
+    if isinstance(scene_model(record), TracedStrengths):
         return {SURFACES: "strengths are kriged about the local mean of traced power"}
     return {}
 
@@ -120,7 +120,7 @@ def _means(problem: Problem) -> list[tuple[str, bool]]:
         # The graph of paths has a field itself; beside kriged strengths it is a part of its own, which takes minutes.
         if not with_scene:
             means.append((FIELD, False))
-        elif isinstance(scene_side(problem.record), TracedStrengths):
+        elif isinstance(scene_model(problem.record), TracedStrengths):
             means.append((FIELD_IN_SCENE, True))
     return means
 
@@ -128,7 +128,7 @@ def _means(problem: Problem) -> list[tuple[str, bool]]:
 def _part(problem: Problem, name: str, scene: bool) -> tuple[Model, Problem]:
     """Entry and problem of a part, with or without the scene."""
     if name == PATHS:
-        return scene_side(problem.record), problem
+        return scene_model(problem.record), problem
     model = {FIELD: "wrf-gs+", FIELD_IN_SCENE: "wrf-gs+", "r2f2-scene": "r2f2"}.get(name, name)
     entry = MODELS[model].serving(problem.record.task.name, scene)
     arguments = {"model": model, "seed": problem.seed, "deterministic": problem.settings.deterministic}
@@ -164,13 +164,13 @@ def _fitted(problem: Problem, split: Split, session: Session) -> FittedMixture:
     reports, residuals = list[StageReport](), None
     for name in parts:
         fit.predict_held_out(name)
-        side = fit.fitted.get(name)
-        if isinstance(side, FittedInScene):
-            reports += side.stages
+        fitted_part = fit.fitted.get(name)
+        if isinstance(fitted_part, FittedInScene):
+            reports += fitted_part.stages
             begun = time.perf_counter()  # of the stage residual
-            if side.with_residuals is not None and fit.rows is not None:
-                fit.predictions[RESIDUAL] = HeldOutPrediction(side.with_residuals)
-                left = training_residuals(side, problem.record, split)
+            if fitted_part.with_residuals is not None and fit.rows is not None:
+                fit.predictions[RESIDUAL] = HeldOutPrediction(fitted_part.with_residuals)
+                left = training_residuals(fitted_part, problem.record, split)
                 residuals = Residuals.of(left, problem.record, split, problem.seed)
     chosen = fit.weights()
     used, scores = fit.used(chosen), fit.scores(chosen)
@@ -247,7 +247,7 @@ class Hybrid(Model):
         trained = [name for name, _ in means if name != PATHS or SURFACES not in idle]
         if not {*trained} & {PATHS, FIELD, FIELD_IN_SCENE}:
             unused["steps"] = "no stage is trained step by step"
-        if (PATHS, True) not in means or not isinstance(scene_side(problem.record), TracedStrengths):
+        if (PATHS, True) not in means or not isinstance(scene_model(problem.record), TracedStrengths):
             unused["search_seconds"] = "no signal strengths are traced in a scene"
         return unused
 

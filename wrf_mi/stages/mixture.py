@@ -131,7 +131,7 @@ class MixtureFit:
         return {name: (1 if higher else -1) * float(self._score(each, every).mean()) for name, each in weights.items()}
 
     def used(self, chosen: ChosenWeights) -> list[str]:
-        """Names of predictions with a weight, the residuals as the last and with the scene's side they are about."""
+        """Names of predictions with a weight, the residuals as the last and with the scene model they are about."""
         largest = chosen.mixture.weights.max(axis=0)
         used = [name for name, most in zip(self.names, largest, strict=True) if most >= NEGLIGIBLE]
         if RESIDUAL in used:
@@ -144,7 +144,7 @@ class MixtureFit:
 
         Args:
             chosen: weights.
-            residuals: what the scene's side leaves, if that has a weight.
+            residuals: what the scene model leaves, if that has a weight.
             stated: entries of ``metrics.json``, to which the sizes of expected errors are added.
         """
         used, trained_rows = self.used(chosen), self._problem.rows(self._split)

@@ -42,7 +42,7 @@ from .scene import (
     scene_reports,
     too_few,
 )
-from .side import FittedInScene
+from .scene_model import FittedInScene
 from .stage import Option, Stage, State
 
 AS_TRACED, CALIBRATED, TRAINED = "as traced", "calibrated", "trained"
@@ -72,7 +72,7 @@ def config_of(problem: Problem, split: Split, few: bool) -> TrainConfig:
 
 
 class FittedPaths(FittedInScene):
-    """The scene's side: a graph of paths, Gaussians on surfaces and those of a field.
+    """Scene model: a graph of paths, Gaussians on surfaces and those of a field.
 
     ``reports`` are those of the held-out rows by a fit to the others, None of a fit to all rows.
     """
@@ -162,9 +162,9 @@ class PathsStage(Stage):
         rows = replace(split, train=split.all_train, validation=fold.test, test=fold.test[:0])
         inner = replace(problem, settings=config_of(problem, rows, False), checked=[])
         graph, trainer = WRF_GS_PLUS.train_part(before and before.trainer, inner, rows, session)
-        kept, side = {**state.kept, self.name: _Training(trainer, problem)}, FittedPaths(graph, problem)
-        side.reports = graph.held_out
-        return replace(state, problem=problem, fitted=side, kept=kept)
+        kept, scene_model = {**state.kept, self.name: _Training(trainer, problem)}, FittedPaths(graph, problem)
+        scene_model.reports = graph.held_out
+        return replace(state, problem=problem, fitted=scene_model, kept=kept)
 
     def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
         """The training goes on from the chosen state with all rows."""
@@ -191,7 +191,7 @@ def _named(name: str, in_stated: bool) -> str:
 
 
 class TracedPaths(Model):
-    """The scene's side for spectra and channels: no name of the registry."""
+    """Scene model of spectra and channels: no name of the registry."""
 
     name, source, settings = "paths", WRF_GS_PLUS.source, object
     tasks, gaps = WRF_GS_PLUS.tasks, WRF_GS_PLUS.gaps
@@ -206,23 +206,27 @@ class TracedPaths(Model):
         """
         engine = Engine(self, (SceneStage(), PathsStage()), problem, split, session)
         state = engine.fit()
-        side = state.fitted
-        assert isinstance(side, FittedPaths)
-        side.problem, side.unseen, side.options = state.problem, engine.unseen, engine.stated_reports()
-        side.stages = tuple(_reports(engine, side.fitted, problem.record.task.higher_is_better))
+        scene_model = state.fitted
+        assert isinstance(scene_model, FittedPaths)
+        scene_model.problem, scene_model.unseen, scene_model.options = (
+            state.problem,
+            engine.unseen,
+            engine.stated_reports(),
+        )
+        scene_model.stages = tuple(_reports(engine, scene_model.fitted, problem.record.task.higher_is_better))
         # Reports of other carriers have residuals of their own.
         if RESIDUAL in problem.settings.wanted and problem.record.carriers_hz is None:
-            side.with_residuals = engine.of_fold("with-residuals", partial(_with_residuals, problem))
+            scene_model.with_residuals = engine.of_fold("with-residuals", partial(_with_residuals, problem))
         del engine, state  # with the trainings of the options
         release_memory()
-        return side
+        return scene_model
 
     def selects(self, problem: Problem, splits: Sequence[Split]) -> bool:
         """By held-out rows."""
         return True
 
     def load(self, arrays: Arrays, problem: Problem, folder: Path) -> FittedPaths:
-        """The scene's side that was fitted in a folder."""
+        """The scene model that was fitted in a folder."""
         inner = in_scene(problem, folder)
         return FittedPaths(from_arrays(FittedField, arrays, problem=inner, folder=folder), inner)
 

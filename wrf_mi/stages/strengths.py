@@ -1,4 +1,4 @@
-"""The scene's side for signal strengths: kriging about the power traced in the stated or the calibrated scene.
+"""Scene model of signal strengths: kriging about the power traced in the stated or the calibrated scene.
 
 For a transmitter whose position is known to a decimetre, ray tracing gives the mean over some wavelengths: single
 paths, and Gaussians that change them, say nothing of the fading about it. So the stages surfaces and field are not
@@ -35,7 +35,7 @@ from .kriging import StrengthKriging
 from .residual import StrengthResidual
 from .runs import Runs
 from .scene import MEAN, SceneStage, StageReport, in_scene, scene_reports
-from .side import FittedInScene, some_rows
+from .scene_model import FittedInScene, some_rows
 from .stage import Option, Stage, State
 
 SPACING_M, SMOOTH_M = 0.25, 0.3
@@ -49,7 +49,7 @@ DIRECT, LOCAL, EXACT = "direct", "local", "exact"
 
 
 class FittedStrengths(FittedInScene):
-    """The scene's side for strengths: kriging about traced power."""
+    """Scene model of strengths: kriging about traced power."""
 
     fitted: Strengths
 
@@ -75,7 +75,7 @@ class FittedStrengths(FittedInScene):
     def _power(self, problem: Problem) -> Traced:
         """Power in a problem's scene, of the kind of the fit's mean."""
         mean = self.fitted.field.prior.traced
-        assert mean is not None, "the scene's side is about traced power"
+        assert mean is not None, "the scene model is about traced power"
         return _mean(problem, EXACT if mean.exact else LOCAL if mean.reflections else DIRECT)
 
     def refit(self, record: Record, rows: IntArray) -> FittedStrengths:
@@ -127,7 +127,7 @@ def affordable(problem: Problem) -> bool:
 
 
 class TracedStrengths(Model):
-    """The scene's side for strengths: no name of the registry."""
+    """Scene model of strengths: no name of the registry."""
 
     name, source, settings = "strengths", StrengthKriging.source, object
     tasks, gaps = ("rssi",), StrengthKriging.gaps

@@ -1,4 +1,4 @@
-"""A scene's side of a fit in stages: a model fitted in the scene that the measurements have edited."""
+"""Scene model of a fit in stages, fitted in the scene that the measurements have edited."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class FittedInScene(Fitted):
     """A part of the hybrid that predicts from the scene, by a model fitted in it.
 
     ``problem`` is the hybrid's with that scene, ``stages`` are reports of those that were tried, none after loading;
-    ``with_residuals`` [q, ...] are predictions of the held-out rows with what the side leaves of the others, None where
-    none were asked for.
+    ``with_residuals`` [q, ...] are predictions of the held-out rows with what the scene model leaves of the others,
+    None where none were asked for.
     """
 
     with_residuals: NDArray[Any] | None = None
@@ -85,25 +85,27 @@ class FittedInScene(Fitted):
         return self.fitted.arrays()
 
 
-def by_stage(problem: Problem, split: Split, side: FittedInScene, used: Collection[str]) -> dict[str, PredictAll]:
-    """Predictions of the stages up to each but the last, of the ``used`` ones of a fitted scene's side.
+def by_stage(
+    problem: Problem, split: Split, scene_model: FittedInScene, used: Collection[str]
+) -> dict[str, PredictAll]:
+    """Predictions of the stages up to each but the last, of the ``used`` ones of a fitted scene model.
 
     The problem has the scene as it is stated; training rows of the split fit offsets of traced signal strengths.
     """
     predictions: dict[str, PredictAll] = {}
     earlier = [stage for stage in STAGES if stage in used][:-1]
     if MEAN in earlier:
-        predictions[MEAN] = side.traced(problem, split)
-    if side.problem.scene != problem.scene:
+        predictions[MEAN] = scene_model.traced(problem, split)
+    if scene_model.problem.scene != problem.scene:
         stages = [stage for stage in (CALIBRATION, CORRECTED) if stage in earlier]
-        predictions |= {stage: side.traced(side.problem, split) for stage in stages}
-    field, count = side.fitted, len(problem.record.receivers)
+        predictions |= {stage: scene_model.traced(scene_model.problem, split) for stage in stages}
+    field, count = scene_model.fitted, len(problem.record.receivers)
     if isinstance(field, FittedField):
         if SURFACES in earlier:
-            fitted = field.without_gaussians() if FIELD in used else side
+            fitted = field.without_gaussians() if FIELD in used else scene_model
             predictions[SURFACES] = partial(at_all_receivers, fitted, count)
         if FIELD in earlier:
-            predictions[FIELD] = partial(at_all_receivers, side, count)
+            predictions[FIELD] = partial(at_all_receivers, scene_model, count)
     return predictions
 
 
