@@ -1,4 +1,4 @@
-"""Plane waves that leave transmitters in a cone around the line of sight, and what an array reports of them."""
+"""Plane waves that leave transmitters in a cone around the line of sight, and what an array observes of them."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from wrf_mi.core import Receiver, Record
 from wrf_mi.core.angles import fibonacci_sphere
 from wrf_mi.core.arrays import planar_array
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
-from wrf_mi.receivers.reports import minmax_scale
+from wrf_mi.receivers.scaling import minmax_scale
 
 FREQUENCY_HZ = 920e6
 WAVELENGTH_M = speed_of_light / FREQUENCY_HZ

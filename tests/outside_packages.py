@@ -172,7 +172,7 @@ from wrf_mi.stages.stage import Option
 
 @dataclass
 class InSteps(Further):
-    \"\"\"Strengths of an instrument that reports multiples of a step.\"\"\"
+    \"\"\"Strengths of an instrument that observes multiples of a step.\"\"\"
 
     stage = "steps"
     step_db: float

@@ -48,7 +48,7 @@ def main(folder, out, backend):
     dr.enable_grad(params)
     batch = trainer.config.batch
     tx, truth, _ = data.select(mi.UInt32(trainer.plan.split.train[:batch].tolist()), mi.UInt32(0), plane.pixels)
-    image = trainer.graph.report(0, None)(params, Batch(tx, None, None, pose, plane))
+    image = trainer.graph.observation(0, None)(params, Batch(tx, None, None, pose, plane))
     dr.backward(spectrum_loss(image, truth, batch, plane.height, plane.width, trainer.config.loss.ssim_weight)[0])
     gradients = {name: dr.grad(value).numpy() for name, value in params.items()}
     np.savez(out, image=dr.detach(image).numpy(), **gradients)

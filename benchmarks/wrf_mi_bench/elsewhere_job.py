@@ -55,7 +55,7 @@ def main(file: str, backend: str, threads: str, small: str) -> None:
     data = TrainingData(to_tensor(spectra.tx_pos_m.T), to_float(spectra.observation), to_float([1.0]))
     batch = config.batch
     tx, truth, _ = data.select(mi.UInt32(split.train[:batch].tolist()), mi.UInt32(0), plane.pixels)
-    shown = trainer.graph.report(0, None)(params, Batch(tx, None, None, pose, plane))
+    shown = trainer.graph.observation(0, None)(params, Batch(tx, None, None, pose, plane))
     dr.backward(spectrum_loss(shown, truth, batch, plane.height, plane.width, config.loss.ssim_weight)[0])
     arrays |= {f"gradient/{name}": dr.grad(value).numpy() for name, value in params.items()}
     if backend == "llvm":

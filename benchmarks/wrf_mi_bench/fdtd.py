@@ -186,7 +186,7 @@ class Twin:
     def vector(self, logarithms: FloatArray) -> FloatArray:
         """Vector of the misfit with one material of both walls: logarithms of permittivity - 1 and conductivity."""
         vector = self.misfit.start.copy()
-        for slab, name in enumerate(self.misfit.sides[0].slabs.names):
+        for slab, name in enumerate(self.misfit.traced_fields[0].slabs.names):
             if name.startswith(WALLS):
                 vector[material_places(self.misfit, slab)[:2]] = logarithms
         return vector

@@ -98,7 +98,7 @@ def _batch() -> tuple[Call, Call]:
     dr.eval(params)
 
     def spectra(params: Any, tx_pos: Any, pose: Any, plane: Any) -> Any:
-        return trainer.graph.report(0, None)(params, Batch(tx_pos, None, None, pose, plane))
+        return trainer.graph.observation(0, None)(params, Batch(tx_pos, None, None, pose, plane))
 
     together, alone = Recorded(spectra), Recorded(spectra)
 
@@ -143,21 +143,21 @@ def _alone() -> tuple[Call, Call]:
     )
     trainer = Trainer(room_record, split, config, scene=open_scene("laboratory", FREQUENCY_HZ))
     graph, targets, batch = trainer.graph, trainer.plan.targets, trainer.schedule.rows[0]
-    side = graph.trace(room_record.tx_pos_m, 0)[0]
-    assert side is not None
+    traced_field = graph.trace(room_record.tx_pos_m, 0)[0]
+    assert traced_field is not None
     adam = Adam(lr=0.05, params={name: to_tensor(value) for name, value in trainer.state.params().items()})
     names, model, size = list(adam), graph.models[0], targets.observed.shape[2:]
     loss_of = partial(trainer.plan.task.loss, ssim_weight=config.loss.ssim_weight)
 
     def step(adam: Any, data: TrainingData, rows: Any, receiver: Any) -> Any:
         truth = data.select(rows, receiver, HEIGHT * WIDTH)[1]
-        loss = loss_of(model(side({name: adam[name] for name in names}, rows), None), truth, len(batch), *size)
+        loss = loss_of(model(traced_field({name: adam[name] for name in names}, rows), None), truth, len(batch), *size)
         dr.backward(loss)
         adam.step(eval=False)
         dr.eval(adam, loss)
         return dr.detach(loss)
 
-    recorded = Recorded(step, lambda: graph.arrays(0, side))
+    recorded = Recorded(step, lambda: graph.arrays(0, traced_field))
     data = TrainingData.of(targets)
     rows, receiver = on_device(batch, mi.UInt32), dr.opaque(mi.UInt32, 0)
 

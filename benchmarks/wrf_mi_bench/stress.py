@@ -1,10 +1,10 @@
 """Numerical stress test of fields of Gaussians: float32 against float64, values and derivatives, ill-conditioned cases.
 
-Images by splatting and by the Mitsuba plugin are compared with `truth` in NumPy, reports of receivers with those of the
-same receivers in float64 for the true field, and derivatives with those of the same code in float64. Pixels on the edge
-of a footprint are left out of images, and zero in fields that receivers report. The error of a single sum over
-directions (RSSI, CSI) is relative to the sum of magnitudes, as waves may cancel; that of images and spectra to their
-norm. Losses, sums of paths, paths and Gaussians together, and fits from bad starts are stressed in the tests.
+Images by splatting and by the Mitsuba plugin are compared with `truth` in NumPy, observations of receivers with those
+of the same receivers in float64 for the true field, and derivatives with those of the same code in float64. Pixels on
+the edge of a footprint are left out of images, and zero in fields that receivers observe. The error of a single sum
+over directions (RSSI, CSI) is relative to the sum of magnitudes, as waves may cancel; that of images and spectra to
+their norm. Losses, sums of paths, paths and Gaussians together, and fits from bad starts are stressed in the tests.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -38,7 +38,7 @@ from .stress_fields import (
     SIZE,
     SMALL,
     Family,
-    Report,
+    Observe,
     Size,
     StressField,
     cases,
@@ -118,13 +118,13 @@ def image_row(
 
 
 def gradient_row(
-    what: str, tried: Iterable[tuple[str, StressField, str, int]], report: Report = splatted, least: int = 1
+    what: str, tried: Iterable[tuple[str, StressField, str, int]], observe: Observe = splatted, least: int = 1
 ) -> Row:
-    """Row of derivatives of a report in float32, compared with float64; fields of ``least`` Gaussians or more."""
+    """Row of derivatives of an observation in float32, compared with float64; fields of ``least`` Gaussians or more."""
     worst, number = Worst(), 0
     for name, field, blending, seed in tried:
         if len(field.signal) >= least:
-            single, double = (gradient(field, blending, kind, seed, report) for kind in (mi.Float, DOUBLE))
+            single, double = (gradient(field, blending, kind, seed, observe) for kind in (mi.Float, DOUBLE))
             for group, error in gradient_errors(single, double, felt_values(field, blending)):
                 worst.add(error, f"{group}, {name}")
             number += 1
@@ -149,7 +149,7 @@ def _random(rng: np.random.Generator) -> StressField:
 
 
 def receivers(random: int, of_each: int, families: Iterable[str] = tuple(FAMILIES)) -> list[Row]:
-    """Rows of the reports of `MODELS` of ``random`` random fields and ``of_each`` fields of each hard family."""
+    """Rows of the observations of `MODELS` of ``random`` random fields and ``of_each`` fields of each hard family."""
     worst, number = {what: Worst() for what in MODELS}, 0
     for family in families:
         for name, field, blending, _ in cases({family: FAMILIES[family]}, random if family == "random" else of_each):
@@ -164,36 +164,36 @@ def receivers(random: int, of_each: int, families: Iterable[str] = tuple(FAMILIE
                 part = dr.arange(mi.UInt32, count)
                 single = model(None, tuple(dr.gather(mi.Float, side * mask, part) for side in field_on_sphere))
                 double = model(None, tuple(to_device(side[:count].copy(), DOUBLE) for side in expected))
-                error = report_error(model, single.numpy().astype(float), double.numpy(), waves)
+                error = observation_error(model, single.numpy().astype(float), double.numpy(), waves)
                 worst[what].add(error, name)
     return [each.row(f"receiver: {what}, {number} cases", IMAGE) for what, each in worst.items()]
 
 
-def report_error(model: Any, report: FloatArray, expected: FloatArray, waves: float) -> float:
-    """Error of a report relative to its norm, or at an antenna to the sum of the waves' magnitudes."""
+def observation_error(model: Any, observation: FloatArray, expected: FloatArray, waves: float) -> float:
+    """Error of an observation relative to its norm, or at an antenna to the sum of the waves' magnitudes."""
     if not isinstance(model, CsiReceiver):
-        return relative(report - expected, expected)
+        return relative(observation - expected, expected)
     if isinstance(model, PowerReceiver):
-        report, expected = 10 ** (report / 20), 10 ** (expected / 20)
+        observation, expected = 10 ** (observation / 20), 10 ** (expected / 20)
         waves = max(waves, float(expected.max()))
-    return float(np.abs(report - expected).max()) / waves
+    return float(np.abs(observation - expected).max()) / waves
 
 
 def receiver_gradients(
     of_each: int, names: Iterable[str] = tuple(MODELS), families: Iterable[str] = tuple(FAMILIES)
 ) -> list[Row]:
-    """Rows of derivatives of the reports of `MODELS` by the Gaussians, ``of_each`` fields of each family."""
+    """Rows of derivatives of the observations of `MODELS` by the Gaussians, ``of_each`` fields of each family."""
     rows = []
     for name in names:
 
-        def report(gaussians: Gaussians, at: Pose, model: Any = MODELS[name]) -> list[Any]:
+        def observe(gaussians: Gaussians, at: Pose, model: Any = MODELS[name]) -> list[Any]:
             plane = perception_plane(*SIZE, _type(gaussians))
             return [model(None, learned_field(gaussians, at, plane, model.sphere))]
 
         # Instrument scaling cancels nearly all derivatives of a single Gaussian; rounding would remain.
         least = 2 if name == "scaled spectrum" else 1
         tried = cases({family: FAMILIES[family] for family in families}, of_each)
-        rows.append(gradient_row(f"receiver: derivatives of {name}", tried, report, least))
+        rows.append(gradient_row(f"receiver: derivatives of {name}", tried, observe, least))
     return rows
 
 

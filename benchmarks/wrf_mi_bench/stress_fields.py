@@ -179,19 +179,19 @@ def _on_rays(field: StressField, index: int, directions: FloatArray) -> tuple[Fl
     return ((t[..., None] * along - centre) ** 2).sum(-1), rays @ (offset / depth)
 
 
-Report = Callable[[Gaussians, Pose], Sequence[Any]]  # differentiable real arrays computed from a field
+Observe = Callable[[Gaussians, Pose], Sequence[Any]]  # differentiable real arrays computed from a field
 
 
-def gradient(field: StressField, blending: str, float_type: Any, seed: int, report: Report) -> dict[str, FloatArray]:
-    """Derivative [n, k] of a random linear functional of a report by each group of parameters."""
+def gradient(field: StressField, blending: str, float_type: Any, seed: int, observe: Observe) -> dict[str, FloatArray]:
+    """Derivative [n, k] of a random linear functional of an observation by each group of parameters."""
     gaussians, parts = on_device(field, blending, float_type)
     for array in (a for part in parts.values() for a in part):
         dr.enable_grad(array)
-    reported = report(gaussians, pose(float_type))
+    observation = observe(gaussians, pose(float_type))
     rng = np.random.default_rng(seed)
-    weights = [rng.normal(size=dr.width(part)).astype(np.float32) for part in reported]
+    weights = [rng.normal(size=dr.width(part)).astype(np.float32) for part in observation]
     total: Any = 0
-    for part, weight in zip(reported, weights, strict=True):
+    for part, weight in zip(observation, weights, strict=True):
         total = total + dr.sum(part * to_device(weight, float_type))
     dr.backward(total)
     return {name: np.stack([dr.grad(a).numpy().astype(float) for a in part], axis=1) for name, part in parts.items()}

@@ -10,7 +10,7 @@ from wrf_mi.core.angles import FloatArray
 
 Row = dict[str, str]
 
-IMAGE = 1e-4  # bound on the relative L2 error of float32 images and reports
+IMAGE = 1e-4  # bound on the relative L2 error of float32 images and observations
 GRADIENT = 1e-3  # bound on the relative error, in norm, of a derivative in float32
 UNFELT = 1e-3  # floor of the norm of a group's derivatives times parameters, as a share of the largest group's
 

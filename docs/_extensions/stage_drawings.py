@@ -64,11 +64,11 @@ DETAILS: dict[str, tuple[tuple[Box, ...], ...]] = {
         (("T: paths", ("g, d, u",)), ("L: Gaussians", ("complex per direction",))),
         (("combine", ("add complex numbers", "or powers")),),
         (("receiver model", ("pixel, array, power, CSI", "gain and phase")),),
-        (("report", ("spectrum, 0 to 1", "signal strength, dBm", "channel, complex")),),
+        (("observation", ("spectrum, 0 to 1", "signal strength, dBm", "channel, complex")),),
     ),
     "training": (
         (("batch", ("rows of one receiver",)), ("parameters", ("Gaussians, network,", "materials, planes"))),
-        (("forward", ("report and loss", "of the task")),),
+        (("forward", ("observation and loss", "of the task")),),
         (("backward", ("Dr.Jit's reverse mode,", "Adam; finite or stop")),),
         (("fit", ("running mean, best on", "held-out rows,", "checkpoint")),),
     ),

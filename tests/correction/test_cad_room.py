@@ -142,7 +142,7 @@ def corrected(folder):
 
 def test_only_surfaces_that_paths_meet_have_parameters(corrected):
     """Of 24,000 surfaces; held-out spectra are explained by the walls' materials."""
-    surfaces, misfit = corrected.misfit.sides[0].surfaces, corrected.misfit
+    surfaces, misfit = corrected.misfit.traced_fields[0].surfaces, corrected.misfit
     assert len(surfaces.triangles) > 22_000
     assert len(surfaces.normal) > 20_000
     assert len(corrected.vector) < 5_000
@@ -218,8 +218,8 @@ def test_commands_need_a_minute_and_two_gibibytes(large, tmp_path):
 def test_strengths_and_channels_correct_the_room(large, task):
     record = observed(large / "truth", task)
     correction = correct_scene(large / "room", record, make_splits(record, "official")[0])
-    assert len(correction.misfit.sides[0].surfaces.triangles) > 100_000
-    assert len(correction.misfit.sides[0].surfaces.normal) > 90_000
+    assert len(correction.misfit.traced_fields[0].surfaces.triangles) > 100_000
+    assert len(correction.misfit.traced_fields[0].surfaces.normal) > 90_000
     assert len(correction.vector) < 5_000
     # Three held-out strengths may not tell a change from chance; then the scene stays.
     assert correction.kept or task == "rssi"

@@ -29,7 +29,7 @@ from wrf_mi.tracing.tracer import RayTracer
 CARRIERS_HZ = (1.2e9, 2.4e9, 5.8e9)
 OPTIONS = CorrectionOptions(("materials", "gain"), depth=2, rays=4096, steps=6)
 ROUNDING_DB = 2e-3
-"""Of reports in single precision: 8e-6 of 100 dB, and conductivities as float32."""
+"""Of observations in single precision: 8e-6 of 100 dB, and conductivities as float32."""
 
 
 TRACE = TraceOptions(transmission=True, depth=2, rays=4096)
@@ -103,12 +103,12 @@ def test_paths_are_searched_once_for_all_carriers(truth, searches):
     scene, record = truth
     record = replace(record, tx_pos_m=record.tx_pos_m[np.arange(len(record)) % 14])
     misfit = Misfit(record, np.arange(len(record)), Prepared(open_scene(scene, 2.4e9)), OPTIONS)
-    assert len(misfit.sides) == len(CARRIERS_HZ)
+    assert len(misfit.traced_fields) == len(CARRIERS_HZ)
     assert searches == [14]
 
 
 def test_derivatives_by_exponents_are_those_of_finite_differences(truth):
-    """To 1 % of the largest, or the rounding of float32 reports over the step."""
+    """To 1 % of the largest, or the rounding of float32 observations over the step."""
     (scene, record), step = truth, 0.02
     misfit = Misfit(record, np.arange(50), Prepared(open_scene(scene, 2.4e9)), OPTIONS)
     part = misfit.parts[name_of(SURFACE, EXPONENT)]
@@ -160,10 +160,10 @@ def test_an_absent_surface_that_no_path_meets_stays_absent(tmp_path):
 
     none = np.zeros(0, np.int64)
     first = fit(1, (none, none))
-    slab = next(k for k, name in enumerate(first.misfit.sides[0].slabs.names) if name.startswith("wall_01"))
+    slab = next(k for k, name in enumerate(first.misfit.traced_fields[0].slabs.names) if name.startswith("wall_01"))
     vector = first.stated.copy()
     vector[material_places(first.misfit, slab)] = ABSENT_VALUES
-    state = State(first, "materials", vector, vector, {first.misfit.sides[0].slabs.names[slab]: ABSENT})
+    state = State(first, "materials", vector, vector, {first.misfit.traced_fields[0].slabs.names[slab]: ABSENT})
     second = fit(0, (first.misfit.planes, first.misfit.slabs))
     assert not second.misfit.counts()[1][slab]
     over = state.at(second)
@@ -244,7 +244,7 @@ def test_materials_are_found_where_planes_are_not(room):
     split = make_splits(record, "official")[0]
     correction = correct_scene(uncorrected_scene, record, split, WITH_PHASES)
     assert correction.kept == "materials+phases"
-    slabs = correction.misfit.sides[0].slabs
+    slabs = correction.misfit.traced_fields[0].slabs
     fitted = slabs.fitted(correction.misfit.named(correction.vector)).permittivity
     rules = slabs.fitted(correction.misfit.named(correction.misfit.start)).permittivity
     slab_index = {name.partition("/")[0]: place for place, name in enumerate(slabs.names)}

@@ -90,7 +90,7 @@ def test_the_scene_is_recovered_from_channels(corrected, tmp_path):
     )
     assert (np.abs(correction.vector[part] - shift) < 4 * correction.deviation[part] + 1e-4).all()
     assert (correction.deviation[part] < correction.state.posterior.prior_deviation[part] / 2).all()
-    slabs = correction.misfit.sides[0].slabs
+    slabs = correction.misfit.traced_fields[0].slabs
     true = open_scene(stated_scene(tmp_path / "named", TRUE_MATERIALS), CARRIER_HZ)
     expected = Prepared(true).tables("surface").slabs
     assert slabs.names == expected.names
@@ -346,7 +346,7 @@ def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:
 
 @pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
 def test_derivatives_are_those_of_finite_differences(task, tmp_path):
-    """To 1 %, or the rounding of float32 reports, 4e-7 of 1 and 8e-6 of 100 dB, over the step."""
+    """To 1 %, or the rounding of float32 observations, 4e-7 of 1 and 8e-6 of 100 dB, over the step."""
     record, scene, rows = record_of(task, stated_scene(tmp_path / "scene"))
     options = CorrectionOptions(PARTS, depth=2, rays=4096, faint=0.0, pattern_degree=1)
     misfit = Misfit(record, np.arange(rows), Prepared(scene), options)

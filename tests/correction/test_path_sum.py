@@ -55,7 +55,7 @@ def test_trials_of_one_plane_and_its_material_follow_the_tracer(misfit, accepted
     np.testing.assert_allclose(trials.residual(vector), before, atol=ROUNDING)
     changed_vector[misfit.parts[SHIFT].start + 2] += 0.01
     changed_vector[misfit.parts[TILT].start + 5] += 3e-3
-    slab = next(k for k, name in enumerate(misfit.sides[0].slabs.names) if name.endswith("/2"))
+    slab = next(k for k, name in enumerate(misfit.traced_fields[0].slabs.names) if name.endswith("/2"))
     changed_vector[misfit.parts[name_of(SURFACE, "permittivity")].start + slab] += 0.7
     if accepted:
         trials.accept(changed_vector)
@@ -125,7 +125,7 @@ def changed(misfit: Misfit) -> tuple[np.ndarray, np.ndarray]:
     vector = changed_material(misfit)
     changed_vector = vector.copy()
     changed_vector[misfit.parts[name_of(SURFACE, "permittivity")].start + 2] += 0.7
-    changed_vector[misfit.parts[misfit.sides[1].gain_name].start] += 0.4
+    changed_vector[misfit.parts[misfit.traced_fields[1].gain_name].start] += 0.4
     return vector, changed_vector
 
 
@@ -133,7 +133,7 @@ def test_strengths_and_their_derivatives_are_those_of_the_tracer(strengths):
     """A receiver without rows has a parameter and is not traced."""
     vector, changed_vector = changed(strengths)
     trials, louder = PathSum(strengths, vector), vector.copy()
-    louder[strengths.parts[strengths.sides[1].gain_name].start] += 0.4
+    louder[strengths.parts[strengths.traced_fields[1].gain_name].start] += 0.4
     for tried in (vector, changed_vector, louder):
         np.testing.assert_allclose(trials.residual(tried), strengths.residual(tried), atol=DECIBEL)
     assert np.nanmax(np.abs(strengths.residual(changed_vector) - strengths.residual(vector))) > 1
@@ -184,9 +184,9 @@ def test_derivatives_of_spectra_are_those_of_the_tracer(spectra):
 
 
 def test_rows_that_no_changed_path_reaches_are_kept(spectra):
-    """A material that some rows meet changes their reports, all others stay as they are."""
+    """A material that some rows meet changes their observations, all others stay as they are."""
     trials, vector = PathSum(spectra, spectra.start), spectra.start.copy()
-    slabs = np.arange(len(spectra.sides[0].slabs.names))
+    slabs = np.arange(len(spectra.traced_fields[0].slabs.names))
     paths = spectra.paths
     met = [np.unique(paths.row[(paths.slab == slab).any(axis=1)]) for slab in slabs]
     slab = next(slab for slab in slabs if 0 < len(met[slab]) < len(spectra.observed))

@@ -49,14 +49,14 @@ KINDS = (
 
 @pytest.fixture(scope="module")
 def both(request, tmp_path_factory):
-    """A traced side with reflections and transmissions, a learned side, and generic values of all their parameters."""
+    """A traced component with reflections and transmissions, a learned one, and generic values of all parameters."""
     rng = np.random.default_rng(5)
     scene, array = room(tmp_path_factory.mktemp("room"), {**WALLS, **CEILING, **PARTITION}), receiver((30, 20, 10))
     options = TraceOptions(depth=2, transmission=True, rays=4096)
     how = TracedOptions(options, pattern_degree=2, materials=request.param, planes=True)
     traced = TracedField(scene, transmitters(BATCH), array, how)
     values = {name: value.astype(float) for name, value in traced.parameters().items()}
-    values[traced.gain_name][0] = np.log(300.0)  # the learned side's size
+    values[traced.gain_name][0] = np.log(300.0)  # the learned component's size
     met = traced.interactions
     gaussians = SurfaceGaussians(np.column_stack([met.position_m, met.normal])[::5].T, SIZE_M)
     traced.attach(gaussians)
@@ -75,7 +75,7 @@ def both(request, tmp_path_factory):
 
 
 def terms_of(both, model, weight):
-    """The weighted report of a receiver, whose sum is the loss."""
+    """The weighted observation of a receiver, whose sum is the loss."""
     traced, field, _ = both
     plane, tx_pos = perception_plane(HEIGHT, WIDTH, Float64), Tensor64(np.ascontiguousarray(traced.tx_pos_m.T))
 
@@ -94,7 +94,7 @@ def terms_of(both, model, weight):
 @pytest.mark.parametrize(
     ("both", "name"), [*(("named", name) for name in MODELS), ("surface", "csi")], indirect=["both"]
 )
-def test_gradients_of_both_sides(name, both):
+def test_gradients_of_both_components(name, both):
     model, rng = MODELS[name], np.random.default_rng(2)
     terms = terms_of(both, model, Float64(rng.standard_normal(BATCH * int(np.prod(model.shape)))))
     parameters = {n: Tensor64(value) for n, value in both[2].items()}

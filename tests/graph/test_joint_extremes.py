@@ -49,7 +49,7 @@ PLACES: dict[str, tuple[Any, Any, Any]] = {
     "grazing paths": ({}, np.array([[0.6, 1.8, LOW_M], [0.5, 2.9, 2 * LOW_M]]), (5.6, 2.9, LOW_M)),
     # Searched 2 cm in front of a wall and evaluated on it, where its reflection and the direct path coincide.
     "antenna on a wall": ({}, NEAR_M, (LENGTH - 0.02, 2.9, 1.4)),
-    "cancelling sides": ({}, NEAR_M[:1], (4.2, 2.9, 0.4)),
+    "cancelling components": ({}, NEAR_M[:1], (4.2, 2.9, 0.4)),
     "many paths": ({}, np.random.default_rng(5).uniform(0.15, 0.85, (160, 3)) * (LENGTH, WIDTH, HEIGHT), (4, 2.9, 0.4)),
 }
 """Parts of the scene beside the room, transmitters and receiver by name."""
@@ -71,7 +71,7 @@ def tensor(value: Any, kind: Any) -> Any:
 
 
 class Joint:
-    """Both sides of a place, and parameters that float32 holds."""
+    """Both components at a place, and parameters that float32 holds."""
 
     def __init__(self, name: str, folder: Any) -> None:
         parts, self.tx_pos_m, position_m = PLACES[name]
@@ -95,14 +95,18 @@ class Joint:
         elif name == "antenna on a wall":
             values["receiver.array.position"] = [0.02, 0, 0]
         self.values = rounded(values)
-        if name == "cancelling sides":
-            learned, traced = (self.report(MODELS["csi"], side=side) for side in ("learned", "traced"))
+        if name == "cancelling components":
+            learned, traced = (
+                self.observation(MODELS["csi"], component=component) for component in ("learned", "traced")
+            )
             factor = -(learned[0] + 1j * learned[1]) / (traced[0] + 1j * traced[1]) * (1 + LEFT)
             gain = self.values[self.traced.gain_name] + [np.log(np.abs(factor)), np.angle(factor)]
             self.values = rounded(self.values | {self.traced.gain_name: gain})
 
-    def report(self, model: Any, kind: Any = Float64, values: Any = None, side: str = "", weight: Any = None) -> Any:
-        """Report [n] of both sides or one, with ``weight`` also derivatives of its weighted sum by name."""
+    def observation(
+        self, model: Any, kind: Any = Float64, values: Any = None, component: str = "", weight: Any = None
+    ) -> Any:
+        """Observation [n] of both components or one, with ``weight`` also derivatives of its weighted sum by name."""
         params = {name: tensor(value, kind) for name, value in (self.values | (values or {})).items()}
         dr.enable_grad(params)
         field_parameters = {name.removeprefix("field."): p for name, p in params.items() if name.startswith("field.")}
@@ -110,11 +114,13 @@ class Joint:
         learned = learned_field(
             self.field.gaussians(field_parameters, tensor(self.tx_pos_m.T, kind)), pose, plane, model.sphere
         )
-        report = model(None if side == "learned" else self.traced(params), None if side == "traced" else learned)
-        shown = dr.detach(report).numpy().astype(float)
+        observation = model(
+            None if component == "learned" else self.traced(params), None if component == "traced" else learned
+        )
+        shown = dr.detach(observation).numpy().astype(float)
         if weight is None:
             return shown
-        dr.backward(dr.sum(report * on_device(weight, kind)))
+        dr.backward(dr.sum(observation * on_device(weight, kind)))
         return shown, {name: np.asarray(dr.grad(p).numpy(), float) for name, p in params.items()}
 
 
@@ -131,22 +137,28 @@ def test_joint_graph_of_float32_is_that_of_float64(name, receivers, tmp_path):
     joint, rng = Joint(name, tmp_path), np.random.default_rng(3)
     values = joint.values.items()
     scales = {key: np.abs(value) if key.startswith("field.") else natural(key) for key, value in values}
-    # The receiver's pose moves Gaussians over edges of pixels, where reports jump.
+    # The receiver's pose moves Gaussians over edges of pixels, where observations jump.
     paths = [key for key in scales if not key.startswith(("field.", "receiver.array.position", "receiver.array.turn"))]
     for kind in receivers:
         model = MODELS[kind]
         weight = rng.normal(size=len(joint.tx_pos_m) * int(np.prod(model.shape))).astype(np.float32)
-        (report, single), (expected, slopes) = (joint.report(model, of, weight=weight) for of in (mi.Float, Float64))
+        (observation, single), (expected, slopes) = (
+            joint.observation(model, of, weight=weight) for of in (mi.Float, Float64)
+        )
         # A sum of waves that cancel is accurate to the waves.
-        waves = [expected] if kind == "rssi" else [joint.report(model, side=side) for side in ("traced", "learned")]
-        assert np.linalg.norm(report - expected) < VALUE * max(map(np.linalg.norm, waves)), kind
+        waves = (
+            [expected]
+            if kind == "rssi"
+            else [joint.observation(model, component=component) for component in ("traced", "learned")]
+        )
+        assert np.linalg.norm(observation - expected) < VALUE * max(map(np.linalg.norm, waves)), kind
         norms = {key: np.linalg.norm(slope * scales[key]) for key, slope in slopes.items()}
         for key, slope in slopes.items():
             error = np.linalg.norm((single[key] - slope) * scales[key])
             assert error < GRADIENT * max(norms[key], GRADIENT * max(norms.values())), (kind, key)
         steps = {key: rng.normal(size=slopes[key].shape) * natural(key) for key in paths}
         above, below = (
-            joint.report(model, values={key: joint.values[key] + size * steps[key] for key in paths}) @ weight
+            joint.observation(model, values={key: joint.values[key] + size * steps[key] for key in paths}) @ weight
             for size in (STEP, -STEP)
         )
         analytic = sum(float((slopes[key] * step).sum()) for key, step in steps.items())

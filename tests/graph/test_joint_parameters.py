@@ -70,7 +70,7 @@ def test_material_gain_and_pose_are_recovered(tmp_path):
     scene.radio_materials["itu_concrete"].relative_permittivity = START_PERMITTIVITY
     rates = ("traced.position=2e-3", "traced.turn=5e-3", "traced.material=0.05", "steps=400", "batch=20")
     trainer = Trainer(record, all_of(record), paths_alone("gain,materials,pose", *rates), scene=scene)
-    # A gain starts where the paths report what was observed, on average.
+    # A gain starts where the paths yield what was observed, on average.
     assert trainer.state.params()["receiver.array.gain"][0] == pytest.approx(np.log(40), abs=0.1)
     trainer.run()
     fitted = trainer.state.params()
@@ -86,11 +86,13 @@ def test_gain_starts_at_the_level_of_the_observations(task, tmp_path):
     record = record_of(task, scene, (receiver(),), transmitters(8))
     record = record if task == "spectrum" else replace(record, observation=record.observation + 32)
     trainer = Trainer(record, all_of(record), paths_alone("gain"), scene=scene)
-    side, params = trainer.graph.trace(record.tx_pos_m, 0)[0], dict(trainer.state.adam.items())
+    traced_field, params = trainer.graph.trace(record.tx_pos_m, 0)[0], dict(trainer.state.adam.items())
     if task == "rssi":
         assert float(params["receiver.array.gain"].array[0]) == pytest.approx(np.log(10) * 32 / 20, abs=1e-3)
     else:  # unscaled spectra peak at 1
-        peaks = trainer.graph.models[0].unscaled(side(params), None).numpy().reshape(len(record), -1).max(axis=1)
+        peaks = (
+            trainer.graph.models[0].unscaled(traced_field(params), None).numpy().reshape(len(record), -1).max(axis=1)
+        )
         assert peaks.mean() == pytest.approx(1, abs=1e-3)
 
 
@@ -102,8 +104,8 @@ def test_patterns_are_recovered(tmp_path):
     model, options = PowerReceiver(4, 8, (FREQUENCY_HZ,), interference=False), TracedOptions(OPTIONS, pattern_degree=1)
     names = "pattern.transmitter", *(f"receiver.{station.name}.pattern" for station in receivers)
     truth = {name: mi.TensorXf(rng.normal(0, 0.5, (2, 3)).astype(np.float32)) for name in names}
-    sides = [TracedField(scene, tx, station, options, heading) for station in receivers]
-    observed = np.stack([model(side(truth), None).numpy() for side in sides]).astype(np.float32)
+    traced_fields = [TracedField(scene, tx, station, options, heading) for station in receivers]
+    observed = np.stack([model(field(truth), None).numpy() for field in traced_fields]).astype(np.float32)
     hz = np.array([FREQUENCY_HZ])
     record = Record("room", "rssi", tx, receivers, observed, frequencies_hz=hz, tx_heading_rad=heading)
     error = []
@@ -218,8 +220,8 @@ def test_resumed_fit_keeps_its_paths(rooms):
     part.run(stop=stop_after(9))
     state = FitState.from_arrays(part.state.arrays())
     resumed = Trainer(part.plan.record, part.plan.split, part.config, scene=part.graph.scene, state=state)
-    for side, searched_m in zip(resumed.plan.sides, part.state.searched_m, strict=True):
-        np.testing.assert_array_equal(side.searched_at_m, searched_m)
+    for traced_field, searched_m in zip(resumed.plan.traced_fields, part.state.searched_m, strict=True):
+        np.testing.assert_array_equal(traced_field.searched_at_m, searched_m)
     resumed.run()
     np.testing.assert_equal(resumed.state.params(), uninterrupted.state.params())
 
@@ -286,7 +288,7 @@ def score(record, trainer):
 
 
 @pytest.mark.parametrize(("task", "antennas"), [("rssi", 1), pytest.param("csi", 2, marks=pytest.mark.slow)])
-def test_joint_training_predicts_better_than_either_side(task, antennas, scenes):
+def test_joint_training_predicts_better_than_either_component(task, antennas, scenes):
     record, paths_settings = measured(task, scenes["whole"], antennas), ("model=ray-tracing", "traced.surface=0")
     both, alone, paths = (
         trained(record, *how) for how in ((scenes["known"],), (None,), (scenes["known"], *paths_settings))

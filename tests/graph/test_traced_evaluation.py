@@ -74,13 +74,13 @@ def gradients(values, of, weights):
     return {name: dr.grad(value).numpy().astype(float) for name, value in params.items()}
 
 
-def reported(graph, tx, number=0, side=None):
-    """What a receiver reports of transmitters, as a function of parameters."""
+def reported(graph, tx, number=0, traced_field=None):
+    """What a receiver observes of transmitters, as a function of parameters."""
     pose, plane = device_pose(graph.receivers[number]), perception_plane(*graph.form.size, mi.Float)
     rows = on_device(np.arange(len(tx)), mi.UInt32)
     batch = Batch(to_tensor(np.ascontiguousarray(tx.T)), rows, dr.opaque(mi.UInt32, number), pose, plane)
-    report = graph.report(number, side)
-    return lambda params: report(params, batch)
+    observe = graph.observation(number, traced_field)
+    return lambda params: observe(params, batch)
 
 
 def assert_close(found, expected, tolerance):
@@ -242,16 +242,16 @@ def test_traced_derivative_by_wall_materials(tmp_path, materials):
     """Of parameters that the paths have, too: against central differences."""
     graph, values = behind_the_ceiling(tmp_path, materials=materials)
     named_values = graph.trace(TX, 0)[0].parameters().items()
-    walls, report = {name: value for name, value in named_values if name.startswith("material.")}, reported(graph, TX)
+    walls, observe = {name: value for name, value in named_values if name.startswith("material.")}, reported(graph, TX)
     weights = np.random.default_rng(3).uniform(0.5, 1.5, 3 * SIZE[0] * SIZE[1])
-    derivatives = gradients(values | walls, report, weights)
+    derivatives = gradients(values | walls, observe, weights)
 
     def total(name, index, step):
         moved = walls[name].copy()
         moved[index] += step
         params = {n: to_tensor(v) for n, v in (values | walls | {name: moved}).items()}
         with dr.suspend_grad():
-            return float(report(params).numpy().astype(float) @ weights)
+            return float(observe(params).numpy().astype(float) @ weights)
 
     crossed = {name: int(np.abs(derivatives[name]).argmax()) for name in walls if derivatives[name].any()}
     assert len(crossed) >= 2

@@ -180,7 +180,7 @@ def test_unknown_losses_and_models_without_one_are_refused(flat_folder: Path, fo
 
 
 def test_receiver_of_another_task_or_unknown_is_refused(attenuated, flat_folder: Path, tmp_path: Path) -> None:
-    for name, reason in (("pixel", "pixel does not report rssi"), ("horn", "'horn': unknown")):
+    for name, reason in (("pixel", "pixel does not observe rssi"), ("horn", "'horn': unknown")):
         with pytest.raises(InputError, match=f"receiver model {reason}; choose from power, attenuated"):
             train(flat_folder, "wrf-gs+", out=tmp_path / "run", receiver=name)
     assert not (tmp_path / "run").exists()

@@ -18,7 +18,7 @@ from wrf_mi.tasks import TASKS, instrument_of
 
 @pytest.fixture
 def others(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A registered task, field strengths, and the receiver model that reports it."""
+    """A registered task, field strengths, and the receiver model that observes it."""
     module = types.ModuleType("fields_of_others")
     monkeypatch.setitem(sys.modules, "fields_of_others", module)  # where its dataclass looks for its types
     exec(FIELD_STRENGTHS, module.__dict__)
@@ -43,7 +43,7 @@ def test_registered_receiver_observes_paths(others: Any) -> None:
 
 def test_registered_receiver_serves_its_task_alone(others: Any) -> None:
     assert receiver_model("field-meter", "field-strength") is others.FieldMeter
-    with pytest.raises(InputError, match="receiver model field-meter does not report rssi; choose from power"):
+    with pytest.raises(InputError, match="receiver model field-meter does not observe rssi; choose from power"):
         receiver_model("field-meter", "rssi")
-    with pytest.raises(InputError, match="receiver model power does not report field-strength; choose from field-m"):
+    with pytest.raises(InputError, match="receiver model power does not observe field-strength; choose from field-m"):
         receiver_model("power", "field-strength")

@@ -26,8 +26,8 @@ from wrf_mi.gaussians import Gaussians
 from wrf_mi.gaussians.tiles import perception_plane
 from wrf_mi.receivers import antenna_csi, csi
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
-from wrf_mi.receivers.device_paths import Ports, magnitude, path_sum, power
-from wrf_mi.receivers.reports import minmax_scale
+from wrf_mi.receivers.device_paths import AntennaTones, magnitude, path_sum, power
+from wrf_mi.receivers.scaling import minmax_scale
 
 DOUBLE = 1e-11  # float64, sums of a thousand terms, phases of a hundred radians
 SINGLE = 2e-5  # the same in float32
@@ -85,7 +85,7 @@ INSTRUMENTS = {
 
 
 def summed(name: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """Sums over paths that an instrument reports: element signals, channels, or powers."""
+    """Sums over paths that an instrument observes: element signals, channels, or powers."""
     if name == "spectrum":
         return signals(arrays, ELEMENTS_M)
     if name == "channel":
@@ -94,7 +94,7 @@ def summed(name: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", INSTRUMENTS)
-def test_an_instrument_reports_alike_of_paths_in_numpy_in_drjit_and_of_sums(name: str) -> None:
+def test_an_instrument_observes_alike_of_paths_in_numpy_in_drjit_and_of_sums(name: str) -> None:
     model, (traced, arrays) = INSTRUMENTS[name], paths()
     count = arrays["gain"].size
     tx, rx = np.repeat([0, 1], count // 2), np.zeros(count, np.int64)
@@ -102,19 +102,19 @@ def test_an_instrument_reports_alike_of_paths_in_numpy_in_drjit_and_of_sums(name
     stored = paths_of(tx, rx, arrays["gain"].ravel(), arrays["length"].ravel(), arrival, 2, 1)
     observed = model.observed(stored, Receiver("rx", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))
     expected = np.ascontiguousarray(observed).view(float) if np.iscomplexobj(observed) else observed
-    for report in (model(traced, None).numpy(), model.signal_report(summed(name, arrays))):
+    for report in (model(traced, None).numpy(), model.signal_observation(summed(name, arrays))):
         np.testing.assert_allclose(report.reshape(2, -1), expected.reshape(2, -1), atol=ROOT)
 
 
 @pytest.mark.parametrize("name", INSTRUMENTS)
-def test_slopes_of_reports_are_finite_differences(name: str) -> None:
-    """Of the second row alone, in two parts; the reports of spectra are of single precision."""
+def test_slopes_of_observations_are_finite_differences(name: str) -> None:
+    """Of the second row alone, in two parts; the observations of spectra are of single precision."""
     model, signal, step = INSTRUMENTS[name], summed(name, paths()[1]), 1e-3
     rng = np.random.default_rng(7)
     change: Any = rng.normal(size=(1, signal.shape[1])) + 1j * rng.normal(size=(1, signal.shape[1]))
     if name == "strength":
         change = change.real.astype(complex)
-    above, below = (model.signal_report(signal[1:] + side * step * change) for side in (1, -1))
+    above, below = (model.signal_observation(signal[1:] + side * step * change) for side in (1, -1))
     expected = (above - below) / (2 * step)
     slopes = model.signal_slopes([signal[:1], signal[1:]])(change, np.array([1]))
     np.testing.assert_allclose(slopes, expected, atol=2e-3 * np.abs(expected).max())
@@ -122,7 +122,7 @@ def test_slopes_of_reports_are_finite_differences(name: str) -> None:
 
 def test_path_sum_matches_spherical_waves() -> None:
     traced, arrays = paths()
-    re, im = path_sum(traced, Ports(ELEMENTS_M, np.full(len(ELEMENTS_M), FREQUENCY_HZ)))
+    re, im = path_sum(traced, AntennaTones(ELEMENTS_M, np.full(len(ELEMENTS_M), FREQUENCY_HZ)))
     np.testing.assert_allclose((re.numpy() + 1j * im.numpy()).reshape(2, -1), signals(arrays, ELEMENTS_M), atol=DOUBLE)
 
 
@@ -140,8 +140,8 @@ def test_path_sums_of_far_and_faint_paths_keep_phases_at_28_ghz() -> None:
     elements_m, tones_hz = planar_array(4, 4, 0.005), carrier_hz * np.linspace(0.98, 1.02, 16)
     array = Receiver("array", np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     for ports, expected in (
-        (Ports(elements_m, np.full(16, carrier_hz)), antenna_csi(stored, array, elements_m, carrier_hz)[..., 0]),
-        (Ports(np.zeros((16, 3)), tones_hz), csi(stored, tones_hz)),
+        (AntennaTones(elements_m, np.full(16, carrier_hz)), antenna_csi(stored, array, elements_m, carrier_hz)[..., 0]),
+        (AntennaTones(np.zeros((16, 3)), tones_hz), csi(stored, tones_hz)),
     ):
         re, im = path_sum(traced, ports)
         error = np.abs(re.numpy() + 1j * im.numpy() - expected.ravel()).max()
@@ -149,7 +149,7 @@ def test_path_sums_of_far_and_faint_paths_keep_phases_at_28_ghz() -> None:
 
 
 @pytest.mark.parametrize("how", ["coherent", "power"])
-def test_pixel_and_array_receivers_add_both_sides(how: Any) -> None:
+def test_pixel_and_array_receivers_add_both_components(how: Any) -> None:
     (traced, arrays), (field, signal) = paths(), learned(2, HEIGHT * WIDTH)
     of_paths = image(signals(arrays, ELEMENTS_M))
     at_array = image((signal * solid_angles(HEIGHT, WIDTH)) @ array_response(ELEMENTS_M, DIRECTIONS, FREQUENCY_HZ))
@@ -198,7 +198,7 @@ def test_power_receiver(how: Any) -> None:
     np.testing.assert_allclose(model(traced, None).numpy(), 10 * np.log10(np.abs(h[0]) ** 2), atol=1e-4)
     silent = dr.zeros(Float64, 2 * count), dr.zeros(Float64, 2 * count)
     np.testing.assert_allclose(model(None, silent).numpy(), -200.0, atol=1e-9)
-    # What is reported where nothing arrives changes nothing else, and is no part of a missing gain.
+    # What is observed where nothing arrives changes nothing else, and is no part of a missing gain.
     noisy = PowerReceiver(45, 60, (FREQUENCY_HZ,), how=how, floor=0.1)
     np.testing.assert_allclose(noisy(None, silent).numpy(), -10.0, atol=1e-9)
     np.testing.assert_array_equal(noisy(traced, field).numpy(), model(traced, field).numpy())
@@ -213,7 +213,7 @@ def test_power_over_channels_and_without_interference() -> None:
     sphere_signal, powers = whole_sphere(signal), (np.abs(arrays["gain"]) ** 2).sum(axis=1)
     hopping = PowerReceiver(6, 8, frequencies)
     faded = PowerReceiver(6, 8, frequencies, how="power", interference=False)
-    # A mean power has no phase: as a complex number it is its root, which the learned side raises or lowers.
+    # A mean power has no phase: as a complex number it is its root, which the learned component raises or lowers.
     mixed = PowerReceiver(6, 8, frequencies, interference=False)
     for model, addition, expected, atol in (
         (hopping, field, (np.abs(signals(arrays, ORIGIN, *frequencies) + sphere_signal) ** 2).mean(axis=1), DOUBLE),
@@ -241,7 +241,7 @@ def test_channels_with_and_without_a_basis(antennas: int, coefficients: int) -> 
 
 @pytest.mark.parametrize("float_type", [mi.Float, Float64])
 def test_float_types(float_type: Any) -> None:
-    """The learned side's type is that of the report, and single precision is as good as it can be."""
+    """The learned component's type is that of the observation, and single precision is as good as it can be."""
     (traced, _), (exact, _) = paths(), learned(2, HEIGHT * WIDTH)
     report = ArrayReceiver(**MODEL)(traced, learned(2, HEIGHT * WIDTH, float_type)[0])
     assert type(report) is float_type
@@ -249,10 +249,10 @@ def test_float_types(float_type: Any) -> None:
     np.testing.assert_allclose(report.numpy(), reference, atol=SINGLE * reference.max())
 
 
-def test_receivers_refuse_two_absent_sides() -> None:
+def test_receivers_refuse_two_absent_components() -> None:
     with pytest.raises(ValueError, match="neither"):
         CsiReceiver(6, 8, TONES_HZ)(None, None)
-    with pytest.raises(ValueError, match="0 sides"):
+    with pytest.raises(ValueError, match="0 components"):
         magnitude(None, None, "coherent")
     field, _ = learned(1, 4)
     with pytest.raises(ValueError, match="'sum'"):

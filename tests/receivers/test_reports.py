@@ -1,10 +1,10 @@
-"""Reports of instruments are the same for NumPy and Dr.Jit arrays."""
+"""Observations of instruments are the same for NumPy and Dr.Jit arrays."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from wrf_mi.receivers.reports import LEAST_POWER, SILENCE, arrives, minmax_scale, scaled, strength_db
+from wrf_mi.receivers.scaling import LEAST_POWER, SILENCE, arrives, minmax_scale, scaled, strength_db
 
 EXACT = 1e-12  # A few operations in float64
 POWER = np.array([0.0, SILENCE, 1.01 * SILENCE, 1e-15, 1e-3])

@@ -19,7 +19,7 @@ from wrf_mi.gaussians import Encoding, Factorised, WrfGs, WrfGsPlus, random_gaus
 from wrf_mi.gaussians.operator import recorded_signals, static_signals
 from wrf_mi.runs.api import open_run, predict_to_file, train
 from wrf_mi.training import evaluator
-from wrf_mi.training.evaluator import OperatorReports, Request, read_weights
+from wrf_mi.training.evaluator import OperatorObservations, Request, read_weights
 from wrf_mi.training.predictor import Predictor
 
 GREYS = 1e-5
@@ -48,11 +48,11 @@ class Operator:
     """Operators of a field's receivers, called with transmitters and the number of a receiver."""
 
     def __init__(self, field: Any, params: Any, receivers: Any = RECEIVERS[:1], size: Any = SIZE, store: Any = None):
-        self.reports = OperatorReports(predictor(field, params, receivers, size).graph, store)
-        self.reports.update({name: to_tensor(values) for name, values in params.items()})
+        self.evaluate = OperatorObservations(predictor(field, params, receivers, size).graph, store)
+        self.evaluate.update({name: to_tensor(values) for name, values in params.items()})
 
     def __call__(self, receiver: int = 0, tx_pos_m: np.ndarray = TX) -> np.ndarray:
-        return self.reports(Request(tx_pos_m, receiver, None, np.arange(len(tx_pos_m))))
+        return self.evaluate(Request(tx_pos_m, receiver, None, np.arange(len(tx_pos_m))))
 
 
 MODELS = ["wrf-gs", "factorised", "wrf-gs+ still"]
@@ -81,7 +81,7 @@ def test_moving_geometry_is_splatted() -> None:
     field, params = true_field("wrf-gs+")
     asked = predictor(field, params, operator=True)
     np.testing.assert_array_equal(asked(TX), predictor(field, params)(TX))
-    assert not isinstance(asked.evaluate, OperatorReports)
+    assert not isinstance(asked.evaluate, OperatorObservations)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ CHANGES: dict[str, tuple[Any, Any, Any]] = {
     "another opacity": ({"opacity": lambda values: -values}, {}, SIZE),
     "one Gaussian less": (dict.fromkeys(made("factorised")[0].per_gaussian, lambda values: values[:, 1:]), {}, SIZE),
 }
-"""Changes of parameters, of the receiver and of the size of its report."""
+"""Changes of parameters, of the receiver and of the size of its observation."""
 
 
 @pytest.mark.parametrize("what", CHANGES)
@@ -169,12 +169,12 @@ def test_changed_geometry_rebuilds_the_operator(what: str, tmp_path: Path) -> No
     params = {name: functions[name](values) if name in functions else values for name, values in params.items()}
     receiver = replace(RECEIVERS[0], **pose)
     after = Operator(field, params, [receiver], size, tmp_path)
-    assert after.reports.key(0) != before.reports.key(0)
+    assert after.evaluate.key(0) != before.evaluate.key(0)
     expected = predictor(field, params, [receiver], size)(TX)
     np.testing.assert_allclose(after(0, np.asarray(TX, np.float32)), expected, atol=GREYS)
     # Stored in place of the one before.
     count = params["position"].shape[1]
-    assert read_weights(tmp_path / "operator0.npz", after.reports.key(0), (size[0] * size[1], count)) is not None
+    assert read_weights(tmp_path / "operator0.npz", after.evaluate.key(0), (size[0] * size[1], count)) is not None
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -183,11 +183,11 @@ def test_changed_signals_keep_the_operator(model: str) -> None:
     field, params = made(model)
     changed = {k: v * 2 if k.startswith(field.signal_parameters) else v for k, v in params.items()}
     assert any(k.startswith(field.signal_parameters) for k in params)
-    key, same = (Operator(field, values).reports.key(0) for values in (params, changed))
+    key, same = (Operator(field, values).evaluate.key(0) for values in (params, changed))
     assert key == same
     if model == "wrf-gs":
         other = params | {"attenuation.1.bias": params["attenuation.1.bias"] + np.float32(0.1)}
-        assert Operator(field, other).reports.key(0) != key
+        assert Operator(field, other).evaluate.key(0) != key
 
 
 DAMAGES: dict[str, Any] = {
@@ -206,7 +206,7 @@ def test_damaged_store_is_built_anew(damage: str, tmp_path: Path) -> None:
     DAMAGES[damage](file, arrays_in(file))
     again = Operator(field, params, store=tmp_path)
     np.testing.assert_array_equal(again(), expected)
-    assert read_weights(file, again.reports.key(0), (SIZE[0] * SIZE[1], 8)) is not None
+    assert read_weights(file, again.evaluate.key(0), (SIZE[0] * SIZE[1], 8)) is not None
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")

@@ -201,7 +201,7 @@ def test_fitted_offset_is_the_median(levels: list[float], shift: float) -> None:
     measured[1, 0] = np.nan
     offsets = fit_offsets(strength, measured)
     assert offsets.offset_db == pytest.approx([shift, shift], abs=1e-9)
-    # No path: the weakest strength that this receiver reports.
+    # No path: the weakest strength that this receiver observes.
     assert offsets([[np.nan], [np.nan]])[:, 0] == pytest.approx(np.nanmin(measured, axis=1))
 
 
@@ -233,5 +233,5 @@ def test_calibrated_strength_without_a_path_is_that_of_the_weakest_training_row(
     """Below the floor, which nothing passes here."""
     assert record.official is not None
     below = record.tx_pos_m[:2] - np.array([0, 0, 9.0])
-    report = open_run(calibrated).predict(below, 0, np.zeros(2)).mean
-    np.testing.assert_allclose(report, np.nanmin(record.observation[:, record.official[0]]), atol=FLOAT32_DB)
+    predicted = open_run(calibrated).predict(below, 0, np.zeros(2)).mean
+    np.testing.assert_allclose(predicted, np.nanmin(record.observation[:, record.official[0]]), atol=FLOAT32_DB)

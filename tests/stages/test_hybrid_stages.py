@@ -28,7 +28,7 @@ from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import TraceOptions, open_scene, trace_paths
 from wrf_mi.training.selection import hold_out
 from wrf_mi.training.session import Interrupted
-from wrf_mi.training.validation import HeldOutReports
+from wrf_mi.training.validation import HeldOutObservations
 
 HZ = 920e6
 SHAPES = {"spectrum": (24, 48), "rssi": (), "csi": (6,)}
@@ -46,7 +46,7 @@ STOPPED_IN = (
     ("kriging, held-out rows: signals", ""),
     ("choosing weights", ""),
 )
-"""Beginnings and ends of reports after which a fit of spectra is stopped, in their order."""
+"""Beginnings and ends of progress after which a fit of spectra is stopped, in their order."""
 STRENGTHS_STOPPED_IN = (
     ("paths: choices", "(calibrated)"),
     ("paths: least squares", "(calibrated)"),
@@ -133,7 +133,7 @@ def test_hybrid_of_a_wrong_scene_is_above_its_trace_and_interpolation(spectra, s
         assert run.metrics["ssim"]["mean"] > other.metrics["ssim"]["mean"]
 
 
-def test_fit_in_a_scene_is_restored_with_its_sides(spectra: tuple[wrf_mi.Run, Record]) -> None:
+def test_fit_in_a_scene_is_restored_with_its_components(spectra: tuple[wrf_mi.Run, Record]) -> None:
     run, record = spectra
     again = wrf_mi.open_run(run.folder, record)
     position = record.tx_pos_m[:4]
@@ -217,14 +217,14 @@ def test_first_stage_of_a_training_that_went_further_is_continued_with_all_rows(
     np.testing.assert_array_equal(wrf_mi.resume(out).predict(position).mean, whole.predict(position).mean)
 
 
-def test_reports_of_held_out_rows_are_those_of_a_fit_without_them() -> None:
-    rows, report = np.array([7, 3, 5]), np.arange(3.0)
-    reports = HeldOutReports(np.array([0, 0, 1]), rows, report)
+def test_predictions_of_held_out_rows_are_those_of_a_fit_without_them() -> None:
+    rows, predicted = np.array([7, 3, 5]), np.arange(3.0)
+    held_out = HeldOutObservations(np.array([0, 0, 1]), rows, predicted)
     told = dict.fromkeys(("receivers", "uses_heading", "carriers_hz", "run_sd_db"))
-    graph: Any = SimpleNamespace(**told, traces=True, held_out=reports)
+    graph: Any = SimpleNamespace(**told, traces=True, held_out=held_out)
     scene_model = paths.FittedPaths(graph, None)
     assert scene_model.predict_rows(np.array([3, 7]), 0) is None, "a fit to all rows has other predictions"
-    scene_model.reports = reports
+    scene_model.held_out = held_out
     np.testing.assert_array_equal(scene_model.predict_rows(np.array([3, 7]), 0).mean, [1, 0])
     assert scene_model.predict_rows(np.array([3, 5]), 0) is None
     assert scene_model.predict_rows(np.array([3, 8]), 0) is None

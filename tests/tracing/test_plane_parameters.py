@@ -190,10 +190,10 @@ def test_receivers_share_planes_and_keep_their_recordings(box):
     first, second = recorded[0, 0, False], recorded[1, 0, False]
     recordings = second.frozen.n_recordings
     # As a step does once the receiver has moved by more than a quarter of a wavelength.
-    trainer.plan.sides[0].search(moving.position_m + np.array([0.05, 0, 0]))
+    trainer.plan.traced_fields[0].search(moving.position_m + np.array([0.05, 0, 0]))
     trainer.run(stop=stop_after(6))
     recorded = trainer.steps.recorded
-    assert [side.searches for side in trainer.plan.sides] == [1, 0]
+    assert [field.searches for field in trainer.plan.traced_fields] == [1, 0]
     assert recorded[0, 1, False] is not first
     assert recorded[1, 0, False] is second
     assert (0, 0, False) not in recorded

@@ -21,7 +21,7 @@ from wrf_mi.estimators.ray_tracing import MODEL, TracingSettings
 from wrf_mi.tasks import instrument_of
 from wrf_mi.tracing import RayTracer, TraceOptions, load_trace, open_scene, recompute, save_trace, trace_paths
 from wrf_mi.tracing.paths.solve import Prepared
-from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions, traced_fields
+from wrf_mi.tracing.paths.traced_field import TracedField, TracedOptions, trace_fields
 from wrf_mi.tracing.search import chains as search_module
 from wrf_mi.tracing.sionna.materials import CONSTANTS, at_frequency
 from wrf_mi.tracing.sionna.path_solver import sionna_pattern
@@ -159,7 +159,7 @@ def test_fields_are_those_of_a_search_for_each_carrier(faint, middle, searches):
     """Positions, headings, faint paths left out and lengths; the search is of each distinct position, once."""
     options, (tx, heading, carriers) = TracedOptions(FIELD_OPTIONS, pattern_degree=1, faint=faint), rows()
     pattern = {"pattern.transmitter": Tensor64(np.array([[0.3, -0.2, 0.5], [0.1, 0.4, -0.3]]))}
-    fields = traced_fields(tx, receiver(), options, Prepared(middle), heading, carriers)
+    fields = trace_fields(tx, receiver(), options, Prepared(middle), heading, carriers)
     assert searches == [7]
     assert [field.frequency_hz for field in fields] == list(CARRIERS_HZ)
     for field, hz in zip(fields, CARRIERS_HZ, strict=True):
@@ -173,7 +173,7 @@ def test_fields_are_those_of_a_search_for_each_carrier(faint, middle, searches):
 def test_fields_are_those_of_scenes_at_each_carrier(box_xml, middle):
     """Materials follow the laws of ITU-R P.2040 from the carrier of the search."""
     tx, heading, carriers = rows()
-    for field in traced_fields(tx, receiver(), FIELD, Prepared(middle), heading, carriers):
+    for field in trace_fields(tx, receiver(), FIELD, Prepared(middle), heading, carriers):
         at, scene = carriers == field.frequency_hz, open_scene(box_xml, field.frequency_hz, THICKNESS_M)
         close(response(field, {}), response(TracedField(scene, tx[at], receiver(), FIELD, heading[at]), {}))
 
@@ -181,7 +181,7 @@ def test_fields_are_those_of_scenes_at_each_carrier(box_xml, middle):
 def test_moved_receivers_are_searched_as_by_refresh(middle, searches):
     """Moved by 4 cm, more than a quarter of a wavelength at two carriers: one search from there and one as stated."""
     (tx, _, carriers), moved = rows(), {"receiver.array.position": Tensor64([0.0, 0.04, 0.0])}
-    fields = traced_fields(tx, receiver(), FIELD, Prepared(middle), None, carriers, parameters=moved)
+    fields = trace_fields(tx, receiver(), FIELD, Prepared(middle), None, carriers, parameters=moved)
     assert len(searches) == 2
     for field, hz in zip(fields, CARRIERS_HZ, strict=True):
         alone = TracedField(middle, tx[carriers == hz], receiver(), FIELD, frequency_hz=hz)
@@ -194,7 +194,7 @@ def test_moved_receivers_are_searched_as_by_refresh(middle, searches):
 
 def test_rows_without_carriers_have_that_of_the_scene(box):
     tx = transmitters(3)
-    [field] = traced_fields(tx, receiver(), FIELD, Prepared(box))
+    [field] = trace_fields(tx, receiver(), FIELD, Prepared(box))
     assert field.frequency_hz == pytest.approx(FREQUENCY_HZ)
     np.testing.assert_array_equal(response(field, {}), response(TracedField(box, tx, receiver(), FIELD), {}))
 
@@ -202,7 +202,7 @@ def test_rows_without_carriers_have_that_of_the_scene(box):
 def test_wrong_positions_are_refused(box):
     for wrong in ([[1.0, 2.0]], [[1.0, 2.0, np.nan]]):
         with pytest.raises(ValueError, match="tx_pos_m has shape"):
-            traced_fields(wrong, receiver(), TracedOptions(FIELD_OPTIONS), Prepared(box))
+            trace_fields(wrong, receiver(), TracedOptions(FIELD_OPTIONS), Prepared(box))
 
 
 AGREE = 1e-4  # of the strongest path: Sionna RT in single precision, angles of a table among them

@@ -340,7 +340,7 @@ def test_correction_leaves_absorbers_alone(tmp_path):
     options = replace(default_options(record), rows=40, rays=4096, depth=2)
     correction = correct_scene(uncorrected_scene, record, make_splits(record, "official")[0], options)
     assert correction.kept == "materials+gain"
-    fitted = {name.partition("/")[0] for name in correction.misfit.sides[0].slabs.names}
+    fitted = {name.partition("/")[0] for name in correction.misfit.traced_fields[0].slabs.names}
     assert fitted == set(TRUE_MATERIALS) - {"wall_02"}
     write_page(correction, tmp_path / "page")
     assert read_materials(tmp_path / "page").surfaces["wall_02"] == ABSORBER

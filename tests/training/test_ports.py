@@ -67,7 +67,7 @@ PORTS = ObservationSpec("array", SIZE, carriers_hz=np.array(CARRIERS_HZ))
 
 
 @pytest.mark.parametrize(("model", "tolerance"), [("array", SINGLE), ("power", SINGLE_DB)])
-def test_ports_report_what_a_graph_of_each_carrier_reports(model, tolerance, xml):
+def test_ports_observe_what_a_graph_of_each_carrier_observes(model, tolerance, xml):
     """At trained carriers and at others, in the order of the rows; materials follow the laws of ITU-R P.2040."""
     receivers, form = (array(), second()), replace(PORTS, receiver=model)
     rows = np.array([*CARRIERS_HZ, BETWEEN_HZ])[np.random.default_rng(0).permutation(np.arange(12) % 4)]
@@ -83,7 +83,7 @@ def test_ports_report_what_a_graph_of_each_carrier_reports(model, tolerance, xml
 
 @pytest.mark.parametrize("count", [1, 5])
 def test_spectra_of_uncertain_phases_are_the_expectation_of_the_tracer(count, xml):
-    """Of several transmitters, and of one, whose report is recorded; both differ from those of certain phases."""
+    """Of several transmitters, and of one, whose observation is recorded; both differ from those of certain phases."""
     instrument = Instrument("array", (array(),), np.array([CARRIERS_HZ[1]]), size=SIZE, phase_error=1.0)
     tracer, graph = RayTracer(xml, instrument, OPTIONS), graph_of(xml, MIDDLE)
     expected = tracer.observe(tracer.trace(transmitters(count)))[0]
@@ -93,7 +93,7 @@ def test_spectra_of_uncertain_phases_are_the_expectation_of_the_tracer(count, xm
 
 
 def test_gaussians_count_in_each_draw_of_the_paths_phases(xml):
-    """With phases that are as good as certain the expectation is the report itself, beside Gaussians, too."""
+    """With phases that are as good as certain the expectation is the observation itself, beside Gaussians, too."""
     field, params = true_field("wrf-gs+")
     graph = graph_of(xml, MIDDLE, field)
     for count in (1, 5):
@@ -101,7 +101,7 @@ def test_gaussians_count_in_each_draw_of_the_paths_phases(xml):
         np.testing.assert_allclose(certain, drawn, rtol=0, atol=10 * SINGLE)
 
 
-def test_reports_from_one_search_are_those_of_a_search_for_each_carrier(xml):
+def test_observations_from_one_search_are_those_of_a_search_for_each_carrier(xml):
     """Of rows whose positions are partly the same, some of them repeated, at two trained carriers and another one."""
     predict = Predictor(graph_of(xml, PORTS, faint=0.05), {})
     tx = transmitters(6)[[0, 1, 2, 2, 3, 2, 1, 0, 5, 3, 4, 4]]

@@ -217,7 +217,7 @@ def test_loss_of_a_step_is_that_of_its_batch(two_gateways):
 
 def test_unsuitable_receivers_and_models_are_refused(one_gateway):
     levels = replace(one_gateway, task="rssi", observation=one_gateway.observation[..., 0, 0])
-    with pytest.raises(InputError, match="receiver model array does not report rssi; choose from power"):
+    with pytest.raises(InputError, match="receiver model array does not observe rssi; choose from power"):
         trainer_of(levels, "receiver=array")
     with pytest.raises(InputError, match="model 'nerf2' cannot be trained here"):
         trainer_of(one_gateway, model="nerf2")

@@ -68,14 +68,14 @@ class Task(ABC):
     receiver_with_scene: ClassVar[str] = ""  #: name of the default receiver model of paths of a scene
     carrier_stated_in: ClassVar[str] = "frequency_hz in its gateway_info.yml"  #: key and file, for messages
     in_decibel: ClassVar[bool] = False  #: whether observations are powers in decibels
-    #: whether reports of traced paths differ from observations by an offset of each receiver, which is fitted to its
-    #: training rows
+    #: whether observations of traced paths differ from measured ones by an offset of each receiver, which is fitted to
+    #: its training rows
     has_offsets: ClassVar[bool] = False
-    #: whether a gain of the receiver changes its reports; False: they are scaled to their extremes
+    #: whether a gain of the receiver changes its observations; False: they are scaled to their extremes
     has_gain: ClassVar[bool] = True
-    #: whether reports tell phases of paths, and so planes that are a few centimetres off
+    #: whether observations tell phases of paths, and so planes that are a few centimetres off
     tells_phases: ClassVar[bool] = True
-    #: whether reports of paths with uncertain phases are expectations over the phases
+    #: whether observations of paths with uncertain phases are expectations over the phases
     averages_phases: ClassVar[bool] = False
     #: whether a law of distance that receivers share describes observations: it predicts for receivers with few
     #: training rows or none, and tells unknown places of receivers
@@ -156,7 +156,7 @@ class Task(ABC):
         return np.asarray(np.abs(mean), float)
 
     def of_rays(self, parts: tuple[Any, Any], shape: tuple[int, int, int], offset: Any, receiver: Any) -> Any:
-        """Reports of the signals of rays of equal solid angle, a tensor [batch, values].
+        """Observations of the signals of rays of equal solid angle, a tensor [batch, values].
 
         Args:
             parts: real and imaginary parts, flat Dr.Jit floats [outputs * batch * rays].
@@ -164,7 +164,7 @@ class Task(ABC):
             offset: tensor of each receiver's offset in dB, of whose type the result is.
             receiver: number of the receiver.
         """
-        raise NotImplementedError(f"task {self.name}: no report of rays")
+        raise NotImplementedError(f"task {self.name}: no observation of rays")
 
     def with_arrays(self, record: Any) -> Any:
         """The record (`wrf_mi.core.Record`) with the arrays that its observations have; `InputError`: unknown."""

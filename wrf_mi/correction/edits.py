@@ -124,7 +124,7 @@ def checked(record: Record, split: Split, options: CorrectionOptions | None) -> 
     record, split = record.at_receivers(numbers), split.at_receivers(numbers)
     task = record.task
     if not task.receiver_with_scene:
-        raise InputError(f"{record.name}: no receiver model reports {task.name} from paths")
+        raise InputError(f"{record.name}: no receiver model observes {task.name} from paths")
     check_observations(record, split, complete=task.complete)
     options = options or default_options(record)
     if task.has_offsets and GAIN not in options.parts:
@@ -196,7 +196,7 @@ class TracedScene:
     def fitted_posterior(self, record: Record, rows: IntArray, edit: SceneEdit | None = None) -> ScenePosterior:
         """The `posterior` of rows that are fitted to (InputError: no path reaches them, or none tells of a surface)."""
         posterior = self.posterior(record, rows, edit)
-        if not any(side.exists.any() for side in posterior.misfit.sides):
+        if not any(field.exists.any() for field in posterior.misfit.traced_fields):
             raise InputError(f"{record.name}: no path reaches a receiver in {self._scene}; trace more interactions")
         if not len(posterior.free("+".join(posterior.options.parts))):
             text = f"no surface is met by {LEAST_PATHS} paths; give more training rows or interactions"
@@ -222,9 +222,9 @@ def moves_planes(stage: str) -> bool:
 
 
 def error_ratio(without: FloatArray, with_rows: FloatArray) -> float:
-    """Error of reports that a correction does not know over that of the same reports once it does, 1 or more.
+    """Ratio of held-out to training error of a correction, 1 or more.
 
-    The ratio of quantiles of errors of the same shape without and with knowledge of the reports, NaN for no report.
+    Quantiles of errors of the same shape, of fits without and with these rows, NaN for no observation.
     """
     observed = np.isfinite(without) & np.isfinite(with_rows)
     larger, smaller = (float(np.quantile(np.abs(values[observed]), LEVEL)) for values in (without, with_rows))

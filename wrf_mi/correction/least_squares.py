@@ -27,7 +27,9 @@ FREEDOM = 4.0  # degrees of freedom of the rows' t distribution: ten times the m
 MEDIAN_OF_MEAN = 0.8
 """Median of a row's mean squared residual in units of the variance: that of a chi-squared variable of 3 to 10 degrees
 of freedom, divided by its mean, is 0.79 to 0.93."""
-LEAST_VARIANCE = 1e-10  # smallest variance of a residual in a unit of about 1: reports are rounded to single precision
+LEAST_VARIANCE = (
+    1e-10  # smallest variance of a residual in a unit of about 1: observations are rounded to single precision
+)
 TRIALS = 8  # largest number of damping factors tried in a step, each `HARDER` times the one before
 HARDER = 8.0  # factor of the damping after a step that fails, and its inverse after one that succeeds
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-6  # damping of the first step and the smallest, relative to the diagonal
@@ -105,8 +107,8 @@ class Prior:
 class Jacobian:
     """Derivatives of residuals [rows, values] by k parameters, 0 without observation.
 
-    A report of few signals has few independent derivatives: those of a row may be stated by their coefficients in an
-    orthonormal basis, so that sums over values are over coefficients.
+    An observation of few signals has few independent derivatives: those of a row may be stated by their coefficients in
+    an orthonormal basis, so that sums over values are over coefficients.
     """
 
     columns: NDArray[np.floating]  # derivatives [k, rows, values], or coefficients [k, rows, m]

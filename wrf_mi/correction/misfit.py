@@ -1,8 +1,8 @@
-"""Residuals of traced reports over the rows of a record, and their derivatives by parameters of the scene.
+"""Residuals of traced observations over the rows of a record, and their derivatives by parameters of the scene.
 
 Spectra are compared on a lattice of at most `LATTICE` directions, as an array of few elements has few independent
-ones; both sides are scaled to their extremes there. Channels are divided by the root mean square of a row's, as their
-score is relative, and of a median row's, as rows in deep fades have errors too.
+ones; traced and measured spectra are scaled to their extremes there. Channels are divided by the root mean square of a
+row's, as their score is relative, and of a median row's, as rows in deep fades have errors too.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ..tracing.paths.corrected_scene import MovedSearch
 from ..tracing.paths.instrument_parameters import instrument_parameters
 from ..tracing.paths.scene_parameters import PREFIX, QUANTITIES, SHIFT, TILT
 from ..tracing.paths.solve import Prepared
-from ..tracing.paths.traced_field import TracedField, traced_fields
+from ..tracing.paths.traced_field import TracedField, trace_fields
 from .least_squares import Derivatives, Jacobian, Residuals
 from .options import CorrectionOptions
 
@@ -40,61 +40,61 @@ FLOOR = 0.5  # share of a median row's magnitude that is added to each row's own
 class PathTable(NamedTuple):
     """The n paths of a misfit, and what they meet [n, depth]."""
 
-    entry: IntArray  # place among the entries of the side's `wrf_mi.receivers.device_paths.TracedPaths` [n]
-    side: IntArray  # number of the side [n], ascending
-    row: IntArray  # row of `Misfit.residual` [n], ascending in a side
+    entry: IntArray  # place among the entries of the port's `wrf_mi.receivers.device_paths.TracedPaths` [n]
+    port: IntArray  # number of the port [n], ascending
+    row: IntArray  # row of `Misfit.residual` [n], ascending in a port
     plane: IntArray  # place in `Misfit.planes`, -1 for none
     slab: IntArray  # place in `Misfit.slabs`, -1 for none
     reflects: NDArray[np.bool_]  # whether the path is reflected there
 
 
 class _Port:
-    """A receiver at a carrier: its traced side, receiver models of what is compared and of complete images (which are
+    """A receiver at a carrier: its traced field, receiver models of what is compared and of complete images (which are
     scored), its rows' places in ``Misfit.observed``, and recorded functions of parameters by name.
     """
 
-    def __init__(self, side: TracedField, model: Any, complete: Any, places: IntArray) -> None:
-        self.side, self.model, self.complete, self.places = side, model, complete, places
+    def __init__(self, traced_field: TracedField, model: Any, complete: Any, places: IntArray) -> None:
+        self.traced_field, self.model, self.complete, self.places = traced_field, model, complete, places
 
     def record(self, start: Mapping[str, Any]) -> None:
         """Make the functions; arrays made from NumPy's memory at first use must exist before they are recorded."""
-        side, model = self.side, self.model
+        traced_field, model = self.traced_field, self.model
 
-        def report(params: Mapping[str, Any]) -> Any:  # flat reports of all rows
+        def predict(params: Mapping[str, Any]) -> Any:  # flat observations of all rows
             with dr.suspend_grad():
-                reports = model(side(params), None)
-                dr.eval(reports)
-            return reports
+                predicted = model(traced_field(params), None)
+                dr.eval(predicted)
+            return predicted
 
-        # Derivatives of reports in one direction: forward mode, as rows outnumber the columns of a Jacobian.
+        # Derivatives of observations in one direction: forward mode, as rows outnumber the columns of a Jacobian.
         def tangent(params: Mapping[str, Any], direction: Mapping[str, Any]) -> Any:
             # Gradients of the caller's arrays stay off: all columns share them, and one recording.
             values = {name: dr.copy(value) for name, value in params.items()}
             for name, value in values.items():
                 dr.enable_grad(value)
                 dr.set_grad(value, direction[name])
-            reports = model(side(values), None)
-            dr.forward_to(reports)
-            slope = dr.grad(reports)
+            predicted = model(traced_field(values), None)
+            dr.forward_to(predicted)
+            slope = dr.grad(predicted)
             dr.eval(slope)
             return slope
 
-        def gain(params: Mapping[str, Any], entries: Any) -> Any:  # of paths by their places in the side
+        def gain(params: Mapping[str, Any], entries: Any) -> Any:  # of paths by their places in the field
             with dr.suspend_grad():
-                gains = side(params, entries=entries).gain
+                gains = traced_field(params, entries=entries).gain
                 dr.eval(gains)
             return gains
 
         model.arrays(mi.Float)
-        report(start)
-        self.report, self.tangent = (
-            Recorded(function, lambda: [side.arrays, model.arrays(mi.Float)]) for function in (report, tangent)
+        predict(start)
+        self.predict, self.tangent = (
+            Recorded(function, lambda: [traced_field.arrays, model.arrays(mi.Float)]) for function in (predict, tangent)
         )
-        self.gain = Recorded(gain, lambda: side.arrays)
+        self.gain = Recorded(gain, lambda: traced_field.arrays)
 
 
 class Misfit:
-    """Reports of the paths of some rows of a record, as a function of a vector of parameters.
+    """Observations of the paths of some rows of a record, as a function of a vector of parameters.
 
     ``prepared`` is the shared state of the scene, at the record's carrier or, of several, at the one at which
     parameters of materials hold; ``options`` say which parameters of `TracedField.parameters` are entries of the
@@ -126,10 +126,10 @@ class Misfit:
         # Numbers of the scene's planes and of its surfaces whose parameters are entries of the vector, in their order.
         self.planes, self.slabs = np.arange(len(prepared.surfaces.normal)), np.arange(len(self.tables.slabs.names))
         if surfaces is not None:
-            self.planes, self.slabs = _met_surfaces(self.sides, len(self.planes), len(self.slabs), *surfaces)
+            self.planes, self.slabs = _met_surfaces(self.traced_fields, len(self.planes), len(self.slabs), *surfaces)
             tables = self.tables.select(prepared.surfaces, self.planes, self.slabs)
             for port in self.ports:
-                port.side = port.side.select(tables, self.planes, self.slabs)
+                port.traced_field = port.traced_field.select(tables, self.planes, self.slabs)
         self._instruments = dict[str, NDArray[np.float32]]()
         for receiver in placed:
             self._instruments |= instrument_parameters(receiver, self._traced.pattern_degree)
@@ -141,7 +141,7 @@ class Misfit:
     def _lay_out(self, options: CorrectionOptions) -> None:
         """Positions of parameters in the vector, one after the other, and their stated values ``start`` [p]."""
         # Materials, planes and devices in an order that is the same whichever receivers have rows.
-        of_scene = self.sides[0].parameters().items()
+        of_scene = self.traced_fields[0].parameters().items()
         values = {name: value for name, value in of_scene if name.startswith((PREFIX, SHIFT, TILT))} | self._instruments
         values = {name: value for name, value in values.items() if options.changes(name)}
         self._shapes = {name: value.shape for name, value in values.items()}
@@ -150,9 +150,9 @@ class Misfit:
         self.start = np.concatenate([*map(np.ravel, values.values())]).astype(float)
 
     @property
-    def sides(self) -> list[TracedField]:
-        """Traced sides of the ports."""
-        return [port.side for port in self.ports]
+    def traced_fields(self) -> list[TracedField]:
+        """Traced fields of the ports."""
+        return [port.traced_field for port in self.ports]
 
     def _traced_ports(self, numbers: IntArray, prepared: Prepared, searched: MovedSearch | None) -> list[_Port]:
         """Ports of the receivers, which have these numbers in the record."""
@@ -167,11 +167,13 @@ class Misfit:
         ports, make = list[_Port](), RECEIVERS[form.receiver].of
         for number, receiver in zip(numbers, self.receivers, strict=True):
             of_receiver = record.tx_pos_m[rows], receiver, self._traced, prepared, heading, carriers
-            sides = traced_fields(*of_receiver, searched=searched)
-            for side, (carrier_hz, which) in zip(sides, rows_by_carrier(carriers, len(rows)), strict=True):
+            traced_fields = trace_fields(*of_receiver, searched=searched)
+            for traced_field, (carrier_hz, which) in zip(
+                traced_fields, rows_by_carrier(carriers, len(rows)), strict=True
+            ):
                 at = form if carrier_hz is None else replace(form, frequencies_hz=np.array([carrier_hz]))
                 models = make(at, receiver), make(replace(at, size=(height, width)), receiver)
-                ports.append(_Port(side, *models, number * len(rows) + which))
+                ports.append(_Port(traced_field, *models, number * len(rows) + which))
         return ports
 
     def of_scene(self, vector: FloatArray) -> dict[str, FloatArray]:
@@ -203,7 +205,7 @@ class Misfit:
             coarse = minmax_scale(stored[:, :, :: self._strides[0], :: self._strides[1]].astype(float))
             return coarse.reshape(count, -1), np.ones(count)
         if np.iscomplexobj(stored):
-            # Real and imaginary parts in turn, as receiver models report channels.
+            # Real and imaginary parts in turn, as receiver models observe channels.
             pairs = np.ascontiguousarray(stored, np.complex128).view(float).reshape(count, -1)
             power = np.square(pairs).sum(axis=1)
             # The score is relative to a row's own power, but rows in deep fades have the errors of all others.
@@ -214,7 +216,7 @@ class Misfit:
     @property
     def several_carriers(self) -> bool:
         """Whether rows of several carriers tell how conductivities depend on the frequency."""
-        return len({port.side.frequency_hz for port in self.ports}) > 1
+        return len({port.traced_field.frequency_hz for port in self.ports}) > 1
 
     def named(self, vector: FloatArray) -> dict[str, NDArray[np.float32]]:
         """Parameters of a vector [p] by name."""
@@ -225,39 +227,39 @@ class Misfit:
         return {name: to_tensor(value) for name, value in self.named(vector).items()}
 
     def residual(self, vector: FloatArray) -> FloatArray:
-        """Reports minus observations of a vector [p]: [n_rx * rows, values], NaN where nothing was received."""
-        params, reports = self._device(vector), np.zeros(self.observed.shape)
+        """Predictions of a vector [p] less observations: [n_rx * rows, values], NaN where nothing was received."""
+        params, predicted = self._device(vector), np.zeros(self.observed.shape)
         for port in self.ports:
-            reports[port.places] = np.asarray(port.report(params).numpy(), float).reshape(len(port.places), -1)
-        return reports / self.unit[:, None] - self.observed
+            predicted[port.places] = np.asarray(port.predict(params).numpy(), float).reshape(len(port.places), -1)
+        return predicted / self.unit[:, None] - self.observed
 
     def mean_squares(self, vectors: FloatArray) -> FloatArray:
         """Means of each row's squares of `residual` at vectors [v, p], [v, n_rx * rows]."""
         return np.stack([np.square(self.residual(vector)).mean(axis=1) for vector in vectors])
 
     def missing_gains(self, vector: FloatArray) -> dict[str, float]:
-        """Logarithm of the amplitude that reports of each receiver lack, by the name of its gain, over its carriers."""
-        # Least squares of a phase start from equal mean magnitudes, else the smallest reports would fit best.
+        """Logarithm of the amplitude that each receiver's predictions lack, over its carriers, by name of its gain."""
+        # Least squares of a phase start from equal mean magnitudes, else the smallest predictions would fit best.
         missing = dict[str, list[float]]()
-        if not any(port.side.gain_name in self.parts for port in self.ports):
+        if not any(port.traced_field.gain_name in self.parts for port in self.ports):
             return {}
-        reports = self.residual(vector) + self.observed
+        predicted = self.residual(vector) + self.observed
         for port in self.ports:
             rows = port.places[np.isfinite(self.observed[port.places]).all(axis=1)]
             if len(rows):
-                pair = (values[rows].reshape(-1, *port.model.shape) for values in (reports, self.observed))
-                missing.setdefault(port.side.gain_name, []).append(port.model.missing_gain(*pair))
+                pair = (values[rows].reshape(-1, *port.model.shape) for values in (predicted, self.observed))
+                missing.setdefault(port.traced_field.gain_name, []).append(port.model.missing_gain(*pair))
         return {name: float(np.mean(values)) for name, values in missing.items()}
 
     @cached_property
     def paths(self) -> PathTable:
-        """Rows, sides and interactions of all paths, side by side."""
-        depth = max(len(side.chains.levels) for side in self.sides)
-        entries = [np.flatnonzero(side.exists) for side in self.sides]
+        """Rows, ports and interactions of all paths, one after the other."""
+        depth = max(len(field.chains.levels) for field in self.traced_fields)
+        entries = [np.flatnonzero(field.exists) for field in self.traced_fields]
         ports = zip(self.ports, entries, strict=True)
         # Entries lie transmitter by transmitter, an equal number of each.
-        row = [port.places[exists // (len(port.side.exists) // len(port.places))] for port, exists in ports]
-        met = zip(*(side.chains.met(depth) for side in self.sides), strict=True)
+        row = [port.places[exists // (len(port.traced_field.exists) // len(port.places))] for port, exists in ports]
+        met = zip(*(field.chains.met(depth) for field in self.traced_fields), strict=True)
         number = np.repeat(np.arange(len(entries)), [len(places) for places in entries])
         return PathTable(np.concatenate(entries), number, np.concatenate(row), *map(np.concatenate, met))
 
@@ -280,21 +282,21 @@ class Misfit:
     def gains(self, vector: FloatArray, which: IntArray) -> NDArray[np.complex128]:
         """Gains of a vector [p], without exp(-j k length), of the paths ``which`` of `paths`, ascending."""
         params, result, paths = self._device(vector), np.zeros(len(which), complex), self.paths
-        for number in np.unique(paths.side[which]):
-            of_side = paths.side[which] == number
-            real, imaginary = self.ports[number].gain(params, to_uint(paths.entry[which[of_side]]))
-            result[of_side] = np.asarray(real) + 1j * np.asarray(imaginary)
+        for number in np.unique(paths.port[which]):
+            of_port = paths.port[which] == number
+            real, imaginary = self.ports[number].gain(params, to_uint(paths.entry[which[of_port]]))
+            result[of_port] = np.asarray(real) + 1j * np.asarray(imaginary)
         return result
 
     def unit_signals(self, vector: FloatArray) -> NDArray[np.complex128]:
         """Signals [paths, elements] of all paths of a vector [p] at an array's elements, for gains of one."""
         params, signals = self._device(vector), list[NDArray[np.complex128]]()
         for number, port in enumerate(self.ports):
-            entry = self.paths.entry[self.paths.side == number]
+            entry = self.paths.entry[self.paths.port == number]
             if not len(entry):
                 continue
             with dr.suspend_grad():
-                traced = port.side(params, entries=to_uint(entry))
+                traced = port.traced_field(params, entries=to_uint(entry))
                 unit_gain = dr.ones(type(traced.length_m), len(entry))
                 # Each path as a transmitter's only one, so that the sum at the elements is its wave.
                 alone = replace(traced, gain=(unit_gain, dr.zeros(type(unit_gain), len(entry))))
@@ -318,21 +320,21 @@ class Misfit:
         slopes[:, ~np.isfinite(self.observed).all(axis=1)] = 0
         return Jacobian(slopes)
 
-    def reports(self, vector: FloatArray) -> NDArray[Any]:
-        """Complete reports of a vector [p] as observations [n_rx, rows, ...]; NaN of receivers that have none."""
+    def predicted(self, vector: FloatArray) -> NDArray[Any]:
+        """Complete observations predicted by a vector [p], [n_rx, rows, ...]; NaN of receivers that have none."""
         params, stored = self._device(vector), self.record.observation[:, self.rows]
         kind = complex if np.iscomplexobj(stored) else float
-        reports = np.full((len(self.observed), *stored.shape[2:]), np.nan, kind)
+        predicted = np.full((len(self.observed), *stored.shape[2:]), np.nan, kind)
         for port in self.ports:
             with dr.suspend_grad():
-                values = np.asarray(port.complete(port.side(params), None).numpy(), float)
-            reports[port.places] = values.view(kind).reshape(-1, *stored.shape[2:])
-        return reports.reshape(stored.shape)
+                values = np.asarray(port.complete(port.traced_field(params), None).numpy(), float)
+            predicted[port.places] = values.view(kind).reshape(-1, *stored.shape[2:])
+        return predicted.reshape(stored.shape)
 
     def scores(self, vector: FloatArray) -> FloatArray:
-        """Scores of the task of complete reports, [n_rx * rows]; NaN where nothing was received."""
-        pairs = zip(self.reports(vector), self.record.observation[:, self.rows], strict=True)
-        return np.concatenate([self._task.of_rows(report[None], truth[None])[0] for report, truth in pairs])
+        """Scores of the task of complete observations, [n_rx * rows]; NaN where nothing was received."""
+        pairs = zip(self.predicted(vector), self.record.observation[:, self.rows], strict=True)
+        return np.concatenate([self._task.of_rows(predicted[None], truth[None])[0] for predicted, truth in pairs])
 
     def accept(self, vector: FloatArray) -> None:
         """Nothing, as residuals are exact at all vectors (`wrf_mi.correction.path_sum.PathSum.accept`)."""
@@ -351,15 +353,15 @@ class Misfit:
 
 
 def _met_surfaces(
-    sides: Sequence[TracedField], plane_count: int, slab_count: int, planes: IntArray, slabs: IntArray
+    traced_fields: Sequence[TracedField], plane_count: int, slab_count: int, planes: IntArray, slabs: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Numbers of the planes and surfaces of a scene that paths meet, and of further ones, ascending."""
     # Of furniture of 100,000 facets, the paths of some rows meet hundreds: parameters of all would take gigabytes.
     used = np.zeros(plane_count, bool), np.zeros(slab_count, bool)
     for mask, further, column in zip(used, (planes, slabs), (0, 1), strict=True):
         mask[further] = True
-        for side in sides:
-            numbers = side.chains.met(len(side.chains.levels))[column]
+        for traced_field in traced_fields:
+            numbers = traced_field.chains.met(len(traced_field.chains.levels))[column]
             mask[numbers[numbers >= 0]] = True
         mask[:1] = True  # Dr.Jit gathers from no empty array
     return np.flatnonzero(used[0]), np.flatnonzero(used[1])

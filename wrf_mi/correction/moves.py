@@ -103,7 +103,7 @@ def material_choices(posterior: ScenePosterior, slabs: IntArray) -> list[Surface
             least = max(permittivity - 1, LEAST_SUSCEPTIBILITY), max(conductivity, LEAST_CONDUCTIVITY)
             values[name] = np.append(np.log([*least, thickness]), itu_exponent(name, hz))
     values[ABSENT] = ABSENT_VALUES
-    names, of_plane = misfit.sides[0].slabs.names, np.zeros(len(QUANTITIES), bool)
+    names, of_plane = misfit.traced_fields[0].slabs.names, np.zeros(len(QUANTITIES), bool)
     return [SurfaceChoice(names[slab], material_places(misfit, slab), values, of_plane) for slab in slabs]
 
 

@@ -83,7 +83,7 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
 
     @property
     def traced(self) -> TracedOptions:
-        """Options of the traced side: reflections and transmissions, a material of each surface, planes that move."""
+        """Options of the traced component: reflections, transmissions, a material of each surface, planes that move."""
         degree = self.pattern_degree if PATTERNS in self.parts else 0
         return TracedOptions(
             self.options, degree, materials="surface", planes=True, faint=self.faint, constants=QUANTITIES

@@ -67,7 +67,7 @@ def write_scene(state: State, kinds: Mapping[str, Kind], folder: Path) -> None:
 
     ``kinds`` are those of the objects of the stated scene.
     """
-    opened = state.posterior.misfit.sides[0].scene
+    opened = state.posterior.misfit.traced_fields[0].scene
     how: dict[str, Any] = {"kinds": kinds, "absent": state.absent(), "replace": True}
     write_corrected_scene(folder, opened, state.scene_parameters(), grouping="surface", **how)
 
@@ -111,7 +111,7 @@ def _stage(stage: str) -> str:
 
 def _planes(correction: Correction) -> list[dict[str, Any]]:
     """Each plane that paths meet: objects, paths, movement and its standard deviation."""
-    misfit, surfaces = correction.misfit, correction.misfit.sides[0].surfaces
+    misfit, surfaces = correction.misfit, correction.misfit.traced_fields[0].surfaces
     if SHIFT not in misfit.parts:
         return []
     shift, tilt = (misfit.parts[name] for name in (SHIFT, TILT))
@@ -140,7 +140,7 @@ def _planes(correction: Correction) -> list[dict[str, Any]]:
 
 def _materials(correction: Correction) -> list[dict[str, Any]]:
     """Each surface that paths meet: paths, constants before and after, standard deviations of their logarithms."""
-    misfit, slabs, state = correction.misfit, correction.misfit.sides[0].slabs, correction.state
+    misfit, slabs, state = correction.misfit, correction.misfit.traced_fields[0].slabs, correction.state
     fitted = slabs.fitted(misfit.named(correction.vector)) if correction.kept else slabs
     # Constants, not their logarithms, which parameters are; their uncertainty is a factor.
     before, after = (np.column_stack([part.table, part.exponent]).tolist() for part in (slabs, fitted))
@@ -173,7 +173,7 @@ def _frame(correction: Correction) -> dict[str, Any] | None:
     misfit = correction.misfit
     if FRAME not in correction.kept.split("+"):
         return None
-    surfaces, places = misfit.sides[0].surfaces, misfit.plane_entries
+    surfaces, places = misfit.traced_fields[0].surfaces, misfit.plane_entries
     change, precision = np.zeros((2, 3 * len(surfaces.normal)))
     entries, free = scene_entries(misfit.planes, len(surfaces.normal)), np.isin(places, correction.state.free)
     # The motion nearest to all planes, each as certain as the fit knows it; planes that were not fitted do not count.
@@ -301,7 +301,7 @@ def _changes_of_materials(correction: Correction, facts: dict[str, Any]) -> list
 
 def _picture(correction: Correction, facts: dict[str, Any]) -> Figure:
     """The scene coloured by the shifts of its planes, or where none moved by its materials, and the held-out scores."""
-    surfaces = correction.misfit.sides[0].surfaces
+    surfaces = correction.misfit.traced_fields[0].surfaces
     parameters = correction.state.scene_parameters()
     triangles = moved_triangles(surfaces, parameters)
     shift = np.zeros(len(surfaces.normal)) + 1e3 * parameters.get(SHIFT, 0.0)

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 def lengths_and_slopes(misfit: Misfit, mirrors: IntArray, vector: FloatArray) -> tuple[FloatArray, csr_array]:
     """Lengths [n] of paths that planes ``mirrors`` [n, depth] reflect (-1: none), and slopes by planes [n, 3 q]."""
-    surfaces, chosen, count = misfit.sides[0].surfaces, misfit.planes, len(misfit.planes)
+    surfaces, chosen, count = misfit.traced_fields[0].surfaces, misfit.planes, len(misfit.planes)
     axes, centre = surfaces.axes[chosen], surfaces.plane_centres_m[chosen]
     shift, tilt = (vector[misfit.parts[name]] for name in (SHIFT, TILT))
     normal, offset = surfaces.moved_planes(shift, tilt.reshape(count, 2), chosen)
-    sources = [np.stack([np.asarray(c) for c in side.chains.source_m], axis=-1) for side in misfit.sides]
+    sources = [np.stack([np.asarray(c) for c in field.chains.source_m], axis=-1) for field in misfit.traced_fields]
     first = np.cumsum([0, *map(len, sources[:-1])])
-    point = np.concatenate(sources)[first[misfit.paths.side] + misfit.paths.entry]
-    image = np.array([side.receiver.position_m for side in misfit.sides], float)[misfit.paths.side]
+    point = np.concatenate(sources)[first[misfit.paths.port] + misfit.paths.entry]
+    image = np.array([field.receiver.position_m for field in misfit.traced_fields], float)[misfit.paths.port]
     # Image method (Balanis 2012, section 7.4): the receiver mirrored in the planes, from its end of the chain.
     for at in mirrors.T[::-1]:
         row = np.flatnonzero(at >= 0)

@@ -64,7 +64,7 @@ def _follows(name: str, moving: bool) -> bool:
     return name.startswith(PREFIX) or is_gain or (moving and name in (SHIFT, TILT))
 
 
-def _serves_reports(misfit: Misfit, carriers: int) -> bool:
+def _serves_observations(misfit: Misfit, carriers: int) -> bool:
     sums = sums_of(misfit)
     if sums == "elements":
         # Element signals of all paths, of arrays of one size.
@@ -74,7 +74,7 @@ def _serves_reports(misfit: Misfit, carriers: int) -> bool:
 
 
 def sums_of(misfit: Misfit) -> Sums | None:
-    """What all receivers report sums of (`wrf_mi.receivers.registry.ReceiverModel.sums`); None: they differ."""
+    """What all receivers observe sums of (`wrf_mi.receivers.registry.ReceiverModel.sums`); None: they differ."""
     kinds = {port.model.sums for port in misfit.ports}
     return kinds.pop() if len(kinds) == 1 else None
 
@@ -88,9 +88,9 @@ class PathSum:
         self._coherent = sums_of(misfit) != "powers"
         material = [np.arange(part.start, part.stop) for name, part in misfit.parts.items() if name.startswith(PREFIX)]
         self._material = np.array(material, np.int64).reshape(len(material), len(misfit.slabs))
-        gains = [(port.side.gain_name, port.places) for port in misfit.ports]
+        gains = [(port.traced_field.gain_name, port.places) for port in misfit.ports]
         self._factors = [(misfit.parts[name], places) for name, places in gains if name in misfit.parts]
-        # Receiver models with different reports of signals, and the number of that of each row.
+        # Receiver models with different observations of signals, and the number of that of each row.
         models, self._model_of = dict[Any, Any](), np.zeros(len(misfit.observed), np.int64)
         for port in misfit.ports:
             models.setdefault(port.model.signal_key, port.model)
@@ -118,12 +118,12 @@ class PathSum:
     @staticmethod
     def serves(misfit: Misfit) -> bool:
         """Whether a misfit is of channels or spectra by materials, planes and gains, or of strengths without planes."""
-        gains = {port.side.gain_name for port in misfit.ports}
+        gains = {port.traced_field.gain_name for port in misfit.ports}
         carriers = len(misfit.ports) // len(misfit.receivers)
         # Receivers of one name share parameters: their sums would not be told apart.
         apart, moving = len(gains) * carriers >= len(misfit.ports), sums_of(misfit) != "powers"
         follows = all(_follows(name, moving) for name in misfit.parts)
-        return apart and follows and _serves_reports(misfit, carriers)
+        return apart and follows and _serves_observations(misfit, carriers)
 
     def residual(self, vector: FloatArray) -> FloatArray:
         """Residuals as `Misfit.residual`, lengths linear in planes, gains at the angles of the first vector."""
@@ -174,18 +174,18 @@ class PathSum:
         return rows, residual.reshape(*total.shape[:2], residual.shape[1])
 
     def _residual_of(self, signal: Complex, rows: IntArray) -> FloatArray:
-        reports = [self._models[number].signal_report(signal[run]) for number, run in self._runs(rows)]
-        return _joined(reports, self.misfit) / self.misfit.unit[rows, None] - self.misfit.observed[rows]
+        predicted = [self._models[number].signal_observation(signal[run]) for number, run in self._runs(rows)]
+        return _joined(predicted, self.misfit) / self.misfit.unit[rows, None] - self.misfit.observed[rows]
 
     def _runs(self, rows: IntArray) -> list[tuple[int, slice]]:
-        """Numbers of receiver models and ranges of ``rows`` that they report."""
+        """Numbers of receiver models and ranges of ``rows`` that they observe."""
         # Rows of paths lie side by side, so that there are few ranges, and slices need no copies.
         number = self._model_of[rows]
         bounds = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(rows)]
         return [(int(number[begin]), slice(begin, end)) for begin, end in pairwise(bounds) if begin < end]
 
     def _slopes(self, signal: Complex, rows: IntArray) -> Slopes:
-        """Derivatives of the reports of the signals of some rows."""
+        """Derivatives of the observations of the signals of some rows."""
         parts: list[list[Complex]] = [[] for _ in self._models]
         place = np.zeros(len(rows), np.int64)
         for number, run in self._runs(rows):
@@ -222,7 +222,7 @@ class PathSum:
         basis, coefficients = None, None
         width, values = 2 * total.shape[1], self.misfit.observed.shape[1]
         if len(columns) > width and values > width:
-            # A report changes by the real and imaginary parts of few signals: by far less than by values.
+            # An observation changes by the real and imaginary parts of few signals: by far less than by values.
             units = [*np.eye(width // 2), *(1j * np.eye(width // 2))]
             parts = on_threads(lambda unit: slopes(np.tile(unit, (len(rows), 1)), np.arange(len(rows))), units)
             of_row = np.stack(parts, axis=-1).astype(np.float32)
@@ -377,15 +377,15 @@ class PathSum:
 def _unit_waves(misfit: Misfit, vector: FloatArray, length_m: FloatArray) -> tuple[FloatArray, Complex]:
     """Wavenumbers [paths or 1, frequencies or 1] and waves [paths, frequencies or elements] for gains of one."""
     if sums_of(misfit) == "elements":
-        hz = np.array([port.side.frequency_hz for port in misfit.ports])
-        return (2 * np.pi * hz / speed_of_light)[misfit.paths.side, None], misfit.unit_signals(vector)
+        hz = np.array([port.traced_field.frequency_hz for port in misfit.ports])
+        return (2 * np.pi * hz / speed_of_light)[misfit.paths.port, None], misfit.unit_signals(vector)
     assert misfit.record.frequencies_hz is not None
     k = 2 * np.pi * np.asarray(misfit.record.frequencies_hz, float)[None] / speed_of_light
     return k, np.exp(-1j * length_m[:, None] * k)
 
 
 def _joined(parts: Sequence[FloatArray], misfit: Misfit) -> FloatArray:
-    """Reports of consecutive rows [n, values]; without a copy of the only part."""
+    """Observations of consecutive rows [n, values]; without a copy of the only part."""
     return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, misfit.observed.shape[1])), *parts])
 
 

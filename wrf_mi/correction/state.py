@@ -122,7 +122,7 @@ class State:
         """
         misfit, parameters = self.posterior.misfit, self.posterior.misfit.of_scene(self.vector)
         if self._moves_frame:
-            surfaces = misfit.sides[0].surfaces
+            surfaces = misfit.traced_fields[0].surfaces
             count = len(surfaces.normal)
             # All planes move with the frame, and those that have entries as their entries say.
             moved = rigid_motions(surfaces) @ self.posterior.motion(self.vector, misfit.plane_entries[:0])
@@ -144,7 +144,7 @@ class State:
     def absent(self) -> frozenset[int]:
         """Surfaces that are left out of the scene, by their numbers there."""
         misfit = self.posterior.misfit
-        names = misfit.sides[0].slabs.names
+        names = misfit.traced_fields[0].slabs.names
         slabs = [slab for slab, name in enumerate(names) if self.materials.get(name) == ABSENT]
         # Least squares may bring a surface back that the choice left out; a face that the scan lacks, it may not.
         thin = {slab for slab in slabs if self.vector[material_places(misfit, slab)[0]] < np.log(STILL_ABSENT)}
@@ -184,13 +184,13 @@ class ScenePosterior:
         bodies: Sequence[frozenset[str]] = (),
     ) -> None:
         self.misfit, self.options, self.on_stage = misfit, options, on_stage
-        names = misfit.sides[0].slabs.names  # <object>/<plane>
+        names = misfit.traced_fields[0].slabs.names  # <object>/<plane>
         objects = np.array([name.partition("/")[0] for name in names], str)
         faces = [np.flatnonzero(np.isin(objects, [*body])) for body in bodies]
         self.bodies = [slabs for slabs in faces if len(slabs) > 1]  # places in `Misfit.slabs` of the faces of each box
         # Surfaces of objects that the stated scene lacks: their places in `Misfit.slabs` by name.
         self.supposed = {names[slab]: slab for slab in np.flatnonzero(np.isin(objects, [*hidden])).tolist()}
-        self.frequency_hz = float(misfit.sides[0].scene.frequency[0])
+        self.frequency_hz = float(misfit.traced_fields[0].scene.frequency[0])
         # Places among the misfit's planes and slabs, most paths first. Few paths tell of no surface: their noise would
         # move it anywhere within the prior.
         self.planes, self.slabs = map(_met_most, misfit.counts())
@@ -261,7 +261,7 @@ class ScenePosterior:
     @cached_property
     def motions(self) -> FloatArray:
         """Derivatives of the misfit's plane entries by a rigid motion of the scene [3 k, 6] (`rigid_motions`)."""
-        every = rigid_motions(self.misfit.sides[0].surfaces)
+        every = rigid_motions(self.misfit.traced_fields[0].surfaces)
         return every[scene_entries(self.misfit.planes, len(every) // 3)]
 
     def expected(self, vector: FloatArray, places: IntArray) -> FloatArray:

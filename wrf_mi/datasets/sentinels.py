@@ -14,7 +14,7 @@ import numpy as np
 from ..core.angles import FloatArray
 from ..core.types import IntArray
 
-IMPOSSIBLE_DBM = -150.0  # thermal noise in 250 Hz at room temperature (-174 dBm per Hz): no receiver reports less
+IMPOSSIBLE_DBM = -150.0  # thermal noise in 250 Hz at room temperature (-174 dBm per Hz): no receiver observes less
 STRONG_DBM = -10.0  # values at the upper end are suspicious from here: below, they are rows next to the receiver
 CUSTOMARY_DBM = frozenset({-999.0, -200.0, -128.0, -127.0, -120.0, -113.0, -110.0, -105.0, -101.0, -100.0, 0.0, 100.0})
 """Numbers that drivers and data sets give for "not heard": fewer rows and smaller gaps suffice."""

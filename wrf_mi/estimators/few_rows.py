@@ -58,7 +58,7 @@ class SharedLaw:
         law: power at one metre in dBm, and minus the exponent, [2].
         level_dbm: level [k] of receivers at unknown places.
         shift_db: shifts [k].
-        std_db: standard deviations of a report about the prediction [k].
+        std_db: standard deviations of an observation about the prediction [k].
         carrier_hz: carrier that the law belongs to; others are shifted as free space is. 0: unknown.
     """
 

@@ -125,7 +125,7 @@ class Decomposition:
 
     prediction: Prediction  #: the prediction
     #: what the traced paths of the scene alone predict, [m, ...] as observations, or, of spectra, as magnitudes in a
-    #: common unit of both sides; NaN where they are not used. None: the model has one side
+    #: common unit of both components; NaN where they are not used. None: the model has one component
     traced: NDArray[Any] | None = None
     learned: NDArray[Any] | None = None  #: what the Gaussians alone predict; None without a scene
     paths: PathStatistics | None = None  #: statistics of the traced paths; None: the model traces none
@@ -169,7 +169,7 @@ class Fitted(ABC):
         return self.predict(inputs, receiver).mean
 
     def decompose(self, inputs: Inputs, receiver: int, std: bool = True) -> Decomposition:
-        """`predict`, with both sides and the paths of a model that has them; ``std``: whether deviations are needed."""
+        """`predict`, with both components and the paths of a model that has them; ``std``: with standard deviations."""
         return Decomposition(self.predict(inputs, receiver) if std else Prediction(self.predict_mean(inputs, receiver)))
 
     @property

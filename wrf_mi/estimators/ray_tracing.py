@@ -111,7 +111,7 @@ class FittedTracing(Fitted):
         assert self.file is not None
         return _stored_trace(self.file, self.problem.record)
 
-    def _reported(self, traced: TraceResult) -> NDArray[Any]:
+    def _observed(self, traced: TraceResult) -> NDArray[Any]:
         observed = self._tracer.observe(traced)
         return observed if self.offsets is None else self.offsets(observed)
 
@@ -121,7 +121,7 @@ class FittedTracing(Fitted):
             return None
         # Receivers are predicted in turn.
         if self._of_rows is None or not np.array_equal(self._of_rows[0], rows):
-            self._of_rows = rows, self._reported(self._stored.of_transmitters(rows))
+            self._of_rows = rows, self._observed(self._stored.of_transmitters(rows))
         return Prediction(self._of_rows[1][receiver])
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
@@ -136,7 +136,7 @@ class FittedTracing(Fitted):
         if self._last is None or not same or receiver in self._last[3]:
             traced = self._tracer.trace(inputs.tx_pos_m, False, inputs.first_row, inputs.carriers_hz)
             statistics = [PathStatistics.of_receiver(traced.paths, index) for index in range(traced.paths.n_rx)]
-            self._last = inputs, self._reported(traced), statistics, set()
+            self._last = inputs, self._observed(traced), statistics, set()
         self._last[3].add(receiver)
         return Decomposition(Prediction(self._last[1][receiver]), paths=self._last[2][receiver])
 
@@ -288,11 +288,11 @@ class RayTracing(Model):
         offsets = None
         if record.task.has_offsets:
             training_rows = split.all_train
-            reported = tracer.observe(traced)[:, training_rows]
+            traced_observation = tracer.observe(traced)[:, training_rows]
             if not settings.transmission:
-                _warn_of_walls(reported, record.observation[:, training_rows])
+                _warn_of_walls(traced_observation, record.observation[:, training_rows])
             try:
-                offsets = fit_offsets(reported, record.observation[:, training_rows])
+                offsets = fit_offsets(traced_observation, record.observation[:, training_rows])
             except InputError:  # a resumed fit would be refused for the same paths: no progress
                 if not stored:  # else fitted folds have them
                     path.unlink()

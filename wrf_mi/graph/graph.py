@@ -1,4 +1,4 @@
-"""One graph of both sides: Gaussians splatted or traced, paths evaluated on planes, receivers that report both.
+"""Differentiable graph of traced paths, Gaussians (splatted or traced) and receivers, which observe both components.
 
     tx position or uplink ─► Gaussians ─ splat or trace ─► L(u) ─┐
                                                                  ├─► receiver model ─► spectrum, dBm, channel
@@ -8,7 +8,7 @@ A *port* is a receiver at a carrier: rows of several carriers have as many ports
 parameters; other data have one.
 
 Every argument that training changes is a parameter by name: those of the field (`wrf_mi.gaussians`), ``level``, the
-logarithm of the unit in which each receiver sees the learned side, and of the traced side ``material.*``,
+logarithm of the unit in which each receiver sees the learned component, and of the traced component ``material.*``,
 ``receiver.*``, ``pattern.*`` (`wrf_mi.tracing.paths.traced_field.TracedField`) and ``surface.*``
 (`wrf_mi.tracing.paths.surface_gaussians`). Without a scene Sionna RT is not imported.
 """
@@ -34,22 +34,22 @@ from ..core.antenna import ANTENNA
 from ..gaussians import Factorised, WithAttributes, WrfGs, WrfGsPlus
 from ..gaussians.parameters import by_component, gaussians_in_parts
 from ..gaussians.tiles import TiledPlane
-from ..receivers.device_paths import TracedPaths, draws_on_device, expected_report, spread
+from ..receivers.device_paths import TracedPaths, draws_on_device, expected_observation, spread
 from ..receivers.registry import RECEIVERS, ObservationSpec
 from ..tracing.options import FACTOR
 from ..tracing.paths.instrument_parameters import receiver_pose
 from ..tracing.paths.solve import Prepared
 from ..tracing.paths.surface_gaussians import Interactions, SurfaceGaussians
-from ..tracing.paths.traced_field import TracedField, TracedOptions, traced_fields
+from ..tracing.paths.traced_field import TracedField, TracedOptions, trace_fields
 from ..tracing.tracer import check_polarization
 from .evaluations import Evaluation, evaluation_named
 from .settings import DEFAULT, SPLATTED, TracedConfig
 
 Field = WrfGs | WrfGsPlus | Factorised | WithAttributes
-LEVEL = "level"  # parameter [1, n_rx] of the learned side: logarithm of each receiver's unit of amplitude
+LEVEL = "level"  # parameter [1, n_rx] of the learned component: logarithm of each receiver's unit of amplitude
 SHARE = 0.1  # initial learned amplitude relative to the amplitude of the paths
 MATCHING = 3  # passes of `Graph.match_gain`: in the first, magnitudes may be below the receiver's floor
-MATCHED = 256  # most transmitters whose reports it compares
+MATCHED = 256  # most transmitters whose observations it compares
 
 
 @dataclass
@@ -57,7 +57,7 @@ class Batch:
     """A batch of transmitters and their receiver, on the device."""
 
     condition: Any  # positions [3, batch], metres, or features [features, batch] in their place
-    slots: Any  # rows of the traced side [batch]
+    slots: Any  # rows of the traced field [batch]
     receiver: Any  # number of the receiver, from 0
     pose: Pose  # pose of the receiver
     plane: TiledPlane  # directions of the learned signal
@@ -75,8 +75,8 @@ class Batch:
         return type(self.condition)(joint, (count + 1, width))
 
 
-Alone = Literal["traced", "learned"]  # component reported alone: traced or learned
-Report = Callable[[Mapping[str, Any], Batch], Any]  # ``report(params, batch)``: flat, differentiable observations
+Component = Literal["traced", "learned"]  # component that is observed without the other
+ObservationFunction = Callable[[Mapping[str, Any], Batch], Any]  # ``observe(params, batch)``: flat, differentiable
 
 
 class Graph:
@@ -157,7 +157,7 @@ class Graph:
 
     @property
     def corrects(self) -> bool:
-        """Whether the Gaussians correct a report without them: paths, or a channel of zero."""
+        """Whether the Gaussians correct an observation without them: paths, or a channel of zero."""
         is_channel = self.kind.complex_valued and not self.form.features
         return self.field is not None and (self.scene is not None or is_channel)
 
@@ -183,57 +183,57 @@ class Graph:
         carriers_hz: FloatArray | None = None,
         params: Mapping[str, Any] | None = None,
     ) -> Sequence[TracedField | None]:
-        """The traced sides of a receiver, one for each carrier of the transmitters, from one search for paths.
+        """The traced fields of a receiver, one for each carrier of the transmitters, from one search for paths.
 
         Transmitters [n, 3] are in the world frame, metres; ``tx_heading_rad`` is the yaw of each one's frame [n] (None:
         0), ``carriers_hz`` its carrier [n], of training or not (None: all have that of the scene). With ``params``,
         values by name, paths are those that `TracedField.refresh` finds; None: stated values.
 
-        Sides are in ascending order of carriers, each of the transmitters at its carrier; without a scene None.
+        They are in ascending order of carriers, each of the transmitters at its carrier; without a scene None.
         """
         if self.scene is None:
             return [None] * (1 if carriers_hz is None else len(np.unique(carriers_hz)))
         t = self.traced
         options = TracedOptions(t.options, t.pattern_degree, self.tx_antenna, t.materials, t.moves_planes, t.faint)
         at = self.receivers[receiver], options, self._prepared
-        sides = traced_fields(tx_pos_m, *at, tx_heading_rad, carriers_hz, parameters=params)
+        traced_fields = trace_fields(tx_pos_m, *at, tx_heading_rad, carriers_hz, parameters=params)
         if self.surface:
-            for side in sides:
-                side.attach(self.surface)
-        return sides
+            for traced_field in traced_fields:
+                traced_field.attach(self.surface)
+        return traced_fields
 
     def add_surface_gaussians(
-        self, sides: Sequence[TracedField | None], fitted: Mapping[str, NDArray[Any]] | None = None
+        self, traced_fields: Sequence[TracedField | None], fitted: Mapping[str, NDArray[Any]] | None = None
     ) -> dict[str, NDArray[np.float32]]:
-        """Put Gaussians on the surfaces that paths of traced sides meet, if the settings train them.
+        """Put Gaussians on the surfaces that paths of traced fields meet, if the settings train them.
 
-        ``sides`` are those of the training transmitters; later ones get the same Gaussians. ``fitted``: parameters of a
-        fit with such Gaussians, which replace new ones. Returns starting values of their parameters, if any.
+        ``traced_fields`` are those of the training transmitters, later ones get the same Gaussians; ``fitted`` are
+        parameters of a fit with such Gaussians, which replace new ones. Returns starting values of their parameters.
         """
-        spacing_m, present = self.traced.surface_spacing, [side for side in sides if side is not None]
+        spacing_m, present = self.traced.surface_spacing, [traced for traced in traced_fields if traced is not None]
         if fitted is not None:
             self.surface = SurfaceGaussians.of(fitted, spacing_m)
         elif self.traced.surface > 0 and present:
-            joint = Interactions(*map(np.concatenate, zip(*(side.interactions for side in present), strict=True)))
+            joint = Interactions(*map(np.concatenate, zip(*(traced.interactions for traced in present), strict=True)))
             self.surface = SurfaceGaussians.covering(joint, spacing_m)
         if not self.surface:
             return {}
-        for side in present:
-            side.attach(self.surface)
+        for traced in present:
+            traced.attach(self.surface)
         return self.surface.parameters()
 
-    def parameters(self, sides: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
-        """Starting values of the trained parameters beside the field's, by name, from the traced sides of all ports.
+    def parameters(self, traced_fields: Sequence[TracedField | None]) -> dict[str, NDArray[np.float32]]:
+        """Starting values of the trained parameters beside the field's, by name, from the traced fields of all ports.
 
         `InputError` without Gaussians for a receiver that no path reaches.
         """
         values: dict[str, NDArray[np.float32]] = {}
-        for side in sides:
-            if side is not None:
-                if self.field is None and not side.exists.any():
-                    name = side.receiver.name
+        for traced_field in traced_fields:
+            if traced_field is not None:
+                if self.field is None and not traced_field.exists.any():
+                    name = traced_field.receiver.name
                     raise InputError(f"{name}: no training row is reached by a path; trace more kinds of path")
-                values |= {name: v for name, v in side.parameters().items() if self.traced.rate(name) > 0}
+                values |= {name: v for name, v in traced_field.parameters().items() if self.traced.rate(name) > 0}
         if self.field is not None and self.kind.levels:
             values[LEVEL] = np.zeros((1, len(self.receivers)), np.float32)
         return values
@@ -261,67 +261,67 @@ class Graph:
             unit = dr.sqrt(SHARE**2 * kind(paths.power) + unit * unit)
         return unit if batch.weight is None else unit * batch.weight
 
-    def report(
+    def observation(
         self,
         number: int,
-        side: TracedField | None,
+        traced_field: TracedField | None,
         learned: bool = True,
         chunked: bool = False,
         surface: bool = True,
-        alone: Alone | None = None,
+        component: Component | None = None,
         phase_error: float = 0.0,
-    ) -> Report:
-        """Reports of a port as a function of parameters, for transmitters of a traced side.
+    ) -> ObservationFunction:
+        """Observations of a port as a function of parameters, for transmitters of a traced field.
 
-        ``learned`` and ``surface``: with the learned side and the Gaussians on surfaces, where the graph has them;
-        ``chunked``: evaluate networks in chunks of Gaussians, without gradients (`gaussians_in_parts`); ``alone``:
-        report one of both sides alone, without an instrument's scaling of each report, so that the two compare (the
-        unit of the Gaussians is that beside the paths). With ``phase_error``, the standard deviation in rad of the
-        phase that each reflection of a path adds, the report is the expectation
+        ``learned`` and ``surface``: with the learned component and the Gaussians on surfaces, where the graph has them;
+        ``chunked``: evaluate networks in chunks of Gaussians, without gradients (`gaussians_in_parts`);
+        ``component``: the one component that is observed, without an instrument's scaling of each observation, so that
+        both compare (the unit of the Gaussians is that beside the paths). With ``phase_error``, the standard deviation
+        in rad of the phase that each reflection of a path adds, the observation is the expectation
         (`wrf_mi.receivers.instruments.Instrument`).
         """
         model: Any = self.models[number]
-        if alone is not None:
+        if component is not None:
             model = model.unscaled
 
-        def report(params: Mapping[str, Any], batch: Batch) -> Any:
+        def observe(params: Mapping[str, Any], batch: Batch) -> Any:
             if not surface:
                 params = {name: values for name, values in params.items() if name != FACTOR}
             # The traced component, then the learned one in the receiver's unit.
-            paths, signal = None if side is None else side(params, batch.slots), None
-            if self.field is not None and learned and alone != "traced":
+            paths, signal = None if traced_field is None else traced_field(params, batch.slots), None
+            if self.field is not None and learned and component != "traced":
                 signal = batch.signal or self.learned(number, params, batch, chunked)
                 if (unit := self.unit(params, batch, paths)) is not None:
                     if (count := dr.width(unit)) > 1:
                         unit = spread(unit, dr.width(signal[0]) // count)
                     signal = signal[0] * unit, signal[1] * unit
-                if alone == "learned":
+                if component == "learned":
                     return model(None, signal)
             # Single components are compared with each other: they keep the phases that the paths have.
-            if phase_error and side is not None and paths is not None and alone is None:
-                return expected_report(model, paths, signal, phase_error * side.bounces_of(batch.slots))
+            if phase_error and traced_field is not None and paths is not None and component is None:
+                return expected_observation(model, paths, signal, phase_error * traced_field.bounces_of(batch.slots))
             return model(paths, signal)
 
-        return report
+        return observe
 
-    def arrays(self, number: int, side: TracedField | None) -> list[Any]:
-        """Constants on the device that a report reads beside its arguments, inputs of a recording."""
-        if side is None and self.form.receiver == "pixel":
+    def arrays(self, number: int, traced_field: TracedField | None) -> list[Any]:
+        """Constants on the device that an observation reads beside its arguments, inputs of a recording."""
+        if traced_field is None and self.form.receiver == "pixel":
             return []
-        of_side = [] if side is None else [side.arrays, draws_on_device(side.form[0])]
-        return [self.models[number].arrays(mi.Float), of_side]
+        of_traced_field = [] if traced_field is None else [traced_field.arrays, draws_on_device(traced_field.form[0])]
+        return [self.models[number].arrays(mi.Float), of_traced_field]
 
-    def power_level(self, side: TracedField, params: Mapping[str, Any]) -> float:
-        """Logarithm of the paths' amplitude, by their mean power over all transmitters of a side."""
+    def power_level(self, traced_field: TracedField, params: Mapping[str, Any]) -> float:
+        """Logarithm of the paths' amplitude, by their mean power over all transmitters of a traced field."""
         with dr.suspend_grad():
-            re, im = side(params).gain
-            power = float(dr.sum(re * re + im * im)[0]) / len(side)
+            re, im = traced_field(params).gain
+            power = float(dr.sum(re * re + im * im)[0]) / len(traced_field)
         return float(np.log(power) / 2) if power > 0 else 0.0
 
-    def match_gain(self, number: int, side: TracedField, observed: NDArray[Any]) -> NDArray[np.float32]:
-        """The receiver's starting gain [2], which matches the mean of the traced reports of a port to the observations.
+    def match_gain(self, number: int, traced_field: TracedField, observed: NDArray[Any]) -> NDArray[np.float32]:
+        """Starting gain [2] of a receiver, which matches the mean of a port's traced observations to the measured ones.
 
-        ``observed`` [n, *shape of a report] are of the transmitters of ``side``, NaN where nothing was received.
+        ``observed`` [n, *shape of an observation] are of its transmitters, NaN where nothing was received.
         """
         model = self.models[number]
         unscaled = model.unscaled
@@ -329,10 +329,12 @@ class Graph:
         # Images of thousands of rows would take gigabytes, for a start that training changes anyway.
         rows = finite_rows[:: -(-len(finite_rows) // MATCHED)] if len(finite_rows) else finite_rows
         gain = np.zeros(2, np.float32)
-        # Reports are linear in the gain but for floors, which further passes leave behind.
+        # Observations are linear in the gain but for floors, which further passes leave behind.
         for _ in range(MATCHING if len(rows) else 0):
             with dr.suspend_grad():
-                report = unscaled(side({side.gain_name: mi.TensorXf(gain)}, to_uint(rows)), None).numpy()
-            report = report.astype(float).reshape(len(rows), *np.shape(observed)[1:])
-            gain[0] += model.missing_gain(report, observed[rows])
+                predicted = unscaled(
+                    traced_field({traced_field.gain_name: mi.TensorXf(gain)}, to_uint(rows)), None
+                ).numpy()
+            predicted = predicted.astype(float).reshape(len(rows), *np.shape(observed)[1:])
+            gain[0] += model.missing_gain(predicted, observed[rows])
         return gain

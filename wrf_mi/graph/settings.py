@@ -14,7 +14,7 @@ EvaluationName = Literal["splatted", "traced"]  # evaluations of Gaussians (`wrf
 SPLATTED: EvaluationName = "splatted"
 TRACED: EvaluationName = "traced"
 TRACED_NAMES = ("material.", "plane.", "receiver.", "pattern.", "surface.")
-"""Prefixes of the traced side's parameters (`wrf_mi.tracing.paths.traced_field.TracedField.parameters`)."""
+"""Prefixes of the traced component's parameters (`wrf_mi.tracing.paths.traced_field.TracedField.parameters`)."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from .array import Lags, array_response, bartlett_spectrum
 from .channel import antenna_csi, array_channels, csi, received_power, rssi_dbm
-from .reports import minmax_scale
+from .scaling import minmax_scale
 
 __all__ = [
     "Lags",

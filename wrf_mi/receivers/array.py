@@ -152,7 +152,7 @@ class Lags:
             raise InputError(f"lags: elements of shape {elements.shape}; give finite [m, 3] in metres")
         self.shape = height, width
         self.elements = len(elements)
-        self.lag_m, self._pair, self._side = _differences(elements)
+        self.lag_m, self._pair, self._sign = _differences(elements)
         wavenumber = 2 * np.pi * frequency_hz / speed_of_light
         phase = wavenumber * (pixel_directions(height, width).reshape(-1, 3) @ self.lag_m.T)
         # Re(r exp(-j phase)) = Re(r) cos(phase) + Im(r) sin(phase).
@@ -167,9 +167,9 @@ class Lags:
     @cached_property
     def pairs(self) -> FloatArray:
         """Matrices [2, m * m, count] that add real and imaginary parts of products h_m conj(h_n) up to lags."""
-        half, lag_of, side = len(self.lag_m) - 1, self._pair.ravel(), self._side.ravel()
+        half, lag_of, sign = len(self.lag_m) - 1, self._pair.ravel(), self._sign.ravel()
         matrices = np.zeros((2, len(lag_of), self.count))
-        same, first = np.flatnonzero((side > 0) & (lag_of == 0)), np.flatnonzero((side > 0) & (lag_of > 0))
+        same, first = np.flatnonzero((sign > 0) & (lag_of == 0)), np.flatnonzero((sign > 0) & (lag_of > 0))
         matrices[0, same, 0] = 1
         matrices[0, first, lag_of[first]] = matrices[1, first, half + lag_of[first]] = np.sqrt(2)
         return matrices
@@ -209,7 +209,7 @@ def _differences(elements_m: FloatArray) -> tuple[FloatArray, IntArray, IntArray
     # Whole steps, so that differences of rounded positions compare as equal.
     steps = np.rint(difference / grain)
     first = np.argmax(steps != 0, axis=1)
-    side = np.where(steps[np.arange(len(steps)), first] < 0, -1, 1)
+    sign = np.where(steps[np.arange(len(steps)), first] < 0, -1, 1)
     # Each leads with a positive number, so zero sorts first.
-    _, index, lag = np.unique(side[:, None] * steps, axis=0, return_index=True, return_inverse=True)
-    return side[index, None] * difference[index], lag.reshape(count, count), side.reshape(count, count)
+    _, index, lag = np.unique(sign[:, None] * steps, axis=0, return_index=True, return_inverse=True)
+    return sign[index, None] * difference[index], lag.reshape(count, count), sign.reshape(count, count)

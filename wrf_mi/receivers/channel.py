@@ -12,7 +12,7 @@ from scipy.special import ndtri
 
 from ..core import Paths, Receiver
 from ..core.types import FloatArray, IntArray
-from .reports import strength_db
+from .scaling import strength_db
 
 ComplexArray = NDArray[np.complex128]
 

@@ -1,7 +1,7 @@
-"""Paths on the device: the values that receivers read, coherent sums at ports and of both sides, and draws of phases.
+"""Paths on the device: values that receivers read, coherent sums at antennas and of both components, draws of phases.
 
-A *port* is a position in the receiver's frame with a frequency. Arrays are Dr.Jit arrays with derivatives, complex
-numbers pairs (re, im).
+An *antenna tone* is a position in the receiver's frame with a frequency. Arrays are Dr.Jit arrays with derivatives,
+complex numbers pairs (re, im).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..backend.vectors import Complex, Float64, Vector, times
 from ..core.angles import FloatArray, solid_angles
 from .channel import DRAWS, phase_draws
 from .registry import How
-from .reports import SQUARED_MAGNITUDE_EPS
+from .scaling import SQUARED_MAGNITUDE_EPS
 
 
 @dataclass
@@ -47,7 +47,7 @@ class TracedPaths:
         return dr.block_reduce(dr.ReduceOp.Add, re * re + im * im, self.each)
 
 
-class Ports:
+class AntennaTones:
     """Positions [m, 3] in the receiver's frame, metres, and frequencies [m] of a receiver's signals, on the device."""
 
     def __init__(self, offset_m: FloatArray, frequency_hz: ArrayLike) -> None:
@@ -62,26 +62,26 @@ class Ports:
         return [*self.offset_m, self.wavenumber]
 
 
-def path_sum(paths: TracedPaths, ports: Ports) -> Complex:
-    """Coherent sums of a batch's paths at m ports, float64 [batch * m]: spherical waves as in `antenna_csi`."""
+def path_sum(paths: TracedPaths, tones: AntennaTones) -> Complex:
+    """Coherent sums of a batch's paths at m antenna tones, float64 [batch * m]: spherical waves as in `antenna_csi`."""
     each = paths.each
-    # A lane for each path at each port, the paths of a port side by side: one reduction in fixed order then sums them,
+    # A lane for each path at each tone, the paths of a tone side by side: one reduction in fixed order then sums them,
     # the same in every run.
-    lane = dr.arange(mi.UInt32, paths.batch * ports.count * each)
-    port = (lane // each) % ports.count
-    slot = (lane // (each * ports.count)) * each + lane % each
+    lane = dr.arange(mi.UInt32, paths.batch * tones.count * each)
+    tone = (lane // each) % tones.count
+    slot = (lane // (each * tones.count)) * each + lane % each
 
     def of_path(array: Any) -> Any:
         return dr.gather(Float64, array, slot)
 
-    def of_port(array: Any) -> Any:
-        return dr.gather(Float64, array, port)
+    def of_tone(array: Any) -> Any:
+        return dr.gather(Float64, array, tone)
 
     length = of_path(paths.length_m)
-    away = [of_path(u) * length - of_port(p) for u, p in zip(paths.arrival, ports.offset_m, strict=True)]
+    away = [of_path(u) * length - of_tone(p) for u, p in zip(paths.arrival, tones.offset_m, strict=True)]
     distance = dr.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2])
-    sine, cosine = dr.sincos(-of_port(ports.wavenumber) * distance)
-    # The gain has the loss lambda / (4 pi d) of the origin; at the port the wave has travelled d_m.
+    sine, cosine = dr.sincos(-of_tone(tones.wavenumber) * distance)
+    # The gain has the loss lambda / (4 pi d) of the origin; at the antenna the wave has travelled d_m.
     re, im = (of_path(part) * length / distance for part in paths.gain)
     re, im = times((re, im), (cosine, sine))
     return dr.block_reduce(dr.ReduceOp.Add, re, each), dr.block_reduce(dr.ReduceOp.Add, im, each)
@@ -93,10 +93,10 @@ def draws_on_device(each: int) -> Any:
     return on_device(phase_draws(each).ravel(), Float64)
 
 
-def expected_report(
-    report: Callable[[TracedPaths, Complex | None], Any], paths: TracedPaths, learned: Complex | None, deviation: Any
+def expected_observation(
+    observe: Callable[[TracedPaths, Complex | None], Any], paths: TracedPaths, learned: Complex | None, deviation: Any
 ) -> Any:
-    """Mean of a receiver's reports over `DRAWS` draws of its paths' phases (`wrf_mi.receivers.channel`).
+    """Mean of a receiver's observations over `DRAWS` draws of its paths' phases (`wrf_mi.receivers.channel`).
 
     ``learned`` is the learned signal of the transmitters of ``paths``, flat, or None; ``deviation`` the standard
     deviation of each path's phase [batch * each], rad.
@@ -116,13 +116,13 @@ def expected_report(
         of_learned = lane // (DRAWS * size) * size + lane % size
         re_l, im_l = (dr.gather(type(part), part, of_learned) for part in learned)
         learned = re_l, im_l
-    reports = report(TracedPaths(times((re, im), (cosine, sine)), length_m, arrival, drawn, each), learned)
-    # Reports lie draw by draw: gathered value by value, so that one reduction in fixed order sums the draws.
-    size = dr.width(reports) // drawn
-    lane = dr.arange(mi.UInt32, dr.width(reports))
+    observations = observe(TracedPaths(times((re, im), (cosine, sine)), length_m, arrival, drawn, each), learned)
+    # Observations lie draw by draw: gathered value by value, so that one reduction in fixed order sums the draws.
+    size = dr.width(observations) // drawn
+    lane = dr.arange(mi.UInt32, dr.width(observations))
     value, number = lane // DRAWS, lane % DRAWS
     entry = (value // size * DRAWS + number) * size + value % size
-    return dr.block_reduce(dr.ReduceOp.Add, dr.gather(type(reports), reports, entry), DRAWS) / DRAWS
+    return dr.block_reduce(dr.ReduceOp.Add, dr.gather(type(observations), observations, entry), DRAWS) / DRAWS
 
 
 def spread(values: Any, count: int) -> Any:
@@ -185,21 +185,23 @@ def weighted(signal: Complex, weight: Any) -> Complex:
 
 
 def magnitude(traced: Complex | None, learned: Complex | None, how: How) -> Any:
-    """abs(T + L) or sqrt(abs(T)^2 + abs(L)^2), flat arrays; None is an absent side."""
+    """abs(T + L) or sqrt(abs(T)^2 + abs(L)^2), flat arrays; None is an absent component."""
     return dr.sqrt(power(traced, learned, how) + SQUARED_MAGNITUDE_EPS)
 
 
 def power(traced: Complex | None, learned: Complex | None, how: How) -> Any:
-    """abs(T + L)^2 or abs(T)^2 + abs(L)^2, flat arrays; `ValueError` of two absent sides (None) or another ``how``."""
-    sides = [side for side in (traced, learned) if side is not None]
-    if not sides or how not in ("coherent", "power"):
-        raise ValueError(f"power: how {how!r} with {len(sides)} sides; give coherent or power, and one side at least")
+    """abs(T + L)^2 or abs(T)^2 + abs(L)^2, flat arrays; `ValueError` without components or for another ``how``."""
+    components = [signal for signal in (traced, learned) if signal is not None]
+    if not components or how not in ("coherent", "power"):
+        raise ValueError(
+            f"power: how {how!r} with {len(components)} components; give coherent or power, and one component at least"
+        )
     if how == "coherent":
-        sides = [add(*sides)]
-    squares = [re * re + im * im for re, im in sides]
+        components = [add(*components)]
+    squares = [re * re + im * im for re, im in components]
     return sum(squares[1:], squares[0])
 
 
-def add(*sides: Complex) -> Complex:
+def add(*signals: Complex) -> Complex:
     """Sum of complex flat arrays."""
-    return sum((re for re, _ in sides[1:]), sides[0][0]), sum((im for _, im in sides[1:]), sides[0][1])
+    return sum((re for re, _ in signals[1:]), signals[0][0]), sum((im for _, im in signals[1:]), signals[0][1])

@@ -1,4 +1,4 @@
-"""Instruments of a record: several receivers and their reports of traced paths, in float64."""
+"""Instruments of a record: several receivers and their observations of traced paths, in float64."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ SIZE = (90, 360)  # elevations and azimuths of a spectrum where none are stated:
 
 @dataclass(frozen=True)
 class Instrument:
-    """Receivers and their reports of traced paths.
+    """Receivers and their observations of traced paths.
 
-    Reports of the receiver models of this package, each [n_rx, n_tx, ...]: ``array`` Bartlett spectra [height, width],
-    scaled by minimum and maximum as instruments do; ``power`` received power in dBm for 0 dBm sent, NaN where no path
-    arrives; ``csi`` channel coefficients [k], or [m, k] of receivers with m antennas.
+    Observations of the receiver models of this package, each [n_rx, n_tx, ...]: ``array`` Bartlett spectra [height,
+    width], scaled by minimum and maximum as instruments do; ``power`` received power in dBm for 0 dBm sent, NaN where
+    no path arrives; ``csi`` channel coefficients [k], or [m, k] of receivers with m antennas.
 
     With a phase error a spectrum is the mean over draws of the paths' phases, its expectation: a spectrum of wrong
     phases has maxima and zeros at wrong places. Draws of a path are the same in every call.
@@ -59,13 +59,13 @@ class Instrument:
     def observe(self, paths: Paths) -> NDArray[Any]:
         """Observations [n_rx, n_tx, ...] of traced paths, as in a record of the task."""
         bounds = np.searchsorted(paths.rx, np.arange(paths.n_rx + 1))  # paths are sorted by receiver
-        reports = []
+        observations = []
         for receiver, begin, end in zip(self.receivers, bounds[:-1], bounds[1:], strict=True):
             arriving = paths.select(np.arange(begin, end))
             arriving = replace(arriving, rx=np.zeros_like(arriving.rx), n_rx=1)
-            reports.append(self.model(receiver).observed(arriving, receiver))
+            observations.append(self.model(receiver).observed(arriving, receiver))
         # Spectra of one receiver are not copied: those of all rows may take gigabytes.
-        return reports[0][None] if len(reports) == 1 else np.stack(reports)
+        return observations[0][None] if len(observations) == 1 else np.stack(observations)
 
     def observe_rows(self, paths: Paths, carriers_hz: FloatArray | None) -> NDArray[Any]:
         """`observe` with a carrier in Hz for each transmitter, ``carriers_hz`` [n_tx]; None: the instrument's."""

@@ -22,8 +22,8 @@ from ..core.types import IntArray
 from .array import bartlett_spectrum, steering_matrix
 from .channel import antenna_csi, csi, rssi_dbm, with_phase_errors
 from .device_paths import (
+    AntennaTones,
     ComplexMatrix,
-    Ports,
     TracedPaths,
     add,
     direction_weights,
@@ -33,7 +33,7 @@ from .device_paths import (
     weighted,
 )
 from .registry import PIXEL, ComplexArray, How, ObservationSpec, ReceiverModel, Slopes, Sums
-from .reports import LEAST_POWER, SILENCE, arrives, magnitudes, minmax_scale, scaled, scaled_rows, strength_db
+from .scaling import LEAST_POWER, SILENCE, arrives, magnitudes, minmax_scale, scaled, scaled_rows, strength_db
 
 CHUNK_SIZE = 64  # transmitters observed together: float64 spectra of all would take several times the result
 
@@ -55,7 +55,7 @@ class PixelReceiver(ReceiverModel):
         width: azimuths of the plane.
         elements_m: elements of the array that receives traced paths, [m, 3], receiver's frame, metres.
         frequency_hz: carrier.
-        how: sum of the sides.
+        how: sum of the traced and the learned component.
     """
 
     height: int
@@ -74,7 +74,7 @@ class PixelReceiver(ReceiverModel):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of a report."""
+        """Shape of an observation."""
         return self.height, self.width
 
     @cached_property
@@ -83,32 +83,32 @@ class PixelReceiver(ReceiverModel):
         return ComplexMatrix(steering_matrix(self.elements_m, directions, self.frequency_hz))
 
     @cached_property
-    def _ports(self) -> Ports:
-        return Ports(self.elements_m, np.full(len(self.elements_m), self.frequency_hz))
+    def _tones(self) -> AntennaTones:
+        return AntennaTones(self.elements_m, np.full(len(self.elements_m), self.frequency_hz))
 
     def arrays(self, float_type: Any) -> list[Any]:
-        """Constants on the device that a report of a float type reads, inputs of a recording."""
+        """Constants on the device that an observation of a float type reads, inputs of a recording."""
         weights = direction_weights(self.height, self.width, 1, float_type)
-        return [*self._ports.arrays, *self._steering.arrays(float_type), weights]
+        return [*self._tones.arrays, *self._steering.arrays(float_type), weights]
 
     def elements(self, traced: TracedPaths, float_type: Any) -> Complex:
         """Signals of the array's elements, [batch * m], of the traced paths."""
-        re, im = path_sum(traced, self._ports)
+        re, im = path_sum(traced, self._tones)
         return float_type(re), float_type(im)
 
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
-        """Magnitudes [batch * height * width] of the two sides; either may be None."""
+        """Magnitudes [batch * height * width] of the traced and the learned component; either may be None."""
         image = None if traced is None else self._steering.forward(self.elements(traced, _float_type(learned)))
         return magnitude(image, learned, self.how)
 
-    def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
-        """Logarithm of the missing amplitude of a report, by mean magnitudes."""
-        return float(np.log(np.nanmean(observed) / np.mean(report)))
+    def missing_gain(self, predicted: NDArray[Any], observed: NDArray[Any]) -> float:
+        """Logarithm of the missing amplitude of an observation, by mean magnitudes."""
+        return float(np.log(np.nanmean(observed) / np.mean(predicted)))
 
 
 @dataclass(frozen=True)
 class ArrayReceiver(PixelReceiver):
-    """An antenna array that reports the Bartlett spectrum of its element signals.
+    """An antenna array that observes the Bartlett spectrum of its element signals.
 
     Attributes:
         instrument_scale: scale each spectrum to its own minimum and maximum, as measured ones are.
@@ -131,16 +131,16 @@ class ArrayReceiver(PixelReceiver):
         return replace(self, phase_error=phase_error)
 
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
-        """Spectra [batch * height * width] of the two sides; either may be None."""
-        sides: list[Complex | None] = [None if traced is None else self.elements(traced, _float_type(learned)), None]
+        """Spectra [batch * height * width] of the traced and the learned component; either may be None."""
+        signals: list[Complex | None] = [None if traced is None else self.elements(traced, _float_type(learned)), None]
         if learned is not None:
             weights = direction_weights(self.height, self.width, 1, _float_type(learned))
             # The integral over directions gives element signals, so that a learned spectrum has the array's lobes.
-            sides[1] = self._steering.adjoint(weighted(learned, weights))
-        if self.how == "coherent" and any(sides):
-            # The Bartlett sum is linear: one image of the sum in place of one of each side.
-            sides = [add(*filter(None, sides)), None]
-        images = [None if side is None else self._steering.forward(side) for side in sides]
+            signals[1] = self._steering.adjoint(weighted(learned, weights))
+        if self.how == "coherent" and any(signals):
+            # The Bartlett sum is linear: one image of the sum in place of one of each component.
+            signals = [add(*filter(None, signals)), None]
+        images = [None if signal is None else self._steering.forward(signal) for signal in signals]
         spectrum = magnitude(images[0], images[1], self.how)
         return scaled(spectrum, self.height * self.width) if self.instrument_scale else spectrum
 
@@ -158,20 +158,20 @@ class ArrayReceiver(PixelReceiver):
 
     @property
     def sums(self) -> Sums | None:
-        """Fields at the elements; without scaling `signal_report` is not defined."""
+        """Fields at the elements; without scaling `signal_observation` is not defined."""
         return "elements" if self.instrument_scale else None
 
     @cached_property
     def signal_key(self) -> tuple[bytes, float]:
-        """Equal for receivers whose `signal_report` is the same function."""
+        """Equal for receivers whose `signal_observation` is the same function."""
         return self.elements_m.tobytes(), float(self.frequency_hz)
 
-    def signal_report(self, signal: ComplexArray) -> FloatArray:
+    def signal_observation(self, signal: ComplexArray) -> FloatArray:
         """Scaled spectra [n, pixels] of element signals [n, m], in single precision as those of the call."""
         return np.asarray(scaled_rows(magnitudes(self._images(signal)))[0], float)
 
     def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
-        """Derivative of `signal_report` at parts of element signals [n, m], pixels that set the scale included."""
+        """Derivative of `signal_observation` at parts of element signals [n, m], pixels that set the scale included."""
         image = np.concatenate([np.zeros((0, self.height * self.width), np.complex64), *map(self._images, parts)])
         spectrum = magnitudes(image)
         share, low, high, inverse = scaled_rows(spectrum)
@@ -198,20 +198,20 @@ class ArrayReceiver(PixelReceiver):
         """The receiver without the instrument's scaling."""
         return replace(self, instrument_scale=False)
 
-    def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
-        """Logarithm of the missing amplitude of an unscaled report, whose peaks are to be 1 if scaled."""
+    def missing_gain(self, predicted: NDArray[Any], observed: NDArray[Any]) -> float:
+        """Logarithm of the missing amplitude of an unscaled observation, whose peaks are to be 1 if scaled."""
         if not self.instrument_scale:
-            return super().missing_gain(report, observed)
-        return float(-np.log(np.asarray(report).reshape(len(observed), -1).max(axis=1).mean()))
+            return super().missing_gain(predicted, observed)
+        return float(-np.log(np.asarray(predicted).reshape(len(observed), -1).max(axis=1).mean()))
 
 
 @dataclass(frozen=True)
 class CsiReceiver(ReceiverModel):
-    """One or several antennas that report their complex channel on each subcarrier.
+    """One or several antennas that observe their complex channel on each subcarrier.
 
     The learned field covers the full sphere. Without a basis it and the paths' gains are equal at all antennas and on
     all subcarriers; the phase of paths differs between them. With a basis the field has several signals in each
-    direction, whose sums over directions are the coefficients of its vectors. The sides add as complex numbers.
+    direction, whose sums over directions are the coefficients of its vectors. Both components add as complex numbers.
 
     Attributes:
         height: elevations of each hemisphere.
@@ -242,7 +242,7 @@ class CsiReceiver(ReceiverModel):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of a report: antennas where there are several, subcarriers, real and imaginary part."""
+        """Shape of an observation: antennas where there are several, subcarriers, real and imaginary part."""
         antennas = () if self.elements_m is None else (len(self.elements_m),)
         return *antennas, len(self.frequencies_hz), 2
 
@@ -252,40 +252,40 @@ class CsiReceiver(ReceiverModel):
         return 1 if self.basis is None else len(self.basis)
 
     @cached_property
-    def _ports(self) -> Ports:
+    def _tones(self) -> AntennaTones:
         places = np.zeros((1, 3)) if self.elements_m is None else np.asarray(self.elements_m, float)
         count = len(self.frequencies_hz)
-        return Ports(np.repeat(places, count, axis=0), np.tile(self.frequencies_hz, len(places)))
+        return AntennaTones(np.repeat(places, count, axis=0), np.tile(self.frequencies_hz, len(places)))
 
     @cached_property
     def _basis(self) -> ComplexMatrix:
         return ComplexMatrix(np.asarray(self.basis))
 
     def arrays(self, float_type: Any) -> list[Any]:
-        """Constants on the device that a report of a float type reads, inputs of a recording."""
+        """Constants on the device that an observation of a float type reads, inputs of a recording."""
         basis = [] if self.basis is None else self._basis.arrays(float_type)
-        return [*self._ports.arrays, direction_weights(self.height, self.width, 2, float_type), *basis]
+        return [*self._tones.arrays, direction_weights(self.height, self.width, 2, float_type), *basis]
 
     def signals(self, traced: TracedPaths | None, learned: Complex | None) -> tuple[Complex | None, Complex | None]:
-        """Both sides at the antennas, [batch * outputs]; None where a side is None."""
-        float_type, count = _float_type(learned), self._ports.count
-        sides: list[Complex | None] = [None, None]
+        """Both components at the antennas, [batch * outputs]; None where a component is None."""
+        float_type, count = _float_type(learned), self._tones.count
+        signals: list[Complex | None] = [None, None]
         if traced is not None:
-            re, im = path_sum(traced, self._ports)
-            sides[0] = float_type(re), float_type(im)
+            re, im = path_sum(traced, self._tones)
+            signals[0] = float_type(re), float_type(im)
         if learned is not None:
             parts = weighted(learned, direction_weights(self.height, self.width, 2, float_type))
             re, im = (dr.block_reduce(dr.ReduceOp.Add, part, 2 * self.height * self.width) for part in parts)
             equal = dr.repeat(re, count), dr.repeat(im, count)
-            sides[1] = equal if self.basis is None else self._basis.forward((re, im))
-        return sides[0], sides[1]
+            signals[1] = equal if self.basis is None else self._basis.forward((re, im))
+        return signals[0], signals[1]
 
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
-        """Channels [batch * outputs * 2], real and imaginary part in turn; either side, but not both, may be None."""
-        sides = [side for side in self.signals(traced, learned) if side is not None]
-        if not sides:
-            raise ValueError("CsiReceiver: neither a traced nor a learned side")
-        re, im = add(*sides)
+        """Channels [batch * outputs * 2], real and imaginary part in turn; one of both components may be None."""
+        signals = [signal for signal in self.signals(traced, learned) if signal is not None]
+        if not signals:
+            raise ValueError("CsiReceiver: neither a traced nor a learned component")
+        re, im = add(*signals)
         pair: Any = mi.Complex2f if type(re) is mi.Float else dr.float64_array_t(mi.Complex2f)
         # Real and imaginary parts in turn, as a record's complex numbers are in memory.
         return dr.ravel(pair(re, im))
@@ -303,34 +303,34 @@ class CsiReceiver(ReceiverModel):
 
     @property
     def signal_key(self) -> object:
-        """Equal for receivers whose `signal_report` is the same function."""
+        """Equal for receivers whose `signal_observation` is the same function."""
         return CsiReceiver
 
-    def signal_report(self, signal: ComplexArray) -> FloatArray:
+    def signal_observation(self, signal: ComplexArray) -> FloatArray:
         """Channels [n, 2 values] of signals [n, values], real and imaginary part in turn."""
         return np.ascontiguousarray(signal).view(float)
 
     def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
-        """Derivative of `signal_report`, which is linear."""
+        """Derivative of `signal_observation`, which is linear."""
         return lambda change, which: np.ascontiguousarray(change).view(float)
 
-    def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
-        """Logarithm of the missing amplitude of a report, by root mean squares."""
+    def missing_gain(self, predicted: NDArray[Any], observed: NDArray[Any]) -> float:
+        """Logarithm of the missing amplitude of an observation, by root mean squares."""
         # Half the logarithm of a ratio of powers is that of amplitudes.
-        powers = [np.nanmean(np.square(np.asarray(values, float))) for values in (observed, report)]
+        powers = [np.nanmean(np.square(np.asarray(values, float))) for values in (observed, predicted)]
         return float(np.log(powers[0] / powers[1]) / 2)
 
 
 @dataclass(frozen=True)
 class PowerReceiver(CsiReceiver):
-    """A single antenna that reports its power in dB: RSSI. The learned field covers the full sphere.
+    """A single antenna that observes its power in dB: RSSI. The learned field covers the full sphere.
 
     Attributes:
-        how: sum of the sides.
+        how: sum of the traced and the learned component.
         interference: traced paths interfere with each other; False: their powers add, as in an average over positions
             within a wavelength or over a wide band. Such a mean has no phase: in a ``coherent`` sum with the learned
-            side its root enters as a positive real number.
-        floor: power that is reported where neither side arrives.
+            component its root enters as a positive real number.
+        floor: power that is observed where neither component arrives.
     """
 
     how: How = "coherent"
@@ -348,12 +348,12 @@ class PowerReceiver(CsiReceiver):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of a report."""
+        """Shape of an observation."""
         return ()
 
     def __call__(self, traced: TracedPaths | None, learned: Complex | None) -> Any:
-        """Powers [batch] in dB of the two sides; either may be None."""
-        count = self._ports.count
+        """Powers [batch] in dB of the traced and the learned component; either may be None."""
+        count = self._tones.count
         of_paths, of_gaussians = self.signals(traced if self.interference else None, learned)
         if traced is not None and not self.interference:
             # The root of the sum of powers, equal at all frequencies, as a signal of phase zero.
@@ -373,24 +373,24 @@ class PowerReceiver(CsiReceiver):
 
     @property
     def signal_key(self) -> object:
-        """Equal for receivers whose `signal_report` is the same function."""
+        """Equal for receivers whose `signal_observation` is the same function."""
         return self.floor
 
-    def signal_report(self, signal: ComplexArray) -> FloatArray:
+    def signal_observation(self, signal: ComplexArray) -> FloatArray:
         """Powers in dB of sums of powers [n, 1] (complex numbers without imaginary part)."""
         # The call adds the constant twice: under the root of the paths' power and under the logarithm.
         return np.asarray(strength_db(signal.real + LEAST_POWER, self.floor, LEAST_POWER), float)
 
     def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
-        """Derivative of `signal_report` at parts of sums of powers [n, 1]; 0 where the floor is reported."""
+        """Derivative of `signal_observation` at parts of sums of powers [n, 1]; 0 where the floor is observed."""
         power = np.concatenate([np.zeros((0, 1)), *(part.real for part in parts)]) + LEAST_POWER
         weight = np.where(power > SILENCE, 10 / np.log(10) / (power + LEAST_POWER), 0)
         return lambda change, which: weight[which] * change.real
 
-    def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
-        """Logarithm of the missing amplitude of a report, by mean powers in dB."""
-        received = arrives(report, self.floor)
+    def missing_gain(self, predicted: NDArray[Any], observed: NDArray[Any]) -> float:
+        """Logarithm of the missing amplitude of an observation, by mean powers in dB."""
+        received = arrives(predicted, self.floor)
         if not received.any():
             return 0.0
         # dB to nepers of an amplitude: ln(10) / 20.
-        return float((np.nanmean(observed[received]) - np.mean(report[received])) * math.log(10) / 20)
+        return float((np.nanmean(observed[received]) - np.mean(predicted[received])) * math.log(10) / 20)

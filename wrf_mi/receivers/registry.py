@@ -1,15 +1,15 @@
 """Receiver models by name, and the form of observations that they need.
 
-One class states all of a receiver: its observation of traced paths in NumPy, its differentiable report in Dr.Jit, and
-what the correction of a scene needs of it (`ReceiverModel`). Instruments, the graph and the correction take it from
+One class states all of a receiver: its observation of traced paths in NumPy, its differentiable observation in Dr.Jit,
+and what the correction of a scene needs of it (`ReceiverModel`). Instruments, the graph and the correction take it from
 `RECEIVERS`. Another package adds one by an entry point of the group `ENTRY_POINTS` that names the class. Dr.Jit is
 imported with the first class: a command that only reads data does without it.
 
-The traced field is given as paths, the learned one as a complex signal R(u) on directions. Each side is summed
-coherently; the two, T and L, then add as complex numbers (``how="coherent"``: abs(T + L)) or as powers
+The traced field is given as paths, the learned one as a complex signal R(u) on directions. Each component is
+summed coherently; the two, T and L, then add as complex numbers (``how="coherent"``: abs(T + L)) or as powers
 (``how="power"``: sqrt(abs(T)^2 + abs(L)^2)).
 
-| receiver | T | L | reports |
+| receiver | T | L | observation |
 | --- | --- | --- | --- |
 | pixel | image of h_m, sum_m h_m exp(-j k p_m . u) | R(u) | magnitude at every pixel u |
 | array | image of h_m | image of sum_u w(u) R(u) exp(+j k p_m . u) | magnitude at every pixel u |
@@ -19,11 +19,11 @@ coherently; the two, T and L, then add as complex numbers (``how="coherent"``: a
 with h_m = sum over paths of g (d / d_m) exp(-j k d_m), d_m from the path's image source to element m, and w(u) the
 solid angle of a pixel.
 
-A model reports in three ways:
+A model observes in three ways:
 
-- the call, in Dr.Jit and of the float type of the learned side, with derivatives (complex numbers are pairs re, im);
+- the call, in Dr.Jit and of the float type of the learned component, with derivatives (complex numbers: pairs re, im);
 - `observed`, in NumPy and float64, of `wrf_mi.core.Paths`: the reference, and the observation of a synthetic record;
-- `signal_report` and `signal_slopes`, in NumPy, of signals that a caller has summed over paths already: trials of
+- `signal_observation` and `signal_slopes`, in NumPy, of signals that a caller has summed over paths already: trials of
   `wrf_mi.correction.path_sum`, thousands of them with few paths changed, where a recorded call costs too much.
 """
 
@@ -47,7 +47,7 @@ PIXEL = "pixel"  # the receiver model of the papers
 AUTO = "auto"  # the setting that leaves the choice to the task
 ComplexArray = NDArray[np.complex128]
 Slopes = Callable[[ComplexArray, IntArray], FloatArray]
-"""Changes of reports by changes [k, values] of signals of the rows ``which`` [k]."""
+"""Changes of observations by changes [k, values] of signals of the rows ``which`` [k]."""
 Sums = Literal["fields", "elements", "powers"]
 """Sums over paths: of fields at one antenna on each subcarrier, of fields at the elements of an array, or of powers."""
 How = Literal["coherent", "power"]  # sum of the traced and the learned field: of complex numbers, or of powers
@@ -102,18 +102,18 @@ class ObservationSpec:
 
 
 class ReceiverModel(ABC):
-    """Model of a receiver: what it reports of the traced and the learned field.
+    """Model of a receiver: what it observes of the traced and the learned field.
 
     A class is an entry of `RECEIVERS`, an object is the model of one receiver at one carrier.
     """
 
     name: ClassVar[str]  #: value of the setting ``receiver``
-    tasks: ClassVar[tuple[str, ...]]  #: tasks whose observations it reports
+    tasks: ClassVar[tuple[str, ...]]  #: tasks of its observations
     needs_array: ClassVar[bool] = False  #: whether it needs the receiver's antenna array
     needs_carrier: ClassVar[bool] = False  #: whether it needs the carrier even without a scene
-    #: whether the learned component has a level at each receiver, because reports have a unit
+    #: whether the learned component has a level at each receiver, because observations have a unit
     levels: ClassVar[bool] = False
-    complex_valued: ClassVar[bool] = False  #: whether reports have a last axis of real and imaginary part
+    complex_valued: ClassVar[bool] = False  #: whether observations have a last axis of real and imaginary part
     sphere: ClassVar[bool] = True  #: whether directions cover the full sphere instead of the upper hemisphere
 
     @classmethod
@@ -124,15 +124,15 @@ class ReceiverModel(ABC):
     @property
     @abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Shape of a report; complex numbers as a last axis of real and imaginary part."""
+        """Shape of an observation; complex numbers as a last axis of real and imaginary part."""
 
     @abstractmethod
     def arrays(self, float_type: Any) -> list[Any]:
-        """Constants on the device that a report reads."""
+        """Constants on the device that an observation reads."""
 
     @abstractmethod
     def __call__(self, traced: Any, learned: Any) -> Any:
-        """Flat reports of a batch, in Dr.Jit and with derivatives.
+        """Flat observations of a batch, in Dr.Jit and with derivatives.
 
         Args:
             traced: paths of the batch (`wrf_mi.receivers.device_paths.TracedPaths`), or None.
@@ -140,12 +140,12 @@ class ReceiverModel(ABC):
         """
 
     @abstractmethod
-    def missing_gain(self, report: NDArray[Any], observed: NDArray[Any]) -> float:
-        """Logarithm of the missing amplitude of reports."""
+    def missing_gain(self, predicted: NDArray[Any], observed: NDArray[Any]) -> float:
+        """Logarithm of the amplitude that predicted observations lack."""
 
     @property
     def unscaled(self) -> ReceiverModel:
-        """The model without an instrument's scaling of each report."""
+        """The model without an instrument's scaling of each observation."""
         return self
 
     def with_phase_error(self, phase_error: float) -> ReceiverModel:
@@ -158,20 +158,20 @@ class ReceiverModel(ABC):
 
     @property
     def sums(self) -> Sums | None:
-        """What `signal_report` takes; None: it is not defined, and the correction differentiates the call."""
+        """What `signal_observation` takes; None: it is not defined, and the correction differentiates the call."""
         return None
 
     @property
     def signal_key(self) -> object:
-        """Equal for receivers whose `signal_report` is the same function."""
+        """Equal for receivers whose `signal_observation` is the same function."""
         return self
 
-    def signal_report(self, signal: ComplexArray) -> FloatArray:
-        """Reports [n, values] of signals [n, elements] that are summed over paths, in NumPy."""
+    def signal_observation(self, signal: ComplexArray) -> FloatArray:
+        """Observations [n, values] of signals [n, elements] that are summed over paths, in NumPy."""
         raise NotImplementedError
 
     def signal_slopes(self, parts: Sequence[ComplexArray]) -> Slopes:
-        """Derivative of `signal_report` at parts of signals [n, elements], one after the other."""
+        """Derivative of `signal_observation` at parts of signals [n, elements], one after the other."""
         raise NotImplementedError
 
 
@@ -200,5 +200,5 @@ def receiver_model(name: str, task: str) -> type[ReceiverModel]:
     if name not in RECEIVERS:
         raise InputError(f"receiver model {name!r}: unknown; choose from {', '.join(able)}")
     if name not in able:
-        raise InputError(f"receiver model {name} does not report {task}; choose from {', '.join(able)}")
+        raise InputError(f"receiver model {name} does not observe {task}; choose from {', '.join(able)}")
     return RECEIVERS[name]

@@ -31,7 +31,7 @@ from ..core.types import FloatArray, IntArray
 from ..datasets.observations import place_of
 from ..datasets.read_mat import FAULT, mat_arrays
 from ..datasets.spectrum_folder import read_grey
-from ..receivers.reports import minmax_scale
+from ..receivers.scaling import minmax_scale
 
 logger = logging.getLogger(__name__)
 

@@ -1,6 +1,6 @@
 """Correction of a scene by measurements (``docs/correction.md`` has the steps).
 
-The engine chooses of the options of the stage *scene*, which are judged by the reports of traced paths with the
+The engine chooses of the options of the stage *scene*, which are judged by the observations of traced paths with the
 parameters of each; all training rows are then fitted to.
 """
 
@@ -63,33 +63,33 @@ def correct_scene(
     # Paths of the training rows, and which of these rows judge.
     begun = time.perf_counter()
     traced = TracedScene(scene, record, split, options, material, on_stage)
-    judging, of_scene, reports = _judging(traced), _SharedScene(traced), _Reports(traced)
+    judging, of_scene, observations = _judging(traced), _SharedScene(traced), _TracedObservations(traced)
     enough = judging.held_receivers or not too_few(traced.record, judging)
     problem = Problem(traced.record, None, split.seed, str(scene), material)
 
     # Engine: options are fitted without the judging rows, which choose one.
     with TemporaryDirectory() as place:
         session = Session(Path(place), Path(place), lambda stage, share, _=None, /: on_stage(stage, share))
-        chosen = Engine(None, (of_scene, reports), problem, judging, session).choose() if enough else None
+        chosen = Engine(None, (of_scene, observations), problem, judging, session).choose() if enough else None
     if chosen is None:
         text = f"{len(traced.split.train)} training rows are too few to hold some out; give more"
         raise InputError(f"{traced.record.name}: {text}")
 
     # Phases: known, or uncertain where that is likelier.
     best = chosen.fitted
-    assert isinstance(best, _Reported)
+    assert isinstance(best, _EditObservations)
     if not moves_planes(best.edit.stage):
-        best = _by_uncertain_phases(of_scene.trial, reports, best)
+        best = _by_uncertain_phases(of_scene.trial, observations, best)
 
     # Least squares with all rows, from the chosen edit.
-    scores = {each.edit.stage: each.scores for each in reports.tried} | {best.edit.stage: best.scores}
-    facts = {"held_out": len(best.misfit.rows), "held_out_receivers": reports.out}
+    scores = {each.edit.stage: each.scores for each in observations.tried} | {best.edit.stage: best.scores}
+    facts = {"held_out": len(best.misfit.rows), "held_out_receivers": observations.out}
     correction: Correction = refit_edit(traced, best.edit, scores, facts)
 
     # How much smaller errors of known rows are than those of others.
     if correction.data is not None:
         # Rows held out of every choice are few; residuals of rows left out of least squares alone are of all rows.
-        after = _with_mean_gain(correction.vector, correction.misfit, reports.heard)
+        after = _with_mean_gain(correction.vector, correction.misfit, observations.heard)
         ratio = _held_out_ratio(best.misfit, best.vector, correction.misfit, after)
         correction.data = replace(correction.data, error_ratio=max(correction.data.error_ratio, ratio))
     correction.seconds = time.perf_counter() - begun
@@ -131,8 +131,8 @@ class _SharedScene(SceneStage):
         return replace(state, kept={**state.kept, self.name: Edited(state.problem, change.options, fitted.edit)})
 
 
-class _Reported(Fitted):
-    """Reports of held-out rows along the paths of a scene with the parameters of an edit.
+class _EditObservations(Fitted):
+    """Predicted observations of held-out rows along the paths of a scene with the parameters of an edit.
 
     ``heard`` are names of the receivers whose gains are known; others have the mean of these.
     """
@@ -141,34 +141,34 @@ class _Reported(Fitted):
         self.edit, self.misfit = edit, misfit
         self.vector = _with_mean_gain(misfit.vector_of(edit.parameters), misfit, heard)
         self.scores = misfit.scores(self.vector)
-        self._reports = misfit.reports(self.vector)
+        self._predicted = misfit.predicted(self.vector)
 
     def predict(self, inputs: Inputs, receiver: int) -> Prediction:
         """Refused: paths to the held-out rows alone are known."""
-        raise InputError("the reports of a correction are those of held-out rows")
+        raise InputError("the predictions of a correction are those of held-out rows")
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
-        """Reports [q, ...]; NaN of rows that do not judge."""
+        """Predictions [q, ...]; NaN of rows that do not judge."""
         known = np.isin(rows, self.misfit.rows)
-        reports = np.full((len(rows), *self._reports.shape[2:]), np.nan, self._reports.dtype)
-        reports[known] = self._reports[receiver, np.searchsorted(self.misfit.rows, rows[known])]
-        return Prediction(reports)
+        predicted = np.full((len(rows), *self._predicted.shape[2:]), np.nan, self._predicted.dtype)
+        predicted[known] = self._predicted[receiver, np.searchsorted(self.misfit.rows, rows[known])]
+        return Prediction(predicted)
 
     def arrays(self) -> Arrays:
-        """None: no run stores reports."""
+        """None: no run stores these predictions."""
         return {}
 
 
-class _Reports(Stage):
-    """Reports of traced paths."""
+class _TracedObservations(Stage):
+    """Observations of traced paths."""
 
-    name = "reports"
+    name = "observations"
     stated: ScenePosterior  # of the held-out rows that judge, along the paths of the stated scene
     heard: Collection[str]  # names of the receivers that observed rows which are fitted to
     out: Collection[str] = ()  # names of the receivers that judge where some were held out
 
     def __init__(self, traced: TracedScene) -> None:
-        self._traced, self.tried = traced, list[_Reported]()
+        self._traced, self.tried = traced, list[_EditObservations]()
 
     def options(self, problem: Problem, split: Split) -> Sequence[Option]:
         """One."""
@@ -195,27 +195,29 @@ class _Reports(Stage):
             self.out = [unseen.receivers[number].name for number in np.flatnonzero(judge)]
         self.stated = self._traced.posterior(unseen, rows)
 
-    def of(self, edit: SceneEdit) -> _Reported:
-        """Reports of the rows that judge with the parameters of an edit, along the paths of its scene."""
+    def of(self, edit: SceneEdit) -> _EditObservations:
+        """Predictions of the rows that judge with the parameters of an edit, along the paths of its scene."""
         stated = self.stated.misfit
         if not moves_planes(edit.stage):
-            return _Reported(edit, stated, self.heard)
-        return _Reported(edit, self._traced.posterior(stated.record, stated.rows, edit).misfit, self.heard)
+            return _EditObservations(edit, stated, self.heard)
+        return _EditObservations(edit, self._traced.posterior(stated.record, stated.rows, edit).misfit, self.heard)
 
 
-def _by_uncertain_phases(trial: ScenePosterior, reports: _Reports, best: _Reported) -> _Reported:
+def _by_uncertain_phases(
+    trial: ScenePosterior, observations: _TracedObservations, best: _EditObservations
+) -> _EditObservations:
     """What is kept where planes are not resolved: ``best``, or materials by uncertain phases."""
     if PHASES not in trial.options.parts or not UncertainPhases.serves(trial.misfit):
         return best
     fit = UncertainPhases(trial)
     parts = [part for part in trial.options.parts if part not in (PLANES, FRAME)]
-    other = reports.of(fit.best("+".join(parts)).edit)
-    reports.tried.append(other)
+    other = observations.of(fit.best("+".join(parts)).edit)
+    observations.tried.append(other)
     # The engine judges by predictions. Predicted channels of wrong phases say nothing of materials: their likelihood
     # with uncertain phases decides.
-    unseen = UncertainPhases(reports.stated, fit.noise)
+    unseen = UncertainPhases(observations.stated, fit.noise)
     gain = unseen.scores(other.vector) - unseen.scores(best.vector)
-    if reports.out:  # errors are independent between receivers
+    if observations.out:  # errors are independent between receivers
         of_receivers = gain.reshape(len(unseen.misfit.record.receivers), -1)
         gain = np.array([np.nanmean(rows) for rows in of_receivers if np.isfinite(rows).any()])
     gain = gain[np.isfinite(gain)]

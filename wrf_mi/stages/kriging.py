@@ -17,7 +17,7 @@ from .residual import StrengthResidual
 from .runs import Runs
 
 POOLED = "field"  # array of pooled strengths, which generic kriging has not
-STOPS = "value_dbm"  # array of readings, NaN where a receiver did not report at a stop
+STOPS = "value_dbm"  # array of readings, NaN where a receiver observed nothing at a stop
 
 
 class StrengthKriging(GenericKriging):

@@ -22,7 +22,7 @@ from ..estimators.held_out import hold_out_once
 from ..estimators.model import Arrays, Model, Problem, Session
 from ..training.config import TrainConfig, calibration_config
 from ..training.trainer import Trainer
-from ..training.validation import HeldOutReports
+from ..training.validation import HeldOutObservations
 from .engine import LEAST_ROWS, Engine, Fold
 from .fitted import Residuals, training_residuals
 from .scene import (
@@ -74,24 +74,24 @@ def config_of(problem: Problem, split: Split, few: bool) -> TrainConfig:
 class FittedPaths(FittedInScene):
     """Scene model: a graph of paths, Gaussians on surfaces and those of a field.
 
-    ``reports`` are those of the held-out rows by a fit to the others, None of a fit to all rows.
+    ``held_out`` are predictions of the held-out rows by a fit to the others, None of a fit to all rows.
     """
 
     fitted: FittedField
-    reports: HeldOutReports | None = None
+    held_out: HeldOutObservations | None = None
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction | None:
-        """Reports of held-out rows by which the training chose its state; None: other rows are among them."""
-        reports = self.reports
-        if reports is None:
+        """Predictions of held-out rows by which the training chose its state; None: other rows are among them."""
+        held_out = self.held_out
+        if held_out is None:
             return None
-        mine = np.flatnonzero(reports.receiver == receiver)
-        order = mine[np.argsort(reports.row[mine], kind="stable")]
-        place = np.searchsorted(reports.row[order], rows)
+        mine = np.flatnonzero(held_out.receiver == receiver)
+        order = mine[np.argsort(held_out.row[mine], kind="stable")]
+        place = np.searchsorted(held_out.row[order], rows)
         known = place < len(order)
-        if not known.all() or (reports.row[order[place]] != rows).any():
+        if not known.all() or (held_out.row[order[place]] != rows).any():
             return None
-        return Prediction(reports.report[order[place]])
+        return Prediction(held_out.predicted[order[place]])
 
 
 class _Training(NamedTuple):
@@ -163,7 +163,7 @@ class PathsStage(Stage):
         inner = replace(problem, settings=config_of(problem, rows, False), checked=[])
         graph, trainer = WRF_GS_PLUS.train_part(before and before.trainer, inner, rows, session)
         kept, scene_model = {**state.kept, self.name: _Training(trainer, problem)}, FittedPaths(graph, problem)
-        scene_model.reports = graph.held_out
+        scene_model.held_out = graph.held_out
         return replace(state, problem=problem, fitted=scene_model, kept=kept)
 
     def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
@@ -214,7 +214,7 @@ class TracedPaths(Model):
             engine.stated_reports(),
         )
         scene_model.stages = tuple(_reports(engine, scene_model.fitted, problem.record.task.higher_is_better))
-        # Reports of other carriers have residuals of their own.
+        # Observations at other carriers have residuals of their own.
         if RESIDUAL in problem.settings.wanted and problem.record.carriers_hz is None:
             scene_model.with_residuals = engine.of_fold("with-residuals", partial(_with_residuals, problem))
         del engine, state  # with the trainings of the options

@@ -33,7 +33,7 @@ from ..core.arrays import planar_array
 from ..datasets import read_spectrum_folder, write_spectrum_folder
 from ..receivers.array import bartlett_spectrum
 from ..receivers.channel import array_channels
-from ..receivers.reports import minmax_scale
+from ..receivers.scaling import minmax_scale
 from ..tasks import SPECTRUM
 from ..tracing.options import TraceOptions
 from ..tracing.paths.result import recompute

@@ -32,7 +32,7 @@ def instrument_of(record: Record) -> Instrument:
     """The instrument of a record, for ray tracing (InputError: an unknown task, position, carrier or array)."""
     task = record.task
     if not task.receiver_with_scene:
-        raise InputError(f"{record.name}: no receiver model reports {task.name} from paths; choose another model")
+        raise InputError(f"{record.name}: no receiver model observes {task.name} from paths; choose another model")
     frequencies_hz, record = _carrier_hz(record, task.carrier_stated_in), task.with_arrays(record)
     size = task.image_size(record.observation.shape) or SIZE
     return Instrument(task.receiver_with_scene, record.receivers, frequencies_hz, record.tx_antenna, size)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..core import Task
 from ..core.angles import FloatArray
-from ..receivers.reports import SQUARED_MAGNITUDE_EPS
+from ..receivers.scaling import SQUARED_MAGNITUDE_EPS
 from .one_antenna import ALONE, JOINT, sums_of_rays
 from .scores import abs_error_db
 
@@ -32,7 +32,7 @@ class Rssi(Task):
     # Best of 0 to 1.6 m in a tenfold cross-validation, in the order of time, on flat-ble's training run.
     neighbours, softening_m = 100, 0.4
     heading, quantity = "received signal strength", "RSSI (dBm)"
-    level_kind, level_note = "power", "received power as the receiver reports it"
+    level_kind, level_note = "power", "received power as the receiver observes it"
     note = (
         "The absolute error in dB counts rows that were received; IDW averages the nearest training rows "
         "that the same receiver received by inverse squared distance, 0.4 m added; held-out training rows choose their "

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..core import InputError, Prediction, Record, Task
 from ..core.angles import FloatArray, solid_angles
-from ..receivers.reports import SQUARED_MAGNITUDE_EPS
+from ..receivers.scaling import SQUARED_MAGNITUDE_EPS
 from .scores import level_of_amplitudes, ssim, ssim_mixtures
 
 SCORED_TOGETHER = 16  # Images whose similarity is computed at a time

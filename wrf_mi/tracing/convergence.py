@@ -46,7 +46,7 @@ class Trial:
     value: int | bool  # the setting's value
     change_db: float | None  # largest change against the previous setting, of power or spectrum; None for the first
     kept: bool  # whether the setting was taken
-    spectrum: float | None = None  # largest change of a reported spectrum, relative L2; None for the first, or without
+    spectrum: float | None = None  # largest change of an observed spectrum, relative L2; None for the first, or without
 
 
 @dataclass(frozen=True)
@@ -95,23 +95,23 @@ def remainder(changes: Sequence[float]) -> float:
 
 @dataclass
 class _Search:
-    """Reports of sampled transmitters [n, 3] under several settings, and the settings that were tried."""
+    """Observations of sampled transmitters [n, 3] under several settings, and the settings that were tried."""
 
     trace: Callable[..., TraceResult]
     positions_m: FloatArray
     spectra: Spectra | None
     share_db: float  # largest change of a part that counts as converged
     trials: list[Trial] = field(default_factory=lambda: [Trial("depth", 1, None, True)])
-    reports: dict[tuple[TraceOptions, bool], tuple[FloatArray, FloatArray | None]] = field(default_factory=dict)
+    observations: dict[tuple[TraceOptions, bool], tuple[FloatArray, FloatArray | None]] = field(default_factory=dict)
 
-    def _report(self, options: TraceOptions, few: bool) -> tuple[FloatArray, FloatArray | None]:
+    def _observed(self, options: TraceOptions, few: bool) -> tuple[FloatArray, FloatArray | None]:
         """Received power [n_rx, n] in dBm, NaN where no path arrives, and spectra [n_rx, n, height, width]."""
-        if (options, few) not in self.reports:
+        if (options, few) not in self.observations:
             sample = self.positions_m[spread(len(self.positions_m), SAMPLED_KINDS)] if few else self.positions_m
             paths = self.trace(tx_pos_m=sample, options=options).paths
             spectra = None if self.spectra is None else np.asarray(self.spectra(paths))
-            self.reports[options, few] = rssi_dbm(paths), spectra
-        return self.reports[options, few]
+            self.observations[options, few] = rssi_dbm(paths), spectra
+        return self.observations[options, few]
 
     def change(self, part: str, value: int | bool, options: TraceOptions, least_db: float = -1.0) -> float:
         """Largest change in dB by another value of a setting, which is kept where the change is above a least one."""
@@ -119,7 +119,7 @@ class _Search:
         other = replace(options, **setting)
         # Each transmitter takes a search of its own where paths are sampled, so fewer of them are compared.
         few = options.sampled or other.sampled
-        (a, before), (b, after) = self._report(options, few), self._report(other, few)
+        (a, before), (b, after) = self._observed(options, few), self._observed(other, few)
         spectrum = None
         if before is not None and after is not None:
             # Relative L2 difference of images: 0 if both are dark, infinite if the second one alone is.

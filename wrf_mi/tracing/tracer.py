@@ -34,11 +34,11 @@ TRIED = 16  # receivers of that trace: antennas of one building are alike, and e
 
 
 class RayTracer:
-    """Traces a scene and reports as an instrument does.
+    """Traces a scene and observes it as an instrument does.
 
     Args:
         scene: see `wrf_mi.tracing.open_scene`.
-        instrument: receivers and their reports, see `wrf_mi.tasks.instrument_of`.
+        instrument: receivers and their observations, see `wrf_mi.tasks.instrument_of`.
         options: kinds of path, depth, rays.
         material: radio material of a bare mesh.
 
@@ -112,7 +112,9 @@ class Offsets:
     """Offsets of traced signal strengths."""
 
     offset_db: FloatArray  # offset of each receiver, shape [n_rx]
-    floor_dbm: FloatArray  # weakest measured signal of each receiver, shape [n_rx], the report where no path arrives
+    floor_dbm: (
+        FloatArray  # weakest measured signal of each receiver, shape [n_rx], the observation where no path arrives
+    )
 
     def __call__(self, traced_dbm: ArrayLike) -> FloatArray:
         """Traced signal strengths [n_rx, n] (dBm for 0 dBm sent, NaN without a path) on the receivers' scales."""

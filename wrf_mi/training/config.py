@@ -265,7 +265,7 @@ CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "pose": ("traced.position=1e-3", "traced.turn=1e-3"),
     "surface": ("traced.surface=0.02",),
 }
-"""Trainable parts of the traced side by name; rates as ``--set`` takes them."""
+"""Trainable parts of the traced component by name; rates as ``--set`` takes them."""
 
 
 def default_config(task: str, with_scene: bool = False) -> TrainConfig:

@@ -1,8 +1,8 @@
-"""Evaluation of a graph's reports for transmitters whose paths are known: splatted, traced, or by operator.
+"""Evaluation of a graph's observations for transmitters whose paths are known: splatted, traced, or by operator.
 
-- `SplattedReports`: Gaussians alone, as one recorded function.
-- `TracedReports`: with the paths of a scene, or Gaussians that are traced.
-- `OperatorReports`: Gaussians of static geometry, as a linear map from their signals to pixels.
+- `SplattedObservations`: Gaussians alone, as one recorded function.
+- `TracedObservations`: with the paths of a scene, or Gaussians that are traced.
+- `OperatorObservations`: Gaussians of static geometry, as a linear map from their signals to pixels.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from ..gaussians.footprint import CUTOFF, LOW_PASS_RAD, MIN_COSINE, NEAR_M
 from ..gaussians.operator import Images, PixelOperator, pixel_weights, static_signals
 from ..gaussians.parameters import CHUNK_SIZE
 from ..gaussians.tiles import perception_plane
-from ..graph.graph import Alone, Batch, Field, Graph
+from ..graph.graph import Batch, Component, Field, Graph
 from ..receivers.registry import PIXEL
-from ..receivers.reports import SQUARED_MAGNITUDE_EPS
+from ..receivers.scaling import SQUARED_MAGNITUDE_EPS
 from ..tracing.paths.traced_field import TracedField
 from ..version import __version__
 from .adam import Params
@@ -48,15 +48,15 @@ MOST_BYTES = 1 << 30  # largest size of one receiver's weights; larger fields ar
 
 @dataclass(frozen=True)
 class Request:
-    """Transmitters whose reports of one port are evaluated."""
+    """Transmitters whose observations of one port are evaluated."""
 
     condition: FloatArray  # positions [m, 3], metres, or features [m, features]
     port: int  # number of the port
-    side: TracedField | None  # its traced side, or None
-    slots: IntArray  # rows of the traced side [m]
+    traced_field: TracedField | None  # its traced field, or None
+    slots: IntArray  # rows of the traced field [m]
     weight: NDArray[Any] | None = None  # weight of the Gaussians' signal [m], 0 to 1; None: 1
-    alone: Alone | None = None  # component reported alone (`Graph.report`); None: both together
-    phase_error: float = 0.0  # see `Graph.report`
+    component: Component | None = None  # the one component that is observed (`Graph.observation`); None: both
+    phase_error: float = 0.0  # see `Graph.observation`
 
     def rows(self, rows: slice | IntArray) -> Request:
         """The request for some of the transmitters."""
@@ -65,7 +65,7 @@ class Request:
 
 
 class Evaluator(ABC):
-    """Evaluates reports of a graph with one set of parameters, Dr.Jit tensors."""
+    """Evaluates observations of a graph with one set of parameters, Dr.Jit tensors."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
@@ -77,7 +77,7 @@ class Evaluator(ABC):
 
     @abstractmethod
     def __call__(self, request: Request) -> NDArray[np.float32]:
-        """Reports [m, *shape of a report]."""
+        """Observations [m, *shape of an observation]."""
 
 
 class _InBatches(Evaluator):
@@ -97,7 +97,7 @@ class _InBatches(Evaluator):
         super().update(params)
 
     def __call__(self, request: Request) -> NDArray[np.float32]:
-        """Reports [m, *shape of a report], batch by batch."""
+        """Observations [m, *shape of an observation], batch by batch."""
         shape, count = self.graph.models[request.port].shape, len(request.condition)
         if self.graph.form.features:  # of one antenna of the array
             shape = shape[-2:]
@@ -109,11 +109,11 @@ class _InBatches(Evaluator):
 
     @abstractmethod
     def _batch_size(self, numbers: int) -> int:
-        """Largest number of transmitters in a batch, for reports of so many numbers."""
+        """Largest number of transmitters in a batch, for observations of so many numbers."""
 
     @abstractmethod
     def _evaluated(self, request: Request) -> Any:
-        """Flat report of a batch, a Dr.Jit array."""
+        """Flat observations of a batch, a Dr.Jit array."""
 
     def _batch(self, request: Request, signal: Complex | None = None) -> Batch:
         """The transmitters of a request on the device, with the Gaussians' signal, if that is evaluated already."""
@@ -159,8 +159,8 @@ class _InBatches(Evaluator):
         return tuple(map(leading, arrays)) if isinstance(arrays, tuple) else leading(arrays)
 
 
-class SplattedReports(_InBatches):
-    """Reports of Gaussians alone, splatted."""
+class SplattedObservations(_InBatches):
+    """Observations of Gaussians alone, splatted."""
 
     def _batch_size(self, numbers: int) -> int:
         # An image of thousands of pixels fills the processors, and one recording serves any number of transmitters.
@@ -169,29 +169,29 @@ class SplattedReports(_InBatches):
     def _evaluated(self, request: Request) -> Any:
         size, port = self._batch_size(1), request.port
         if not self._may_record(size):
-            return evaluated(self.graph.report(port, None, chunked=True), self.params, self._batch(request))
+            return evaluated(self.graph.observation(port, None, chunked=True), self.params, self._batch(request))
         # One recording serves the pixels of all ports, whose poses are arguments.
-        name, read = ("report", None if size == 1 else port), partial(self.graph.arrays, port, None)
-        return self._recorded(name, size, self.graph.report(port, None), request, read)
+        name, read = ("observation", None if size == 1 else port), partial(self.graph.arrays, port, None)
+        return self._recorded(name, size, self.graph.observation(port, None), request, read)
 
 
-class TracedReports(_InBatches):
-    """Reports with the paths of a scene, or of Gaussians that are traced."""
+class TracedObservations(_InBatches):
+    """Observations with the paths of a scene, or of Gaussians that are traced."""
 
     def __init__(self, graph: Graph) -> None:
         super().__init__(graph)
-        self._sides: dict[Hashable, TracedField] = {}
+        self._traced_fields: dict[Hashable, TracedField] = {}
 
     def _batch_size(self, numbers: int) -> int:
         return max(TOGETHER, TRACED_NUMBERS // numbers)
 
     def _evaluated(self, request: Request) -> Any:
-        port, side = request.port, request.side
+        port, traced_field = request.port, request.traced_field
         # Gaussians are not evaluated beside paths where none has a weight.
-        learned = self.graph.field is not None and request.alone != "traced"
-        learned = learned and (side is None or request.weight is None or bool(np.any(request.weight)))
-        if side is not None and len(side) == 1 and self._may_record(1):
-            return self._of_one(request, side, learned)
+        learned = self.graph.field is not None and request.component != "traced"
+        learned = learned and (traced_field is None or request.weight is None or bool(np.any(request.weight)))
+        if traced_field is not None and len(traced_field) == 1 and self._may_record(1):
+            return self._of_one(request, traced_field, learned)
         # Numbers of paths differ from batch to batch, and a recording serves one: only the Gaussians' signal, which
         # takes most of the time, is recorded.
         signal, count = None, len(request.condition)
@@ -200,23 +200,25 @@ class TracedReports(_InBatches):
             # One recording serves the poses of all receivers unless they are trained.
             name = "signal", port if self.graph.moves else None
             signal = self._recorded(name, TOGETHER, partial(self.graph.learned, port), replace(request, weight=None))
-        report = self.graph.report(port, side, learned, alone=request.alone, phase_error=request.phase_error)
-        return evaluated(report, self.params, self._batch(request, signal))
+        observe = self.graph.observation(
+            port, traced_field, learned, component=request.component, phase_error=request.phase_error
+        )
+        return evaluated(observe, self.params, self._batch(request, signal))
 
-    def _of_one(self, request: Request, side: TracedField, learned: bool) -> Any:
-        """Report of one transmitter, by a recording that serves others, whose traced sides are inputs."""
-        port, how = request.port, {"alone": request.alone, "phase_error": request.phase_error}
-        name = "both", port, learned, *how.values(), side.form
-        # The recorded function looks the side up at each call, as its arrays are read beside the arguments.
-        self._sides[name] = side
+    def _of_one(self, request: Request, traced_field: TracedField, learned: bool) -> Any:
+        """Observation of one transmitter, by a recording that serves others, whose traced fields are inputs."""
+        port, how = request.port, {"component": request.component, "phase_error": request.phase_error}
+        name = "both", port, learned, *how.values(), traced_field.form
+        # The recorded function looks the traced field up at each call, as its arrays are read beside the arguments.
+        self._traced_fields[name] = traced_field
 
-        def reported(params: Mapping[str, Any], batch: Batch) -> Any:
-            return self.graph.report(port, self._sides[name], learned, **how)(params, batch)  # type: ignore[arg-type]
+        def observe(params: Mapping[str, Any], batch: Batch) -> Any:
+            return self.graph.observation(port, self._traced_fields[name], learned, **how)(params, batch)  # type: ignore[arg-type]
 
-        return self._recorded(name, 1, reported, request, lambda: self.graph.arrays(port, self._sides[name]))
+        return self._recorded(name, 1, observe, request, lambda: self.graph.arrays(port, self._traced_fields[name]))
 
 
-class OperatorReports(Evaluator):
+class OperatorObservations(Evaluator):
     """Magnitudes at each direction by the linear map from signals to pixels (`wrf_mi.gaussians.operator`).
 
         operator<r>.npz    of receiver r: format version, key, weights [pixels, n] as a sparse matrix; arrays only
@@ -292,8 +294,8 @@ def read_weights(path: Path, key: str, shape: tuple[int, int]) -> csr_array | No
 def evaluator_of(graph: Graph, operator: bool = False, store: Path | None = None) -> Evaluator:
     """The evaluator of a graph; ``operator``: by operator where geometry and attenuation are static."""
     if graph.scene is not None or not graph.evaluation.recordable:
-        return TracedReports(graph)
+        return TracedObservations(graph)
     static = getattr(graph.field, "static_geometry", False) and graph.form.receiver == PIXEL
     if operator and static and graph.form.carriers_hz is None:
-        return OperatorReports(graph, store)
-    return SplattedReports(graph)
+        return OperatorObservations(graph, store)
+    return SplattedObservations(graph)

@@ -118,8 +118,8 @@ class FitPlan:
         return self.chooses and self.graph.scene is not None
 
     @cached_property
-    def sides(self) -> Sequence[TracedField | None]:
-        """Traced side of the training rows at each port, None without a scene (InputError: positions in a solid).
+    def traced_fields(self) -> Sequence[TracedField | None]:
+        """Traced fields of the training rows at each port, None without a scene (InputError: positions in a solid).
 
         Rows are traced once, validation rows included: their positions do not change, only what the paths meet.
         """
@@ -128,10 +128,10 @@ class FitPlan:
         headings = record.tx_heading_rad[rows] if form.headings and record.tx_heading_rad is not None else None
         carriers_hz = None if form.carriers_hz is None or record.carriers_hz is None else record.carriers_hz[rows]
         receivers = range(len(record.receivers))
-        return [side for r in receivers for side in self.graph.trace(record.tx_pos_m[rows], r, headings, carriers_hz)]
+        return [field for r in receivers for field in self.graph.trace(record.tx_pos_m[rows], r, headings, carriers_hz)]
 
     def slots(self, port: int, conditions: IntArray) -> IntArray:
-        """Number of the row of each condition in the traced side of a port."""
+        """Number of the row of each condition in the traced field of a port."""
         return np.searchsorted(self.port_rows[port], conditions // self.targets.per_row)
 
     def _curriculum(self) -> tuple[str, ...]:

@@ -163,7 +163,7 @@ def starting_values(plan: FitPlan, initial: InitialGaussians | None = None) -> d
         placed = replace(plan.record, receivers=graph.receivers)
         start = initial or initial_gaussians(config.initial, placed, plan.split.train, rng, graph.sphere)
         values = graph.field.init(start, rng)
-    values |= graph.parameters(plan.sides) | graph.add_surface_gaussians(plan.sides)
+    values |= graph.parameters(plan.traced_fields) | graph.add_surface_gaussians(plan.traced_fields)
     values |= _gains(plan, values)
     if LEVEL in values:
         values[LEVEL][0] = _levels(plan, values)
@@ -172,11 +172,11 @@ def starting_values(plan: FitPlan, initial: InitialGaussians | None = None) -> d
 
 def _gains(plan: FitPlan, values: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
     gains = defaultdict[str, list[NDArray[np.float32]]](list)
-    for port, side in enumerate(plan.sides):
-        if side is not None and side.gain_name in values and len(side):
+    for port, traced_field in enumerate(plan.traced_fields):
+        if traced_field is not None and traced_field.gain_name in values and len(traced_field):
             observed = plan.targets.observed[port // plan.graph.carriers, plan.port_rows[port]]
             # Ports of several carriers share the receiver's gain, which starts at their mean.
-            gains[side.gain_name].append(plan.graph.match_gain(port, side, observed))
+            gains[traced_field.gain_name].append(plan.graph.match_gain(port, traced_field, observed))
     return {name: np.mean(of_ports, axis=0, dtype=np.float32) for name, of_ports in gains.items()}
 
 
@@ -187,12 +187,12 @@ def _levels(plan: FitPlan, values: Mapping[str, NDArray[np.float32]]) -> list[fl
     params, batches = {name: to_tensor(value) for name, value in values.items()}, port_batches(graph)
     # A receiver has one level for all of its carriers: that of the first.
     for port in range(0, targets.ports, graph.carriers):
-        if (side := plan.sides[port]) is not None:
-            levels.append(graph.power_level(side, params) + float(np.log(SHARE)))
+        if (traced_field := plan.traced_fields[port]) is not None:
+            levels.append(graph.power_level(traced_field, params) + float(np.log(SHARE)))
             continue
         rows = received[port][:LEVEL_ROWS]
         batch = batch_on_device(batches[port], targets.condition[:, rows])
-        reported = evaluated(graph.report(port, None), params, batch).numpy()
+        predicted = evaluated(graph.observation(port, None), params, batch).numpy()
         observed = targets.observed[port // graph.carriers, rows].astype(float)
-        levels.append(graph.models[port].missing_gain(reported.astype(float).reshape(observed.shape), observed))
+        levels.append(graph.models[port].missing_gain(predicted.astype(float).reshape(observed.shape), observed))
     return levels

@@ -42,7 +42,7 @@ class FitState:
         self.searched_m = np.zeros((0, 3))  # position of each receiver at the last search for paths; empty: no scene
         self.phase_error = 0.0  # standard deviation of a reflection's phase in predictions, rad, once chosen
         self.best_scores = np.zeros(0)  # scores of the held-out rows by the best state
-        self.held_out = np.zeros(0)  # reports of the held-out rows by the chosen state
+        self.held_out = np.zeros(0)  # predictions of the held-out rows by the chosen state
         self.best: Arrays | None = None  # arrays of the state with the best validation score
         self.best_score = -np.inf  # its score, the higher the better; kept once the fit went on from it
         self.waited = 0  # number of scores since then

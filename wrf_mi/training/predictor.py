@@ -1,4 +1,4 @@
-"""Reports of a trained graph's receivers for new transmitters."""
+"""Predicted observations of a trained graph's receivers for new transmitters."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from ..core.types import IntArray
 from ..gaussians.footprint import depth_order, project
 from ..gaussians.parameters import Gaussians
 from ..gaussians.tiles import build_lists, perception_plane
-from ..graph.graph import Alone, Graph
+from ..graph.graph import Component, Graph
 from ..receivers.registry import PIXEL
 from ..receivers.spreads import PathStatistics, joined
 from ..tasks.conditions import known_headings, normalised_uplink
 from ..tracing.paths.traced_field import TracedField
 from .adam import Params
 from .by_distance import Reach
-from .evaluator import OperatorReports, Request, evaluator_of
+from .evaluator import OperatorObservations, Request, evaluator_of
 from .step import device_pose
 
 SEARCHED = 512  # transmitters of a carrier whose paths are searched together: a search has a fixed cost
@@ -52,12 +52,12 @@ class Predictor:
 
     Args:
         graph: Gaussians, receivers and a scene.
-        params: parameters of the field and of the traced side, as NumPy arrays.
+        params: parameters of the field and of the traced component, as NumPy arrays.
         operator: where the field's geometry and attenuation do not depend on the transmitter, predict by the linear map
             from signals to pixels (`wrf_mi.gaussians.operator`), built at the first prediction.
         store: folder in which operators are stored; None: in memory only.
         reach: region in which the Gaussians are used; None: everywhere.
-        phase_error: see `wrf_mi.graph.graph.Graph.report`.
+        phase_error: see `wrf_mi.graph.graph.Graph.observation`.
     """
 
     def __init__(
@@ -134,16 +134,16 @@ class Predictor:
             raise InputError(f"trained with {carriers_text(form.carriers_hz)}; give the carrier of every transmitter")
         carriers = None if form.carriers_hz is None else np.asarray(carriers_hz, float)
         if not len(positions):
-            return self._reported(positions, index * self.graph.carriers)
+            return self._predicted(positions, index * self.graph.carriers)
         if counting() and self.graph.form.receiver == PIXEL and self.graph.field is not None:
             self._count_gaussians(positions, index)
         groups = [
-            (rows, predictor._reported(positions[rows], port, side))
-            for rows, predictor, port, side in self._sides(positions, index, headings, carriers)
+            (rows, predictor._predicted(positions[rows], port, traced_field))
+            for rows, predictor, port, traced_field in self._traced_groups(positions, index, headings, carriers)
         ]
         # Groups come in the order of the search, which brings equal positions together.
-        order, reports = (np.concatenate(parts) for parts in zip(*groups, strict=True))
-        return reports[np.argsort(order)]
+        order, predicted = (np.concatenate(parts) for parts in zip(*groups, strict=True))
+        return predicted[np.argsort(order)]
 
     def _count_gaussians(self, tx_pos_m: FloatArray, receiver: int) -> None:
         """Count the pairs of a tile of an image and a Gaussian that reaches it, by the first of transmitters [m, 3]."""
@@ -157,8 +157,8 @@ class Predictor:
     def _from_uplink(self, uplink: NDArray[Any] | None, receiver: int) -> NDArray[Any]:
         # Antennas of an uplink are independent inputs, without positions and paths.
         features, divisor = normalised_uplink(uplink)
-        reports = self._reported(np.asarray(features, float), receiver).reshape(*divisor.shape, -1)
-        channels = reports * divisor[..., None]
+        predicted = self._predicted(np.asarray(features, float), receiver).reshape(*divisor.shape, -1)
+        channels = predicted * divisor[..., None]
         return (channels if len(self.graph.form.outputs) > 1 else channels[:, 0]).astype(np.complex64)
 
     def of_rows(self, record: Record, rows: IntArray, receiver: int) -> NDArray[Any]:
@@ -174,31 +174,33 @@ class Predictor:
         tx_heading_rad: FloatArray | None = None,
         carriers_hz: FloatArray | None = None,
     ) -> tuple[dict[str, NDArray[Any]], PathStatistics]:
-        """Reports with a scene's paths, by sides, and statistics of the paths, from one search; arguments as of a call.
+        """Predictions with a scene's paths, by components, and statistics of the paths, from one search (`__call__`).
 
         Returns:
-            ``whole`` and, with Gaussians, ``traced`` and ``learned`` (`Graph.report`), [m, ...], NaN where Gaussians
-            are out of reach; and statistics of the paths before the instrument's gain.
+            ``prediction`` and, with Gaussians, ``traced`` and ``learned`` (`Graph.observation`), [m, ...], NaN where
+            Gaussians are out of reach; and statistics of the paths before the instrument's gain.
         """
         headings = known_headings(tx_heading_rad, len(tx_pos_m), self.graph.form.headings)
         self.graph.check(tx_pos_m)
-        reports, statistics, order = list[dict[str, NDArray[Any]]](), list[PathStatistics](), list[IntArray]()
-        for rows, predictor, port, side in self._sides(tx_pos_m, receiver, headings, carriers_hz):
-            assert side is not None, "a graph without a scene has one side"
+        predicted, statistics, order = list[dict[str, NDArray[Any]]](), list[PathStatistics](), list[IntArray]()
+        for rows, predictor, port, traced_field in self._traced_groups(tx_pos_m, receiver, headings, carriers_hz):
+            assert traced_field is not None, "a graph without a scene has no traced component"
             positions = tx_pos_m[rows]
-            reports.append({"prediction": predictor._reported(positions, port, side)})
+            predicted.append({"prediction": predictor._predicted(positions, port, traced_field)})
             if self.graph.field is not None:
-                reports[-1] |= {name: predictor._of_one_side(positions, port, side, name) for name in get_args(Alone)}
-            statistics.append(side.statistics(self.evaluate.params))
+                predicted[-1] |= {
+                    name: predictor._of_component(positions, port, traced_field, name) for name in get_args(Component)
+                }
+            statistics.append(traced_field.statistics(self.evaluate.params))
             order.append(rows)
         back = np.argsort(np.concatenate(order))
-        joint = {name: np.concatenate([part[name] for part in reports])[back] for name in reports[0]}
+        joint = {name: np.concatenate([part[name] for part in predicted])[back] for name in predicted[0]}
         return joint, joined(statistics).rows(back)
 
-    def _sides(
+    def _traced_groups(
         self, tx_pos_m: FloatArray, receiver: int, heading_rad: FloatArray | None, carriers_hz: FloatArray | None
     ) -> Iterator[tuple[IntArray, Predictor, int, TracedField | None]]:
-        """Groups of positions: their numbers, predictor and port, and traced side; without a scene one group."""
+        """Groups of positions: their numbers, predictor and port, and traced field; without a scene one group."""
         order = np.arange(len(tx_pos_m))
         size = SEARCHED if self.graph.scene is not None else max(len(order), 1)
         if self.graph.scene is not None and carriers_hz is not None:
@@ -207,12 +209,14 @@ class Predictor:
         for start in range(0, len(order), size):
             rows = order[start : start + size]
             headings, carriers = (None if part is None else part[rows] for part in (heading_rad, carriers_hz))
-            sides = self.graph.trace(tx_pos_m[rows], receiver, headings, carriers, self.evaluate.params)
-            for side, (carrier_hz, which) in zip(sides, rows_by_carrier(carriers, len(rows)), strict=True):
-                yield rows[which], *self._at_carrier(carrier_hz, receiver), side
+            traced_fields = self.graph.trace(tx_pos_m[rows], receiver, headings, carriers, self.evaluate.params)
+            for traced_field, (carrier_hz, which) in zip(
+                traced_fields, rows_by_carrier(carriers, len(rows)), strict=True
+            ):
+                yield rows[which], *self._at_carrier(carrier_hz, receiver), traced_field
 
     def _at_carrier(self, carrier_hz: float | None, receiver: int) -> tuple[Predictor, int]:
-        """Predictor and port of a receiver's reports at a carrier, that of training or another one."""
+        """Predictor and port of a receiver at a carrier, that of training or another one."""
         trained_hz = self.graph.form.carriers_hz
         if trained_hz is None or carrier_hz is None:
             return self, receiver
@@ -226,47 +230,49 @@ class Predictor:
         other.reach, other.phase_error = self.reach, self.phase_error
         return other, receiver
 
-    def _reported(
-        self, conditions: FloatArray, port: int, side: TracedField | None = None, slots: IntArray | None = None
+    def _predicted(
+        self, conditions: FloatArray, port: int, traced_field: TracedField | None = None, slots: IntArray | None = None
     ) -> NDArray[Any]:
-        """Reports for positions [m, 3] or features [m, features], with paths of ``side`` in its rows ``slots`` [m]."""
+        """Predictions for positions [m, 3] or features [m, features], with the paths of rows ``slots`` [m]."""
         slots = np.arange(len(conditions)) if slots is None else slots
         weight = None if self.reach is None else self.reach.weight(conditions, port // self.graph.carriers)
         if weight is not None and not weight.all():
             if weight.any():
                 # Gaussians of weight 0 are not evaluated.
                 parts = [np.flatnonzero(mask) for mask in (weight > 0, weight == 0)]
-                reports = [self._reported(conditions[part], port, side, slots[part]) for part in parts]
-                return np.concatenate(reports)[np.argsort(np.concatenate(parts))]
+                predicted = [self._predicted(conditions[part], port, traced_field, slots[part]) for part in parts]
+                return np.concatenate(predicted)[np.argsort(np.concatenate(parts))]
             # Channels are zero without Gaussians, and nothing has to be evaluated.
             if self.graph.scene is None:
                 return np.zeros((len(conditions), *self.graph.models[port].shape[:-1]), np.complex64)
-        return self.of_side(Request(conditions, port, side, slots, weight))
+        return self.of_request(Request(conditions, port, traced_field, slots, weight))
 
-    def _of_one_side(self, tx_pos_m: FloatArray, port: int, side: TracedField, alone: Alone) -> NDArray[Any]:
-        """Reports of one side alone, NaN where Gaussians are out of reach."""
+    def _of_component(
+        self, tx_pos_m: FloatArray, port: int, traced_field: TracedField, component: Component
+    ) -> NDArray[Any]:
+        """Predictions of one component, NaN where Gaussians are out of reach."""
         weight = None if self.reach is None else self.reach.weight(tx_pos_m, port // self.graph.carriers)
         # Far from training rows the Gaussians' component is not defined, while that of the paths always is.
         used = np.arange(len(tx_pos_m))
-        if alone == "learned" and weight is not None:
+        if component == "learned" and weight is not None:
             used = np.flatnonzero(weight)
         weight = None if weight is None else weight[used]
-        reports = self.of_side(Request(tx_pos_m[used], port, side, used, weight, alone))
-        spread = np.full((len(tx_pos_m), *reports.shape[1:]), np.nan, reports.dtype)
-        spread[used] = reports
+        predicted = self.of_request(Request(tx_pos_m[used], port, traced_field, used, weight, component))
+        spread = np.full((len(tx_pos_m), *predicted.shape[1:]), np.nan, predicted.dtype)
+        spread[used] = predicted
         return spread
 
-    def of_side(self, request: Request) -> NDArray[Any]:
+    def of_request(self, request: Request) -> NDArray[Any]:
         """Predictions, as of `__call__`, for transmitters whose paths are known, with the phase error of the model."""
         request = replace(request, phase_error=self.phase_error)
         try:
-            reports = self.evaluate(request)
+            predicted = self.evaluate(request)
         except MemoryError as error:
-            if not isinstance(self.evaluate, OperatorReports):
+            if not isinstance(self.evaluate, OperatorObservations):
                 raise
             warnings.warn(f"operator: {error}; spectra are splatted one by one", stacklevel=2)
             # From now on, so that this is said once.
             params, self.evaluate = self.evaluate.params, evaluator_of(self.graph)
             self.evaluate.update(params)
-            reports = self.evaluate(request)
-        return reports.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else reports
+            predicted = self.evaluate(request)
+        return predicted.view(np.complex64)[..., 0] if self.graph.kind.complex_valued else predicted

@@ -23,7 +23,7 @@ from ..backend.vectors import Complex, Pose
 from ..core import InputError, Receiver
 from ..gaussians.attributes import attributes_of
 from ..gaussians.tiles import perception_plane
-from ..graph.graph import LEVEL, Batch, Graph, Report
+from ..graph.graph import LEVEL, Batch, Graph, ObservationFunction
 from ..graph.settings import TRACED_NAMES
 from ..tasks import Loss
 from .adam import NonFiniteReport, Params, Schedule, ScheduledStep, guarded_step, rated_params
@@ -118,24 +118,26 @@ class Steps:
 
     def _function(self, port: int, state: FitState) -> StepFunction:
         """Recorded step of a port; without paths one serves all, else each search for paths needs another."""
-        plan, side = self._plan, self._plan.sides[port]
+        plan, traced_field = self._plan, self._plan.traced_fields[port]
         graph, params = plan.graph, dict(state.adam.items())
-        if side is not None and side.refresh(params):
-            state.searched_m[port] = side.searched_at_m
+        if traced_field is not None and traced_field.refresh(params):
+            state.searched_m[port] = traced_field.searched_at_m
         # A chosen reach of 0 is that of no Gaussians.
-        learned = side is None or (plan.trains == FIELD and not (state.chosen and state.reach_m == 0))
-        arrays, surface = graph.arrays(port, side), plan.trains_surfaces
-        key = (None,) if side is None and not arrays else (port, side and side.searches, learned)
+        learned = traced_field is None or (plan.trains == FIELD and not (state.chosen and state.reach_m == 0))
+        arrays, surface = graph.arrays(port, traced_field), plan.trains_surfaces
+        key = (
+            (None,) if traced_field is None and not arrays else (port, traced_field and traced_field.searches, learned)
+        )
         if key not in self.recorded:
             # Recordings of an earlier search hold its paths: they are dropped with them.
             self.recorded = {k: v for k, v in self.recorded.items() if k[0] != port}
-            report, read = graph.report(port, side, learned, surface=surface), None
+            observe, read = graph.observation(port, traced_field, learned, surface=surface), None
             if key != (None,):
                 # Arrays that are made from NumPy's memory at first use must exist before a recording.
                 condition = plan.targets.condition[:, plan.port_rows[port][:1] * plan.targets.per_row]
-                evaluated(report, params, batch_on_device(self._batches[port], condition))
-                read = partial(graph.arrays, port, side)
-            self.recorded[key] = self._recorded(report, self._rates(params), read)
+                evaluated(observe, params, batch_on_device(self._batches[port], condition))
+                read = partial(graph.arrays, port, traced_field)
+            self.recorded[key] = self._recorded(observe, self._rates(params), read)
         return self.recorded[key]
 
     def _rates(self, names: Mapping[str, Any]) -> dict[str, float]:
@@ -152,8 +154,10 @@ class Steps:
             name: traced.rate(name) if name.startswith(TRACED_NAMES) else rates.get(name, o.network) for name in names
         }
 
-    def _recorded(self, report: Report, rates: Mapping[str, float], read: Callable[[], Any] | None) -> StepFunction:
-        """A step by a report; ``read`` returns arrays that the report reads beside its arguments."""
+    def _recorded(
+        self, observe: ObservationFunction, rates: Mapping[str, float], read: Callable[[], Any] | None
+    ) -> StepFunction:
+        """A step by an observation; ``read`` returns arrays that ``observe`` reads beside its arguments."""
         evaluation, loss_of = self._plan.graph.evaluation, self.loss
         shape = self._plan.targets.observed.shape[2:]
 
@@ -162,11 +166,11 @@ class Steps:
             params = rated_params(adam, rates, at.factor)
             condition, observed, scale = data.select(conditions, batch.receiver, math.prod(shape))
             observed = observed * scale
-            # Evaluated with the report's first kernels, so that those of the loss and its reverse pass do not gather
-            # again.
+            # Evaluated with the observation's first kernels, so that those of the loss and its reverse pass do not
+            # gather again.
             dr.schedule(observed, scale)
             # In the receiver's unit, so that learning rates suit observations of any scale.
-            prediction = report(params, replace(batch, condition=condition))
+            prediction = observe(params, replace(batch, condition=condition))
             loss = loss_of(prediction * scale, observed, dr.width(conditions), *shape)
             mean, non_finite, finite = guarded_step(adam, params, loss, mean, at)
             result = mean, non_finite, dr.detach(loss), _view_gradient_norm(params, batch.pose, finite)
@@ -205,7 +209,7 @@ def batch_on_device(
 ) -> Batch:
     """The batch of a port (`port_batches`) with conditions [3 or features, m].
 
-    ``slots`` are rows of the traced side [m], by default the first m; ``weight`` [m] scales the Gaussians' signal.
+    ``slots`` are rows of the traced field [m], by default the first m; ``weight`` [m] scales the Gaussians' signal.
     """
     slots = on_device(np.arange(condition.shape[1]) if slots is None else slots, mi.UInt32)
     weight = None if weight is None else to_float(weight)
@@ -213,9 +217,9 @@ def batch_on_device(
     return replace(port_batch, condition=tensor, slots=slots, weight=weight, signal=signal)
 
 
-def evaluated(report: Report, params: Mapping[str, Any], batch: Batch) -> Any:
-    """A report, evaluated without gradients."""
+def evaluated(observe: ObservationFunction, params: Mapping[str, Any], batch: Batch) -> Any:
+    """Observations of a batch, evaluated without gradients."""
     with dr.suspend_grad():
-        reported = report(params, batch)
-        dr.eval(reported)
-    return reported
+        predicted = observe(params, batch)
+        dr.eval(predicted)
+    return predicted

@@ -27,7 +27,7 @@ class Targets:
     """
 
     condition: FloatArray  # positions [3, c] in metres or features [features, c]
-    observed: NDArray[np.float32]  # observations [n_rx, c, *shape of a report], NaN where nothing was received
+    observed: NDArray[np.float32]  # observations [n_rx, c, *shape of an observation], NaN where nothing was received
     unit: FloatArray  # unit of each receiver's differences in the loss, [n_rx]
     per_row: int = 1  # number of consecutive conditions of a row
     weight: FloatArray | None = None  # factor of each observation's difference in the loss [n_rx, c]; None: 1
@@ -114,12 +114,12 @@ def form_of(record: Record, rows: IntArray, config: TrainConfig, targets: Target
     """Form of a record's observations, whose basis is computed from training ``rows``.
 
     Raises:
-        InputError: no receiver model reports the observations, or one that does not suit them.
+        InputError: no receiver model has the observations, or one that does not suit them.
     """
     task, shape = record.task, record.observation.shape[2:]
     default, outputs = task.receiver_with_scene if with_scene else task.receiver, task.outputs(shape)
     if not default:
-        raise InputError(f"{record.name}: no receiver model reports {task.name}; choose another model")
+        raise InputError(f"{record.name}: no receiver model observes {task.name}; choose another model")
     name = default if config.receiver == AUTO else config.receiver
     receiver_model(name, task.name)
     if with_scene and len(outputs) > 1 and any(receiver.array_m is None for receiver in record.receivers):

@@ -35,7 +35,7 @@ class Trainer(TrainingLoop):
     """Fits one field to the training rows of one split.
 
     Args:
-        record: measurements of any task that a receiver model reports.
+        record: measurements of any task that a receiver model observes.
         split: rows for training and for the choice of settings.
         config: settings.
         field: field that replaces the one of ``config.model``.
@@ -93,7 +93,7 @@ class Trainer(TrainingLoop):
                 state.reach_m = 0.0
         else:
             check_params(plan.graph.field, state.params(), "checkpoint.npz")
-            plan.graph.add_surface_gaussians(plan.sides, state.params())
+            plan.graph.add_surface_gaussians(plan.traced_fields, state.params())
         self.state = state
         # A resumed fit whose state was chosen has the shortened schedule that followed.
         if state.chosen:
@@ -107,7 +107,9 @@ class Trainer(TrainingLoop):
         keep their starting values, but for Gaussians on surfaces, which have places of their own.
         """
         start, chosen = self.state.params(), before.state
-        parameters, parameters_before = (trainer.graph.parameters(trainer.plan.sides) for trainer in (self, before))
+        parameters, parameters_before = (
+            trainer.graph.parameters(trainer.plan.traced_fields) for trainer in (self, before)
+        )
         fitted = {name: v for name, v in params.items() if name in start and v.shape == start[name].shape}
         for name, values in parameters.items():
             if name in fitted and name in parameters_before and parameters_before[name].shape == values.shape:
@@ -116,7 +118,7 @@ class Trainer(TrainingLoop):
         self.state = FitState(start | fitted | discs, self.state.adam.beta_1)
         for name in ("chosen", "reach_m", "phase_error", *OF_FIT):
             setattr(self.state, name, getattr(chosen, name))
-        self.graph.add_surface_gaussians(self.plan.sides, self.state.params())
+        self.graph.add_surface_gaussians(self.plan.traced_fields, self.state.params())
         self.schedule, self.state.step = self.schedule.after(chosen.chosen)
 
     @property
@@ -138,12 +140,12 @@ class Trainer(TrainingLoop):
 
     def _restore_paths(self) -> None:
         # A receiver that training moves is searched from its position at the last search.
-        sides = [side for side in self.plan.sides if side is not None]
-        if sides and not len(self.state.searched_m):
-            self.state.searched_m = np.stack([side.searched_at_m for side in sides])
-        for side, searched_m in zip(sides, self.state.searched_m, strict=True):
-            if not np.array_equal(side.searched_at_m, searched_m):
-                side.search(searched_m)
+        traced_fields = [field for field in self.plan.traced_fields if field is not None]
+        if traced_fields and not len(self.state.searched_m):
+            self.state.searched_m = np.stack([field.searched_at_m for field in traced_fields])
+        for traced_field, searched_m in zip(traced_fields, self.state.searched_m, strict=True):
+            if not np.array_equal(traced_field.searched_at_m, searched_m):
+                traced_field.search(searched_m)
 
     def predictor(self) -> Predictor:
         """Predictions with the current running mean of the parameters."""

@@ -24,16 +24,16 @@ PHASE_ERRORS = (0.5, 1.0, 1.5)  # phase errors that are tried, rad: beyond, phas
 
 
 @dataclass(frozen=True)
-class HeldOutReports:
-    """Reports of training rows that a fit had not seen when it chose its state."""
+class HeldOutObservations:
+    """Predicted observations of training rows that a fit had not seen when it chose its state."""
 
     receiver: IntArray  # number of the receiver of each [q]
     row: IntArray  # row of the record [q]
-    report: NDArray[Any]  # reports [q, ...] as observations
+    predicted: NDArray[Any]  # predicted observations [q, ...]
 
 
 class Validation:
-    """Scores and reports of held-out rows.
+    """Scores and predictions of held-out rows.
 
     Attributes:
         scores: scores of the held-out rows at the last validation, port by port.
@@ -72,8 +72,8 @@ class Validation:
             self.scores = self._scores(predict, rows)
         else:
             record, validation = plan.record, self._split(state.chosen).validation
-            reports = [predict.of_rows(record, validation, r) for r in range(len(record.receivers))]
-            scored = zip(reports, record.observation[:, validation], strict=True)
+            predicted = [predict.of_rows(record, validation, r) for r in range(len(record.receivers))]
+            scored = zip(predicted, record.observation[:, validation], strict=True)
             self.scores = np.concatenate([np.ravel(plan.task.training_score(*pair)) for pair in scored])
         return float(np.nanmedian(self.scores)) if len(self.scores) else float("nan")
 
@@ -120,52 +120,52 @@ class Validation:
         rows = len(np.unique(np.concatenate(scored)[far]))
         return facts | {"far_score": float(np.median(self.scores[far])), "far_rows": rows}
 
-    def _reports(self, predict: Predictor, rows: Sequence[IntArray], reach: Reach | None = None) -> NDArray[Any]:
-        """Reports of known rows of each port, port by port, whose paths need no search."""
-        plan, reports = self.plan, list[NDArray[Any]]()
+    def _predicted(self, predict: Predictor, rows: Sequence[IntArray], reach: Reach | None = None) -> NDArray[Any]:
+        """Predictions of known rows of each port, port by port, whose paths need no search."""
+        plan, predicted = self.plan, list[NDArray[Any]]()
         for port, port_rows in enumerate(rows):
             tx_pos_m = plan.record.tx_pos_m[port_rows]
             weight = None if reach is None else reach.weight(tx_pos_m, port // plan.graph.carriers)
-            # Sides hold all training rows, held-out ones too: scores need no further search for paths.
-            request = Request(tx_pos_m, port, plan.sides[port], plan.slots(port, port_rows), weight)
-            reports.append(predict.of_side(request))
-        return np.concatenate(reports)
+            # Traced fields hold all training rows, held-out ones too: scores need no further search for paths.
+            request = Request(tx_pos_m, port, plan.traced_fields[port], plan.slots(port, port_rows), weight)
+            predicted.append(predict.of_request(request))
+        return np.concatenate(predicted)
 
     def _observed(self, rows: Sequence[IntArray]) -> NDArray[Any]:
         observed, carriers = self.plan.record.observation, self.plan.graph.carriers
         return np.concatenate([observed[port // carriers, port_rows] for port, port_rows in enumerate(rows)])
 
     def _scores(self, predict: Predictor, rows: Sequence[IntArray], reach: Reach | None = None) -> FloatArray:
-        return np.ravel(self.plan.task.training_score(self._reports(predict, rows, reach), self._observed(rows)))
+        return np.ravel(self.plan.task.training_score(self._predicted(predict, rows, reach), self._observed(rows)))
 
     def choose_phase_error(self, predict: Predictor, state: FitState) -> NDArray[Any]:
-        """Reports of all rows on which a state was chosen, port by port, by the phase error that predicts them best.
+        """Predictions of all rows that chose a state, port by port, by the phase error that predicts them best.
 
         Planes that are centimetres off leave phases uncertain, and the expectation of a spectrum is then nearer to what
-        is measured than the spectrum of any phases (`Graph.report`). Other reports have no such expectation.
+        is measured than the spectrum of any phases (`Graph.observation`). Other observations have no such expectation.
         """
         plan, rows, reach = self.plan, self._held_out(False), self.reach(False, state.reach_m)
-        best = self._reports(predict, rows, reach)
+        best = self._predicted(predict, rows, reach)
         if plan.graph.scene is None or not plan.task.averages_phases:
             return best
         observed = self._observed(rows)
         best_scores = np.ravel(plan.task.training_score(best, observed))
         for phase_error in PHASE_ERRORS:
             predict.phase_error = phase_error
-            reports = self._reports(predict, rows, reach)
-            scores = np.ravel(plan.task.training_score(reports, observed))
+            predicted = self._predicted(predict, rows, reach)
+            scores = np.ravel(plan.task.training_score(predicted, observed))
             # Scores are taken to rise to one maximum, as each try costs a prediction of all held-out rows.
             if not improves(scores, best_scores, plan.task.higher_is_better):
                 break
-            state.phase_error, best, best_scores = phase_error, reports, scores
+            state.phase_error, best, best_scores = phase_error, predicted, scores
         predict.phase_error = state.phase_error
         return best
 
-    def reports(self, state: FitState) -> HeldOutReports | None:
-        """Reports of held-out rows by the state that was chosen on them; None: none was chosen in groups."""
+    def held_out_observations(self, state: FitState) -> HeldOutObservations | None:
+        """Predictions of held-out rows by the state that was chosen on them; None: none was chosen in groups."""
         plan = self.plan
         if not plan.chooses_beside_paths or not len(state.held_out):
             return None
         rows = self._held_out(False)
         receiver = [np.full(len(port_rows), port // plan.graph.carriers) for port, port_rows in enumerate(rows)]
-        return HeldOutReports(np.concatenate(receiver), np.concatenate(rows), state.held_out)
+        return HeldOutObservations(np.concatenate(receiver), np.concatenate(rows), state.held_out)

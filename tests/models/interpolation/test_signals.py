@@ -25,7 +25,7 @@ from wrf_mi.estimators.interpolation.signals import (
 )
 from wrf_mi.estimators.interpolation.spectra import ExpectedSpectrum, rician
 from wrf_mi.receivers.array import bartlett_spectrum, mirror_order
-from wrf_mi.receivers.reports import minmax_scale
+from wrf_mi.receivers.scaling import minmax_scale
 
 TOWARDS = np.array([3.0, 1.0, -0.5]) / np.linalg.norm([3.0, 1.0, -0.5])
 DICTIONARY = Covariances(np.array([4.0, 1.0, 0.3]) * WAVELENGTH_M, departures(TOWARDS, WAVENUMBER, CONE_DEG, count=60))
@@ -285,7 +285,7 @@ def test_known_signals_give_their_spectrum(size: tuple[int, int]) -> None:
 
 
 def test_expected_spectrum_is_the_mean_of_many() -> None:
-    """Up to 1 / sqrt(64) of the deviation, which the report's own draws leave in the extremes."""
+    """Up to 1 / sqrt(64) of the deviation, which the observation's own draws leave in the extremes."""
     h = signals(positions(2), TOWARDS)
     posterior = certain(h, 0.5 * float(np.square(np.abs(h)).mean()))
     rng = np.random.default_rng(0)

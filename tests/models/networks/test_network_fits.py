@@ -26,7 +26,7 @@ from wrf_mi.estimators.networks.nerf2_march import Networks
 from wrf_mi.estimators.networks.vae import VaeSettings
 from wrf_mi.models import Model, Problem
 from wrf_mi.receivers.array import array_response, bartlett_spectrum
-from wrf_mi.receivers.reports import minmax_scale
+from wrf_mi.receivers.scaling import minmax_scale
 from wrf_mi.tasks.scores import abs_error_db, cea_db, ssim
 
 FITTED = 0.9  # structural similarity to which 8 spectra must be fitted

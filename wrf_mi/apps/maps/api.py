@@ -290,8 +290,8 @@ def _of_chunk(
         if (limit := conditions.threshold_db) is not None:
             variables[COVERAGE] = coverage_probability(variables[POWER], std_db, limit, received)
     if parts.traced is not None and parts.learned is not None:
-        sides = parts.traced, parts.learned
-        traced, learned = (of_headings(task.level(Prediction(side)).mean).mean(axis=1) + added for side in sides)
+        components = parts.traced, parts.learned
+        traced, learned = (of_headings(task.level(Prediction(each)).mean).mean(axis=1) + added for each in components)
         variables |= {"traced_share": traced, "learned_share": learned, "share_difference_db": traced - learned}
     if parts.paths is not None:
         names = [field.name for field in fields(PathStatistics)]

@@ -36,7 +36,7 @@ from ...training.initial import initial_gaussians, starting_values
 from ...training.loop import FitState, Progress
 from ...training.predictor import Predictor
 from ...training.trainer import Trainer
-from ...training.validation import HeldOutReports
+from ...training.validation import HeldOutObservations
 from ..model import Decomposition, Fitted, Inputs, Model, Problem, Session
 from .curriculum import fit_curriculum
 from .new_receivers import Params, of_all_receivers, trained_part, without_rows
@@ -62,7 +62,7 @@ class FittedField(Fitted):
         reach: region in which the Gaussians are used; None: everywhere.
         phase_error: standard deviation of a reflection's phase in predictions, rad.
         field: field of Gaussians, see `wrf_mi.gaussians`; None: paths alone.
-        held_out: reports of training rows by which its state was chosen; None after loading, or where none were.
+        held_out: predictions of training rows by which its state was chosen; None after loading, or where none were.
     """
 
     problem: Problem = dataclass_field(metadata=NOT_STORED)
@@ -76,7 +76,7 @@ class FittedField(Fitted):
     phase_error: float = 0.0
 
     def __post_init__(self) -> None:
-        self.held_out: HeldOutReports | None = None
+        self.held_out: HeldOutObservations | None = None
         if self.reach is not None and np.isnan(self.reach.length_m):
             raise InputError("array reach/length_m: not a number; train the run anew")
         # Of Gaussians that no held-out row gained by, nothing is stored and nothing evaluated.
@@ -105,8 +105,10 @@ class FittedField(Fitted):
         if self.problem.scene is None:
             return super().decompose(inputs, receiver, std)
         heading = inputs.tx_heading_rad if self.uses_heading else None
-        reports, paths = self.predictor.decompose(inputs.tx_pos_m, receiver, heading, inputs.carriers_hz)
-        return Decomposition(Prediction(reports["prediction"]), reports.get("traced"), reports.get("learned"), paths)
+        predicted, paths = self.predictor.decompose(inputs.tx_pos_m, receiver, heading, inputs.carriers_hz)
+        return Decomposition(
+            Prediction(predicted["prediction"]), predicted.get("traced"), predicted.get("learned"), paths
+        )
 
     def facts(self) -> dict[str, Any]:
         """Steps of the training and number of Gaussians."""
@@ -239,7 +241,7 @@ class GaussianField(Model):
             self.defaults = TASKS[task].settings_with_scene if with_scene else TASKS[task].settings
 
     def serves(self, task: str) -> bool:
-        """Whether a receiver model reports the task, also one of another package."""
+        """Whether a receiver model observes the task, also one of another package."""
         return bool(TASKS[task].receiver)
 
     def serving(self, task: str, with_scene: bool) -> Model:
@@ -290,7 +292,9 @@ class GaussianField(Model):
         placed = placed_receivers(record, by_uplink=False)
         if problem.scene == scene and [each.name for each in placed] == [each.name for each in before]:
             if stopped:
-                del trainer.plan.sides  # traced anew, as paths are searched where the stopped training searched last
+                del (
+                    trainer.plan.traced_fields
+                )  # traced anew, as paths are searched where the stopped training searched last
                 trainer = self._trainer(session, trainer.plan, None)
             trainer.until_chosen = False
         else:
@@ -352,7 +356,7 @@ class GaussianField(Model):
     def _fitted(self, trainer: Trainer, problem: Problem, split: Split, folder: Path) -> FittedField:
         params, reach = of_all_receivers(*_used(trainer), placed_of(problem, trainer.plan), without_rows(split))
         fitted = _fitted(trainer.plan, params, problem, folder, reach, float(trainer.state.phase_error))
-        fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.validation.reports(trainer.state)
+        fitted.train_seconds, fitted.held_out = trainer.seconds, trainer.validation.held_out_observations(trainer.state)
         return fitted
 
     def _plan(self, problem: Problem, split: Split) -> FitPlan:

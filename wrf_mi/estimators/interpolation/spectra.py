@@ -170,13 +170,13 @@ class KrigedSpectra(Probabilistic):
     spread: float = 1.0
 
     def mixed(
-        self, reported: tuple[Image, Image], ignorance: FloatArray, nearby: Image, nearby_std: Image | None
+        self, of_signals: tuple[Image, Image], ignorance: FloatArray, nearby: Image, nearby_std: Image | None
     ) -> tuple[Image, Image | None]:
         """Mean and standard deviation of both estimates, [q, height, width], weighted; None for a mean alone.
 
-        ``reported`` are spectra expected from signals and their deviations, ``ignorance`` that of the signals [q].
+        ``of_signals`` are spectra expected from signals and their deviations, ``ignorance`` that of the signals [q].
         """
-        expected, deviation = reported
+        expected, deviation = of_signals
         weight = signal_weight(ignorance, self.half)[:, None, None]
         difference = expected - nearby
         mean = nearby + weight * difference
@@ -308,8 +308,8 @@ def _fit_weights(
     kriged.half = float(grid[((shares**2 * square) - 2 * shares * product).sum(axis=1).argmin()])
     # Every fifth pixel along either side: neighbours within a lobe's width have the same error.
     ratios = []
-    for truth, reported, unknown, nearby, nearby_std in predictions:
-        mean, std = kriged.mixed(reported, unknown, nearby, nearby_std)
+    for truth, of_signals, unknown, nearby, nearby_std in predictions:
+        mean, std = kriged.mixed(of_signals, unknown, nearby, nearby_std)
         assert std is not None
         ratios.append((np.abs(truth - mean) / np.maximum(std, 1e-6))[:, ::5, ::5].ravel())
         on_progress(0.5 + len(ratios) / (2 * len(predictions)))

@@ -114,7 +114,7 @@ class StrengthPosterior:
         """The process of hyperparameters with this lever, and of deviations of a prior with this mean."""
         parts = []
         for (received, columns, value), count in zip(self._terms, self.stops.count, strict=True):
-            # Reports of a stop average their own noise out, but not the fading that persists during the stop.
+            # Observations of a stop average their own noise out, but not the fading that persists during the stop.
             variance = h.drift_db**2 + h.noise_db**2 / count[received]
             parts.append(ReceiverObservations(received, columns, value, variance))
         sd = (prior or self.prior).deviations(self.headings)
@@ -188,7 +188,7 @@ class StrengthPosterior:
 
     @property
     def noise(self) -> float:
-        """Variance of a single report about the local mean power, dB^2."""
+        """Variance of a single observation about the local mean power, dB^2."""
         return self._spread.drift_db**2 + self._spread.noise_db**2
 
     def mean(self, poses: Poses, receiver: int) -> FloatArray:

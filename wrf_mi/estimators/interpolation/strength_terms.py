@@ -187,7 +187,7 @@ def basis(
 class Measured:
     """Training rows: poses, dBm [n_rx, n] (NaN where nothing was received), ascending numbers in the record [n].
 
-    ``precision`` [n_rx, n] is relative to a single report, see `wrf_mi.core.Record.precision`; None: 1.
+    ``precision`` [n_rx, n] is relative to a single observation, see `wrf_mi.core.Record.precision`; None: 1.
     """
 
     poses: Poses
@@ -205,7 +205,7 @@ class Measured:
 class Stops:
     """Consecutive rows at one pose, joined; s stops.
 
-    ``value_dbm`` [n_rx, s] is the median of each receiver's reports, weighted by precision (NaN where it received
+    ``value_dbm`` [n_rx, s] is the median of each receiver's observations, weighted by precision (NaN where it received
     nothing), ``count`` [n_rx, s] the sum of these precisions, and ``row`` [s] the middle row in the record's order.
     """
 
@@ -231,8 +231,8 @@ class Stops:
 def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> Stops:
     """Join consecutive rows at one pose, at most ``most`` within ``reach_m`` and ``turn_rad`` of the first.
 
-    Fading that persists while the transmitter stands is common to them: a hundred reports of one stop say little more
-    of the position than ten, and less than those of a second visit.
+    Fading that persists while the transmitter stands is common to them: a hundred observations of one stop say little
+    more of the position than ten, and less than those of a second visit.
     """
     position, heading, value_dbm = measured.poses.position_m, measured.poses.heading_rad, measured.value_dbm
     weight = np.ones(value_dbm.shape) if measured.precision is None else measured.precision
@@ -252,12 +252,12 @@ def stops_of(measured: Measured, reach_m: float, turn_rad: float, most: int) -> 
     def sums(values: NDArray[Any]) -> NDArray[Any]:
         return np.add.reduceat(np.where(received, values, 0), begins[:-1], axis=1) if count else values
 
-    reports, total = sums(received.astype(int)), sums(weight)
-    value = np.where(reports == 1, sums(value_dbm), np.nan)
-    for receiver, stop in np.argwhere(reports > 1):
+    observations, total = sums(received.astype(int)), sums(weight)
+    value = np.where(observations == 1, sums(value_dbm), np.nan)
+    for receiver, stop in np.argwhere(observations > 1):
         chunk = slice(begins[stop], begins[stop + 1])
         heard = received[receiver, chunk]
-        # A median, as fades skew the reports of a stop.
+        # A median, as fades skew the observations of a stop.
         value[receiver, stop] = _median(value_dbm[receiver, chunk][heard], weight[receiver, chunk][heard])
     run = None if measured.poses.run is None else measured.poses.run[begins[:-1]]
     return Stops(Poses(centre, direction, run), value, total, mean(measured.rows.astype(float)))

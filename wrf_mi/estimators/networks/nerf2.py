@@ -174,14 +174,14 @@ class Nerf2Field(Fitted):
         return [self._looked(network.state(), part) for part in parts]
 
     def march(self, network: Nerf2Network, rays: list[RayPoints], condition: Any, receiver: int) -> NDArray[np.float32]:
-        """Reports of the instrument for conditions [features, m]: [m, values]."""
+        """Observations of the instrument for conditions [features, m]: [m, values]."""
         index, blocks = dr.opaque(mi.UInt32, receiver), []
         at_once = max(1, PAIRS_PER_CHUNK // max(part.first.shape[1] for part in rays))
         for rows in slices(condition.shape[1], at_once):
             chosen = columns(condition, opaque_rows(np.arange(rows.start, rows.stop)))
             dr.eval(chosen)
-            reports = [self._marched(network.state(), part, chosen, index).numpy() for part in rays]
-            blocks.append(np.concatenate(reports, axis=1))
+            observations = [self._marched(network.state(), part, chosen, index).numpy() for part in rays]
+            blocks.append(np.concatenate(observations, axis=1))
         return np.concatenate(blocks)
 
     def condition_of(self, inputs: Inputs, receiver: int) -> tuple[Any, NDArray[Any] | float]:
@@ -206,13 +206,19 @@ def step_loss(network: Nerf2Network, data: Mapping[str, Any], drawn: Mapping[str
     batch = condition.shape[1]
     parts = march(network, points, condition, field.settings.samples)
     predicted = field.task.of_rays(parts, (field.outputs.count, batch, rays), network.offset, drawn["receiver"])
-    # Truths of the batch: spectra at the step's rays, other reports in whole.
+    # Truths of the batch: spectra at the step's rays, other observations in whole.
     values = data["truth"].shape[1]
-    reported = predicted.shape[1]
-    slot = dr.arange(type(drawn["rows"]), batch * reported)
-    row = dr.gather(type(slot), drawn["rows"], slot // reported) + drawn["receiver"] * data["condition"].shape[1]
-    column = dr.gather(type(slot), drawn["rays"], slot % reported) if field.by_pixel else slot % reported
-    truth = tensor(dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, reported))
+    predicted_values = predicted.shape[1]
+    slot = dr.arange(type(drawn["rows"]), batch * predicted_values)
+    row = (
+        dr.gather(type(slot), drawn["rows"], slot // predicted_values) + drawn["receiver"] * data["condition"].shape[1]
+    )
+    column = (
+        dr.gather(type(slot), drawn["rays"], slot % predicted_values) if field.by_pixel else slot % predicted_values
+    )
+    truth = tensor(
+        dr.gather(type(data["truth"].array), data["truth"].array, row * values + column), (batch, predicted_values)
+    )
     error = predicted - truth
     error = error * (1 / field.task.loss_unit)  # of size one, as greys are: one learning rate serves all
     return dr.mean(error * error, axis=None).array

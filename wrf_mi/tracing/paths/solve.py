@@ -63,7 +63,7 @@ class Prepared:
             check_devices(self.surfaces, before_surfaces(self.surfaces, traced), [names[row] for row in new])
             self._checked.update(antennas_m[row].tobytes() for row in new)
 
-    def report_scattering(self, options: TraceOptions) -> None:
+    def log_scattering(self, options: TraceOptions) -> None:
         """Log once what options of scattering replace in the scene's materials, or that none scatters."""
         coefficient = options.scattering_coefficient
         if not options.scattering or coefficient in self._checked:
@@ -184,7 +184,7 @@ def trace_paths(
     shared = prepared or Prepared(scene)
     if check:
         shared.check(positions, devices, first_row)
-        shared.report_scattering(options)
+        shared.log_scattering(options)
     # Devices are placed before the surfaces that they are on.
     positions, devices = shared.placed(positions, devices)
 

@@ -64,7 +64,7 @@ class TracedOptions:
     def __post_init__(self) -> None:
         """Check the options of the search; `InputError` with diffraction or scattering."""
         if self.trace.diffraction or self.trace.scattering:
-            raise InputError("traced side: diffraction and scattering have no derivative here; switch both off")
+            raise InputError("traced component: diffraction and scattering have no derivative here; switch both off")
 
 
 class TracedField:
@@ -329,7 +329,7 @@ def _needs_search(position_m: FloatArray, searched_at_m: FloatArray, frequency_h
     return bool(np.linalg.norm(position_m - searched_at_m) > speed_of_light / frequency_hz / 4)
 
 
-def traced_fields(
+def trace_fields(
     tx_pos_m: ArrayLike,
     receiver: Receiver,
     options: TracedOptions,

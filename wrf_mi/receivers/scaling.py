@@ -1,7 +1,7 @@
 """Scaling of spectra and powers in dB, for NumPy and Dr.Jit arrays alike.
 
-`wrf_mi.receivers.receiver_models` has what instruments report. Dr.Jit is imported on request: a command that only reads
-data does without it.
+`wrf_mi.receivers.receiver_models` has what instruments observe. Dr.Jit is imported on request: a command that only
+reads data does without it.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from ..core.angles import FloatArray
 from ..core.types import IntArray
 
 SQUARED_MAGNITUDE_EPS = 1e-8  # added to |R|^2 under a root or logarithm, whose gradient is unbounded at zero
-LEAST_POWER = 1e-20  # constant added to a power before its logarithm in a fit: the lowest report is -200 dB
+LEAST_POWER = 1e-20  # constant added to a power before its logarithm in a fit: the lowest observation is -200 dB
 SILENCE = 4 * LEAST_POWER  # power up to which nothing arrives in a fit: above the constants that are added to powers
-FLOOR_DB = 1e-3  # distance from the floor up to which a report is the floor, dB: rounding to single precision
+FLOOR_DB = 1e-3  # distance from the floor up to which an observation is the floor, dB: rounding to single precision
 
 
 def strength_db(power: Any, floor: Any = math.nan, least: float = 0.0) -> Any:
@@ -35,9 +35,9 @@ def strength_db(power: Any, floor: Any = math.nan, least: float = 0.0) -> Any:
     return 10 * dr.log2(dr.select(power > 4 * least, power + least, floor)) / math.log2(10)
 
 
-def arrives(report_db: NDArray[Any], floor: float) -> NDArray[np.bool_]:
-    """Whether reports in dB are above the floor, a power."""
-    above: NDArray[np.bool_] = np.abs(report_db - 10 * math.log10(floor)) > FLOOR_DB
+def arrives(observed_db: NDArray[Any], floor: float) -> NDArray[np.bool_]:
+    """Whether observations in dB are above the floor, a power."""
+    above: NDArray[np.bool_] = np.abs(observed_db - 10 * math.log10(floor)) > FLOOR_DB
     return above
 
 
