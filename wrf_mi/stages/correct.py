@@ -149,9 +149,9 @@ class _EditObservations(Fitted):
 
     def predict_rows(self, rows: IntArray, receiver: int) -> Prediction:
         """Predictions [q, ...]; NaN of rows that do not judge."""
-        known = np.isin(rows, self.misfit.rows)
+        is_judging = np.isin(rows, self.misfit.rows)
         predicted = np.full((len(rows), *self._predicted.shape[2:]), np.nan, self._predicted.dtype)
-        predicted[known] = self._predicted[receiver, np.searchsorted(self.misfit.rows, rows[known])]
+        predicted[is_judging] = self._predicted[receiver, np.searchsorted(self.misfit.rows, rows[is_judging])]
         return Prediction(predicted)
 
     def arrays(self) -> Arrays:
@@ -186,21 +186,21 @@ class _TracedObservations(Stage):
         """Note the rows of a record that judge, given what a fit sees of it."""
         rows, names = fold.test[in_regions(judging, fold.test)], [each.name for each in record.receivers]
         unseen = record.at_receivers([names.index(each.name) for each in fitted.receivers])
-        known = np.isfinite(fitted.observation)
-        of_receiver = known[:, fold.all_train].reshape(len(known), -1).any(axis=1)
+        received = np.isfinite(fitted.observation)
+        of_receiver = received[:, fold.all_train].reshape(len(received), -1).any(axis=1)
         self.heard = {fitted.receivers[number].name for number in np.flatnonzero(of_receiver)}
         if fold.held_receivers:
-            unseen = replace(unseen, observation=np.where(known, np.nan, unseen.observation))
-            judge = np.isfinite(unseen.observation[:, rows]).reshape(len(known), -1).any(axis=1)
+            unseen = replace(unseen, observation=np.where(received, np.nan, unseen.observation))
+            judge = np.isfinite(unseen.observation[:, rows]).reshape(len(received), -1).any(axis=1)
             self.out = [unseen.receivers[number].name for number in np.flatnonzero(judge)]
         self.stated = self._traced.posterior(unseen, rows)
 
     def of(self, edit: SceneEdit) -> _EditObservations:
         """Predictions of the rows that judge with the parameters of an edit, along the paths of its scene."""
-        stated = self.stated.misfit
+        misfit = self.stated.misfit
         if not moves_planes(edit.stage):
-            return _EditObservations(edit, stated, self.heard)
-        return _EditObservations(edit, self._traced.posterior(stated.record, stated.rows, edit).misfit, self.heard)
+            return _EditObservations(edit, misfit, self.heard)
+        return _EditObservations(edit, self._traced.posterior(misfit.record, misfit.rows, edit).misfit, self.heard)
 
 
 def _by_uncertain_phases(
@@ -241,5 +241,5 @@ def _held_out_ratio(unseen: Misfit, before: FloatArray, final: Misfit, after: Fl
     """`error_ratio` of the rows held out of every choice, by vectors of misfits without and with them."""
     names, rows = [each.name for each in final.record.receivers], np.isin(final.rows, unseen.rows)
     numbers = [names.index(each.name) for each in unseen.record.receivers]
-    known = final.residual(after).reshape(len(names), len(rows), -1)[numbers][:, rows]
-    return error_ratio(unseen.residual(before).reshape(known.shape), known)
+    with_rows = final.residual(after).reshape(len(names), len(rows), -1)[numbers][:, rows]
+    return error_ratio(unseen.residual(before).reshape(with_rows.shape), with_rows)

@@ -164,13 +164,13 @@ class Engine:
 
     def _why_omitted(self, before: Option, scores: Mapping[str, FloatArray]) -> str:
         """Why an option that goes on from the one ``before`` is not tried; "": it is."""
-        own = scores.get(before.name)
-        if own is None or any(improves(other, own, True) for other in scores.values()):
+        score_before = scores.get(before.name)
+        if score_before is None or any(improves(other, score_before, True) for other in scores.values()):
             return "is clearly behind"
         # Each has more freedom than the one before, and several times its cost. In six fits to two rooms the third
         # gained twice, where the second had gained; where that had not, it took two thirds of the time.
         first = scores.get(before.after)
-        return f"is no better than {before.after}" if first is not None and own.mean() <= first.mean() else ""
+        return f"is no better than {before.after}" if first is not None and score_before.mean() <= first.mean() else ""
 
     def _best(self, options: Sequence[Option], scores: dict[str, FloatArray], confidence: float | None) -> str:
         """Name of the best option: the best mean of equal freedom, then the last clear gain of more freedom."""

@@ -88,8 +88,8 @@ class FittedPaths(FittedInScene):
         mine = np.flatnonzero(held_out.receiver == receiver)
         order = mine[np.argsort(held_out.row[mine], kind="stable")]
         place = np.searchsorted(held_out.row[order], rows)
-        known = place < len(order)
-        if not known.all() or (held_out.row[order[place]] != rows).any():
+        is_judged = place < len(order)
+        if not is_judged.all() or (held_out.row[order[place]] != rows).any():
             return None
         return Prediction(held_out.predicted[order[place]])
 
@@ -162,25 +162,25 @@ class PathsStage(Stage):
         rows = replace(split, train=split.all_train, validation=fold.test, test=fold.test[:0])
         inner = replace(problem, settings=config_of(problem, rows, False), checked=[])
         graph, trainer = WRF_GS_PLUS.train_part(before and before.trainer, inner, rows, session)
-        kept, scene_model = {**state.kept, self.name: _Training(trainer, problem)}, FittedPaths(graph, problem)
+        carried, scene_model = {**state.kept, self.name: _Training(trainer, problem)}, FittedPaths(graph, problem)
         scene_model.held_out = graph.held_out
-        return replace(state, problem=problem, fitted=scene_model, kept=kept)
+        return replace(state, problem=problem, fitted=scene_model, kept=carried)
 
     def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:
         """The training goes on from the chosen state with all rows."""
-        found: _Training | None = chosen.kept.get(self.name)
+        training: _Training | None = chosen.kept.get(self.name)
         if option.name == AS_TRACED:
             return option
 
         def fit(state: State, split: Split, session: Session) -> State:
             problem = state.problem
-            if option.name.endswith(IN_STATED):  # what the scene's stage has found is not used
+            if option.name.endswith(IN_STATED):  # what the stage of the scene has found is not used
                 shutil.rmtree(session.folder / SCENE, ignore_errors=True)
                 problem = replace(problem, scene=chosen.problem.scene, material=chosen.problem.material)
-            if found is None:
+            if training is None:
                 return self._unjudged(replace(state, problem=problem), split, session)
             inner = replace(problem, settings=config_of(problem, split, False), checked=[])
-            graph = WRF_GS_PLUS.continued(found.trainer, found.problem.scene, inner, split, session)
+            graph = WRF_GS_PLUS.continued(training.trainer, training.problem.scene, inner, split, session)
             return replace(state, problem=problem, fitted=FittedPaths(graph, problem))
 
         return option._replace(fit=fit)

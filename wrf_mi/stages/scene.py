@@ -83,8 +83,8 @@ def in_regions(split: Split, row: IntArray) -> NDArray[np.bool_]:
 def of_rows(record: Record, fold: Split) -> bool:
     """Whether a fold holds out rows of receivers and carriers that train, by which a training can choose its state."""
     carriers = record.carriers_hz
-    known = carriers is None or bool(np.isin(carriers[fold.test], carriers[fold.all_train]).all())
-    return known and not fold.held_receivers
+    is_trained = carriers is None or bool(np.isin(carriers[fold.test], carriers[fold.all_train]).all())
+    return is_trained and not fold.held_receivers
 
 
 @dataclass(frozen=True)
@@ -146,12 +146,15 @@ class SceneStage(Stage):
         if not change.parts:
             return state
         before: Edited | None = state.kept.get(self.name)
-        stated, place = before.stated if before else state.problem, session.folder / SCENE
+        stated_problem, place = before.stated if before else state.problem, session.folder / SCENE
         path = session.folder / EDIT
         if not path.exists():
-            assert stated.scene is not None
-            how = with_near(state, split, change.near), change.options, stated.material, session.progress
-            traced, edit = TracedScene(stated.scene, stated.record, *how), before.edit if before else None
+            assert stated_problem.scene is not None
+            how = with_near(state, split, change.near), change.options, stated_problem.material, session.progress
+            traced, edit = (
+                TracedScene(stated_problem.scene, stated_problem.record, *how),
+                before.edit if before else None,
+            )
             posterior = traced.fitted_posterior(traced.record, traced.split.all_train, edit)
             fitted = fit_edit(posterior, change.parts, edit)
             session.folder.mkdir(parents=True, exist_ok=True)
@@ -159,8 +162,8 @@ class SceneStage(Stage):
             write_arrays(path, to_arrays(fitted.edit))
             del posterior, fitted, traced
             release_memory()
-        edited = Edited(stated, change.options, from_arrays(SceneEdit, stored_arrays(path)))
-        problem = replace(stated, scene=str(place), material=None)
+        edited = Edited(stated_problem, change.options, from_arrays(SceneEdit, stored_arrays(path)))
+        problem = replace(stated_problem, scene=str(place), material=None)
         return replace(state, problem=problem, kept={**state.kept, self.name: edited})
 
     def continued(self, option: Option, chosen: State, scores: Mapping[str, FloatArray]) -> Option:

@@ -80,12 +80,12 @@ def hold_out_groups(split: Split, tx_pos_m: FloatArray, groups: int = GROUPS) ->
     fine = groups > GROUPS
     labels = cells(places_m, count)[place.reshape(-1)] if fine else clusters(tx_pos_m[rows], count, rng)
     sizes = np.bincount(labels, minlength=count)
-    taken, total = np.zeros(len(sizes), bool), 0
+    is_out, total = np.zeros(len(sizes), bool), 0
     for group in rng.permutation(len(sizes)):
         # The first cluster may be larger than the share: without any, nothing could be chosen.
         if (total + sizes[group]) / len(rows) <= (HELD_OUT if total else MOST_HELD_OUT):
-            taken[group], total = True, total + sizes[group]
-    out = taken[labels]
+            is_out[group], total = True, total + sizes[group]
+    out = is_out[labels]
     if not total:
         return split
     return replace(split, train=rows[~out], validation=np.sort(np.concatenate([split.validation, rows[out]])))
@@ -204,8 +204,8 @@ def _as_far_as_wanted(split: Split, tx_pos_m: FloatArray) -> Split:
     if coarse is split or not len(wanted_m):
         return coarse
 
-    def away_m(positions_m: FloatArray, known: IntArray) -> float:
-        return max(float(np.median(cKDTree(tx_pos_m[known]).query(positions_m)[0])), np.finfo(float).tiny)
+    def away_m(positions_m: FloatArray, others: IntArray) -> float:
+        return max(float(np.median(cKDTree(tx_pos_m[others]).query(positions_m)[0])), np.finfo(float).tiny)
 
     wanted, best, most = away_m(wanted_m, split.all_train), coarse, len(np.unique(tx_pos_m[split.train], axis=0))
     nearest, count = away_m(tx_pos_m[best.validation], best.train), GROUPS
