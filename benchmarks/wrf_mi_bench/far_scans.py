@@ -39,15 +39,15 @@ def measure_room(seed: int, folder: Path) -> dict[str, Any]:
     room = random_room(seed)
     record, true, scan = random_room_record(seed, folder, SURVEY, SUBCARRIERS_HZ)
     split, options = make_splits(record, "official")[0], default_options(record)
-    scenes, kept_parts = {"": true, SCAN: scan}, dict[str, str]()
-    for name, parts in ((WITH, (*options.parts, PHASES)), (WITHOUT, options.parts)):
-        scenes[name], kept_parts[name] = folder / name.replace(", ", "-").replace(" ", "-"), kept_parts.get(WITH, "")
-        if name == WITHOUT and PHASES not in kept_parts[WITH]:
+    scenes, kept_groups = {"": true, SCAN: scan}, dict[str, str]()
+    for name, groups in ((WITH, (*options.groups, PHASES)), (WITHOUT, options.groups)):
+        scenes[name], kept_groups[name] = folder / name.replace(", ", "-").replace(" ", "-"), kept_groups.get(WITH, "")
+        if name == WITHOUT and PHASES not in kept_groups[WITH]:
             scenes[name] = scenes[WITH]  # the same corrections were tried
             continue
-        kept_parts[name] = write_page(correct_scene(scan, record, split, replace(options, parts=parts)), scenes[name])[
-            "kept"
-        ]
+        kept_groups[name] = write_page(
+            correct_scene(scan, record, split, replace(options, groups=groups)), scenes[name]
+        )["kept"]
     powers, channels = dict[str, Any](), dict[str, float]()
     for name, scene in scenes.items():
         tracer = RayTracer(scene, instrument_of(record), OPTIONS)
@@ -58,7 +58,7 @@ def measure_room(seed: int, folder: Path) -> dict[str, Any]:
     median, mean = ({name: float(of(values)) for name, values in errors.items()} for of in (np.nanmedian, np.nanmean))
     what = f"{seed}: {' x '.join(f'{side:.1f}' for side in room.size_m)} m, {len(room.parts) - 6} pieces"
     value = f"{median[SCAN]:.2f} to {median[WITH]:.2f} dB"
-    return {**line(what, value, "-"), "median_db": median, "mean_db": mean, "cea_db": channels, "kept": kept_parts}
+    return {**line(what, value, "-"), "median_db": median, "mean_db": mean, "cea_db": channels, "kept": kept_groups}
 
 
 def main() -> dict[str, Any]:

@@ -260,11 +260,11 @@ def _corrections(
     brick: Path, model: Path, place: Path, record: Record, split: Split
 ) -> Iterator[tuple[str, Path, dict[str, Any]]]:
     """The twin with walls of brick after each calibration by the first two receivers, and materials of both walls."""
-    parts = {
+    groups = {
         "`--calibrate materials`": ("materials",),
         "`--calibrate materials,planes,phases`": ("materials", "planes", "phases"),
     }
-    for what, chosen in parts.items():
+    for what, chosen in groups.items():
         correction = correct_scene(brick, record, split, CorrectionOptions(chosen))
         write_page(correction, place / "corrected", replace=True)
         yield what, place / "corrected", {"kept": correction.kept}

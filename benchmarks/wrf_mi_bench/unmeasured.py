@@ -54,7 +54,7 @@ class Held:
     dataset: str  # name
     kind: str  # ``frequency`` or ``receiver``
     n_train: int | None  # number of training rows; None: all
-    parts: tuple[str, ...] | None  # what is corrected; None: the default of the task
+    groups: tuple[str, ...] | None  # parameter groups that are corrected; None: the default of the task
     folds: int  # number of folds
 
 
@@ -66,7 +66,7 @@ def corrected(case: Held, scene: str, record: Record, split: Split, folder: Path
     """Scene in ``folder`` that is corrected by a split's training rows, made where needed."""
     if not folder.exists():
         options: CorrectionOptions = default_options(record)
-        options = options if case.parts is None else replace(options, parts=case.parts)
+        options = options if case.groups is None else replace(options, groups=case.groups)
         write_page(correct_scene(scene, record, split, options), folder, False)
     return str(folder)
 

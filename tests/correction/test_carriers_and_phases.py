@@ -111,8 +111,8 @@ def test_derivatives_by_exponents_are_those_of_finite_differences(truth):
     """To 1 % of the largest, or the rounding of float32 observations over the step."""
     (scene, record), step = truth, 0.02
     misfit = Misfit(record, np.arange(50), Prepared(open_scene(scene, 2.4e9)), OPTIONS)
-    part = misfit.parts[name_of(SURFACE, EXPONENT)]
-    columns = np.arange(part.start, part.stop)
+    span = misfit.slices[name_of(SURFACE, EXPONENT)]
+    columns = np.arange(span.start, span.stop)
     slopes = misfit.jacobian(misfit.start, columns).columns
     for place, column in enumerate(columns):
         way = np.eye(1, len(misfit.start), column)[0] * step

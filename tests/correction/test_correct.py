@@ -17,10 +17,11 @@ from wrf_mi_scenes.build_laboratory import sheet
 
 import wrf_mi
 from wrf_mi.core import InputError, Split
+from wrf_mi.core.settings import with_settings
 from wrf_mi.correction import Correction, CorrectionOptions, default_options, write_page
 from wrf_mi.correction.edits import error_ratio
 from wrf_mi.correction.misfit import Misfit
-from wrf_mi.correction.options import PARTS
+from wrf_mi.correction.options import GROUPS
 from wrf_mi.correction.page import _facts, _picture
 from wrf_mi.datasets import make_splits
 from wrf_mi.receivers.instruments import Instrument
@@ -83,13 +84,13 @@ def test_picture_shows_shifts_or_the_materials_where_no_plane_moved(corrected):
 def test_the_scene_is_recovered_from_channels(corrected, tmp_path):
     """Planes within four standard deviations, which are below those stated before, and permittivities."""
     correction, _, shift, tilt, _ = corrected
-    part = correction.misfit.parts[SHIFT]
-    np.testing.assert_allclose(correction.vector[part], shift, atol=PLANE_M)
+    span = correction.misfit.slices[SHIFT]
+    np.testing.assert_allclose(correction.vector[span], shift, atol=PLANE_M)
     np.testing.assert_allclose(
-        correction.vector[correction.misfit.parts[TILT]].reshape(tilt.shape), tilt, atol=PLANE_RAD
+        correction.vector[correction.misfit.slices[TILT]].reshape(tilt.shape), tilt, atol=PLANE_RAD
     )
-    assert (np.abs(correction.vector[part] - shift) < 4 * correction.deviation[part] + 1e-4).all()
-    assert (correction.deviation[part] < correction.state.posterior.prior_deviation[part] / 2).all()
+    assert (np.abs(correction.vector[span] - shift) < 4 * correction.deviation[span] + 1e-4).all()
+    assert (correction.deviation[span] < correction.state.posterior.prior_deviation[span] / 2).all()
     slabs = correction.misfit.traced_fields[0].slabs
     true = open_scene(stated_scene(tmp_path / "named", TRUE_MATERIALS), CARRIER_HZ)
     expected = Prepared(true).tables("surface").slabs
@@ -134,7 +135,7 @@ def test_error_ratio_is_the_larger_one_of_equal_rows(held, left_out, expected):
 def test_planes_alone_are_corrected(true, corrected):
     """Channels that were held out are predicted better where all materials stay as stated."""
     record = corrected[1]
-    options = CorrectionOptions(parts=("planes", "frame"), rays=1 << 14)
+    options = CorrectionOptions(groups=("planes", "frame"), rays=1 << 14)
     correction = correct_scene(true[0].parent / "base", record, first_split(record), options)
     assert correction.kept == "planes+frame"
     stated_score, kept_score = mean_scores(correction)
@@ -148,7 +149,7 @@ def test_a_wall_is_of_another_material_that_reflects_alike_at_one_carrier(tmp_pa
     true, shift, _ = true_scene(tmp_path, seed=1)
     record, uncorrected_scene = channels(true, 60, seed=1), stated_scene(tmp_path / "stated")
     correction = correct_scene(uncorrected_scene, record, first_split(record), CorrectionOptions(steps=10))
-    np.testing.assert_allclose(correction.vector[correction.misfit.parts[SHIFT]], shift, atol=PLANE_M)
+    np.testing.assert_allclose(correction.vector[correction.misfit.slices[SHIFT]], shift, atol=PLANE_M)
     assert of_wall_2(correction) == "glass"
 
 
@@ -183,7 +184,7 @@ def test_channels_show_the_faces_of_a_box_that_the_scan_missed(tmp_path, monkeyp
     """Its top, of metal, is found; faces that are found once belong to the stated scene of the next correction."""
     true, scanned_faces = ({f"other_{k:02d}": "itu_metal" for k in range(1, 1 + n)} for n in (5, 2))
     record, scene = room_with_box(tmp_path, monkeypatch, LOW_BOX, true, scanned_faces, 100)
-    options = CorrectionOptions(parts=("materials", "hidden"), depth=2, rays=1 << 14, steps=3)
+    options = CorrectionOptions(groups=("materials", "hidden"), depth=2, rays=1 << 14, steps=3)
     correction = correct_scene(scene, record, first_split(record), options)
     facts = write_page(correction, tmp_path / "corrected")
     present = {entry["surface"]: entry["conductivity"][1] for entry in facts["materials"] if not entry["absent"]}
@@ -206,7 +207,7 @@ def test_a_cabinet_of_one_material_is_found_from_few_channels(tmp_path, monkeypa
     """Face by face the front is taken to lose what front and back do, and a face is missing: 16 dB on held-out rows."""
     true = {f"other_{k:02d}": f"itu_{material}" for k in range(1, 6)}
     record, scene = room_with_box(tmp_path, monkeypatch, CABINET, true, {}, 60, snr_db=25)
-    options = CorrectionOptions(parts=("materials", "hidden"), depth=3, rays=1 << 14, steps=3)
+    options = CorrectionOptions(groups=("materials", "hidden"), depth=3, rays=1 << 14, steps=3)
     correction = correct_scene(scene, record, first_split(record), options)
     faces = [kind for name, kind in correction.state.materials.items() if name.startswith(("other", "hidden"))]
     assert faces == [material] * 5
@@ -220,9 +221,9 @@ def test_walls_in_wrong_minima_are_found(tmp_path, monkeypatch):
     true, shift, _ = true_scene(tmp_path, seed=3)
     record, uncorrected_scene = channels(true, 60, snr_db=25, seed=3), stated_scene(tmp_path / "stated")
     correction = correct_scene(uncorrected_scene, record, first_split(record), CorrectionOptions(steps=10))
-    part = correction.misfit.parts[SHIFT]
-    assert (np.abs(correction.vector[part] - shift) < 4 * correction.deviation[part] + 1e-4).all()
-    assert (correction.deviation[part] < 3e-3).all()
+    span = correction.misfit.slices[SHIFT]
+    assert (np.abs(correction.vector[span] - shift) < 4 * correction.deviation[span] + 1e-4).all()
+    assert (correction.deviation[span] < 3e-3).all()
     assert of_wall_2(correction) == "glass"
 
 
@@ -348,12 +349,12 @@ def record_of(task: str, scene: Path) -> tuple[Any, Any, int]:
 def test_derivatives_are_those_of_finite_differences(task, tmp_path):
     """To 1 %, or the rounding of float32 observations, 4e-7 of 1 and 8e-6 of 100 dB, over the step."""
     record, scene, rows = record_of(task, stated_scene(tmp_path / "scene"))
-    options = CorrectionOptions(PARTS, depth=2, rays=4096, faint=0.0, pattern_degree=1)
+    options = CorrectionOptions(GROUPS, depth=2, rays=4096, faint=0.0, pattern_degree=1)
     misfit = Misfit(record, np.arange(rows), Prepared(scene), options)
     planes, slabs = misfit.counts()
     most_met = {"plane": int(planes.argmax()), "material": int(slabs.argmax())}
     columns = np.array(
-        [part.start + (1 + (n == TILT)) * most_met.get(n.partition(".")[0], 0) for n, part in misfit.parts.items()]
+        [span.start + (1 + (n == TILT)) * most_met.get(n.partition(".")[0], 0) for n, span in misfit.slices.items()]
     )
     slopes = misfit.jacobian(misfit.start, columns).columns
     assert [port.tangent.frozen.n_recordings for port in misfit.ports] == [1] * len(misfit.ports)
@@ -371,7 +372,7 @@ def test_derivatives_are_those_of_finite_differences(task, tmp_path):
     [
         (
             ["--calibrate", "walls"],
-            "'walls' is not a part; choose of materials, planes, frame, hidden, gain, pose, patterns",
+            "'walls' is not a parameter group; choose of materials, planes, frame, hidden, gain, pose, patterns",
         ),
         (["--split", "blocked"], "a scene is corrected by one split; choose a fold, such as blocked:0"),
         (["--depth", "0"], "setting depth: 0 is out of range"),
@@ -398,10 +399,18 @@ def test_command_corrects_by_spectra(tmp_path, command):
     assert "SSIM of" in (tmp_path / "corrected" / "correction.md").read_text()
 
 
-def test_unknown_parts_and_few_rows_are_refused(tmp_path):
-    for parts, message in ((("walls",), "'walls' is not a part; choose of materials"), ((), "nothing to change")):
+def test_the_former_name_of_groups_is_read():
+    """Scripts state it."""
+    assert with_settings(CorrectionOptions(), ["parts=[materials]"]).groups == ("materials",)
+
+
+def test_unknown_groups_and_few_rows_are_refused(tmp_path):
+    for groups, message in (
+        (("walls",), "'walls' is not a parameter group; choose of materials"),
+        ((), "nothing to change"),
+    ):
         with pytest.raises(InputError, match=message):
-            CorrectionOptions(parts=parts)
+            CorrectionOptions(groups=groups)
     scene = stated_scene(tmp_path / "scene")
     record = channels(scene, 18)
     with pytest.raises(InputError, match=r"training rows are too few to hold some out"):

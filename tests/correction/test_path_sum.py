@@ -42,8 +42,8 @@ def misfit(room):
 def moved(misfit: Misfit, shift_m: float = 4e-3, tilt_rad: float = 1e-3) -> np.ndarray:
     vector, rng = misfit.start.copy(), np.random.default_rng(0)
     for name, size in ((SHIFT, shift_m), (TILT, tilt_rad)):
-        part = misfit.parts[name]
-        vector[part] += rng.normal(0, size, part.stop - part.start)
+        span = misfit.slices[name]
+        vector[span] += rng.normal(0, size, span.stop - span.start)
     return vector
 
 
@@ -53,10 +53,10 @@ def test_trials_of_one_plane_and_its_material_follow_the_tracer(misfit, accepted
     vector = moved(misfit)
     trials, changed_vector, before = PathSum(misfit, vector), vector.copy(), misfit.residual(vector)
     np.testing.assert_allclose(trials.residual(vector), before, atol=ROUNDING)
-    changed_vector[misfit.parts[SHIFT].start + 2] += 0.01
-    changed_vector[misfit.parts[TILT].start + 5] += 3e-3
+    changed_vector[misfit.slices[SHIFT].start + 2] += 0.01
+    changed_vector[misfit.slices[TILT].start + 5] += 3e-3
     slab = next(k for k, name in enumerate(misfit.traced_fields[0].slabs.names) if name.endswith("/2"))
-    changed_vector[misfit.parts[name_of(SURFACE, "permittivity")].start + slab] += 0.7
+    changed_vector[misfit.slices[name_of(SURFACE, "permittivity")].start + slab] += 0.7
     if accepted:
         trials.accept(changed_vector)
     expected = misfit.residual(changed_vector)
@@ -70,8 +70,8 @@ def test_trials_together_are_those_of_each(misfit, strengths, monkeypatch):
     vector = moved(misfit)
     vectors = np.tile(vector, (5, 1))
     for number, step_m in enumerate((0.0, 0.0, 0.01, -0.02)):
-        vectors[number, misfit.parts[SHIFT].start + number] += step_m
-    vectors[1:4, misfit.parts[name_of(SURFACE, "permittivity")].start] += 0.9
+        vectors[number, misfit.slices[SHIFT].start + number] += step_m
+    vectors[1:4, misfit.slices[name_of(SURFACE, "permittivity")].start] += 0.9
     pair = np.stack(changed(strengths))
     for trials, several in ((PathSum(misfit, vector), vectors), (PathSum(strengths, pair[0]), pair)):
         expected = [np.square(trials.residual(trial)).mean(axis=1) for trial in several]
@@ -82,15 +82,15 @@ def test_trials_together_are_those_of_each(misfit, strengths, monkeypatch):
 
 
 def derivatives_agree(misfit: Misfit, vector: np.ndarray, there: np.ndarray, share: float, floor: float = 0.0) -> None:
-    """Those of sums over paths and of the tracer, to a share of the largest one of each part."""
+    """Those of sums over paths and of the tracer, to a share of the largest one of each parameter."""
     columns = np.arange(len(vector))
     jacobians = misfit.jacobian(there, columns), PathSum(misfit, vector).jacobian(there, columns)
     expected, computed = (
         np.stack([jacobian.at(row) for row in range(len(misfit.observed))], 1) for jacobian in jacobians
     )
-    for name, part in misfit.parts.items():
-        most = np.abs(expected[part]).max()
-        np.testing.assert_allclose(computed[part], expected[part], atol=share * most + floor, err_msg=name)
+    for name, span in misfit.slices.items():
+        most = np.abs(expected[span]).max()
+        np.testing.assert_allclose(computed[span], expected[span], atol=share * most + floor, err_msg=name)
     assert (computed[:, ~np.isfinite(misfit.observed).all(axis=1)] == 0).all()
 
 
@@ -99,7 +99,7 @@ def test_derivatives_are_those_of_the_tracer(misfit, step_m):
     """By planes and materials, to the change of gains with the angle, which sums of paths leave out."""
     vector = moved(misfit)
     changed_vector = vector.copy()
-    changed_vector[misfit.parts[SHIFT].start + 2] += step_m
+    changed_vector[misfit.slices[SHIFT].start + 2] += step_m
     assert not np.isfinite(misfit.observed[3]).all()
     derivatives_agree(misfit, vector, changed_vector, 0.03)
 
@@ -116,7 +116,7 @@ def strengths(room):
     receivers = tuple(replace(first, name=name, position_m=first.position_m + by) for name, by in shifts.items())
     carrier_hz = np.array([CARRIER_HZ])
     record = replace(record, task="rssi", observation=observed, receivers=receivers, frequencies_hz=carrier_hz)
-    options = replace(default_options(record), rays=8192, parts=(MATERIALS, GAIN))
+    options = replace(default_options(record), rays=8192, groups=(MATERIALS, GAIN))
     return Misfit(record, np.arange(16), prepared, options)
 
 
@@ -124,8 +124,8 @@ def changed(misfit: Misfit) -> tuple[np.ndarray, np.ndarray]:
     """A vector of other materials and gains, and one with one more material and gain that differ."""
     vector = changed_material(misfit)
     changed_vector = vector.copy()
-    changed_vector[misfit.parts[name_of(SURFACE, "permittivity")].start + 2] += 0.7
-    changed_vector[misfit.parts[misfit.traced_fields[1].gain_name].start] += 0.4
+    changed_vector[misfit.slices[name_of(SURFACE, "permittivity")].start + 2] += 0.7
+    changed_vector[misfit.slices[misfit.traced_fields[1].gain_name].start] += 0.4
     return vector, changed_vector
 
 
@@ -133,7 +133,7 @@ def test_strengths_and_their_derivatives_are_those_of_the_tracer(strengths):
     """A receiver without rows has a parameter and is not traced."""
     vector, changed_vector = changed(strengths)
     trials, louder = PathSum(strengths, vector), vector.copy()
-    louder[strengths.parts[strengths.traced_fields[1].gain_name].start] += 0.4
+    louder[strengths.slices[strengths.traced_fields[1].gain_name].start] += 0.4
     for tried in (vector, changed_vector, louder):
         np.testing.assert_allclose(trials.residual(tried), strengths.residual(tried), atol=DECIBEL)
     assert np.nanmax(np.abs(strengths.residual(changed_vector) - strengths.residual(vector))) > 1
@@ -141,7 +141,7 @@ def test_strengths_and_their_derivatives_are_those_of_the_tracer(strengths):
     np.testing.assert_allclose(trials.residual(vector), strengths.residual(vector), atol=DECIBEL)
     derivatives_agree(strengths, vector, changed_vector, 0.01, DECIBEL)
     assert [receiver.name for receiver in strengths.receivers] == ["first", "third"]
-    assert "receiver.silent.gain" in strengths.parts
+    assert "receiver.silent.gain" in strengths.slices
     assert np.isnan(strengths.residual(strengths.start)[16:32]).all()
 
 
@@ -154,8 +154,8 @@ def spectra(request, room):
     observed = np.random.default_rng(0).random((2, 24, 9, 36)).astype(np.float32)
     carriers_hz = np.where(np.arange(24) % 3, CARRIER_HZ, 1.5 * CARRIER_HZ)
     kinds = {"task": "spectrum", "receivers": (first, second), "frequencies_hz": None, "carriers_hz": carriers_hz}
-    parts = (MATERIALS, PLANES) if request.param else (MATERIALS,)
-    options = CorrectionOptions(parts, depth=2, rays=8192, faint=0.0)
+    groups = (MATERIALS, PLANES) if request.param else (MATERIALS,)
+    options = CorrectionOptions(groups, depth=2, rays=8192, faint=0.0)
     return Misfit(replace(record, observation=observed, **kinds), np.arange(16), prepared, options)
 
 
@@ -163,15 +163,15 @@ def test_spectra_are_those_of_the_tracer(spectra):
     """Materials exactly; the planes' shifts to second order and to the change of the angle of arrival."""
     assert PathSum.serves(spectra)
     vector, changed_vector = spectra.start.copy(), spectra.start.copy()
-    changed_vector[spectra.parts[name_of(SURFACE, "permittivity")].start + 2] += 0.7
+    changed_vector[spectra.slices[name_of(SURFACE, "permittivity")].start + 2] += 0.7
     trials = PathSum(spectra, vector)
     for tried in (vector, changed_vector):
         np.testing.assert_allclose(trials.residual(tried), spectra.residual(tried), atol=10 * ROUNDING)
     assert np.abs(spectra.residual(changed_vector) - spectra.residual(vector)).max() > 0.05
     trials.accept(changed_vector)
     np.testing.assert_allclose(trials.residual(vector), spectra.residual(vector), atol=10 * ROUNDING)
-    if SHIFT in spectra.parts:
-        changed_vector[spectra.parts[SHIFT].start + 2] += 0.003
+    if SHIFT in spectra.slices:
+        changed_vector[spectra.slices[SHIFT].start + 2] += 0.003
         expected, before = spectra.residual(changed_vector), spectra.residual(vector)
         np.testing.assert_allclose(
             trials.residual(changed_vector), expected, atol=0.05 * np.abs(expected - before).max()
@@ -179,7 +179,7 @@ def test_spectra_are_those_of_the_tracer(spectra):
 
 
 def test_derivatives_of_spectra_are_those_of_the_tracer(spectra):
-    vector = moved(spectra) if SHIFT in spectra.parts else changed_material(spectra)
+    vector = moved(spectra) if SHIFT in spectra.slices else changed_material(spectra)
     derivatives_agree(spectra, vector, vector, 0.05, DECIBEL)
 
 
@@ -190,7 +190,7 @@ def test_rows_that_no_changed_path_reaches_are_kept(spectra):
     paths = spectra.paths
     met = [np.unique(paths.row[(paths.slab == slab).any(axis=1)]) for slab in slabs]
     slab = next(slab for slab in slabs if 0 < len(met[slab]) < len(spectra.observed))
-    vector[spectra.parts[name_of(SURFACE, "permittivity")].start + slab] += 0.7
+    vector[spectra.slices[name_of(SURFACE, "permittivity")].start + slab] += 0.7
     change = trials.residual(vector) - trials.residual(spectra.start)
     np.testing.assert_allclose(trials.residual(vector), spectra.residual(vector), atol=10 * ROUNDING)
     np.testing.assert_array_equal(np.flatnonzero(change.any(axis=1)), met[slab])
@@ -200,9 +200,9 @@ def changed_material(misfit: Misfit) -> np.ndarray:
     return misfit.start + np.random.default_rng(1).normal(0, 0.05, len(misfit.start))
 
 
-@pytest.mark.parametrize("part", ["pose", "planes"])
-def test_a_sum_over_paths_does_not_serve_what_it_cannot_follow(room, strengths, part):
-    options = replace(default_options(strengths.record), rays=8192, parts=(MATERIALS, part))
+@pytest.mark.parametrize("group", ["pose", "planes"])
+def test_a_sum_over_paths_does_not_serve_what_it_cannot_follow(room, strengths, group):
+    options = replace(default_options(strengths.record), rays=8192, groups=(MATERIALS, group))
     assert PathSum.serves(strengths)
     assert not PathSum.serves(Misfit(strengths.record, np.arange(16), room[0], options))
 

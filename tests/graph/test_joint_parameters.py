@@ -54,8 +54,8 @@ def all_of(record, train=None):
     return Split("all", 0, rows[:train], rows[:0], rows[train:] if train else rows[:0])
 
 
-def paths_alone(parts, *settings):
-    return with_settings(calibration_config(parts.split(",")), [*ONE_REFLECTION, *QUICK, *settings])
+def paths_alone(groups, *settings):
+    return with_settings(calibration_config(groups.split(",")), [*ONE_REFLECTION, *QUICK, *settings])
 
 
 def test_material_gain_and_pose_are_recovered(tmp_path):
@@ -109,8 +109,10 @@ def test_patterns_are_recovered(tmp_path):
     hz = np.array([FREQUENCY_HZ])
     record = Record("room", "rssi", tx, receivers, observed, frequencies_hz=hz, tx_heading_rad=heading)
     error = []
-    for parts, degree in (("gain", ()), ("gain,patterns", ("traced.pattern_degree=1",))):
-        trainer = Trainer(record, all_of(record, 60), paths_alone(parts, "steps=250", "batch=30", *degree), scene=scene)
+    for groups, degree in (("gain", ()), ("gain,patterns", ("traced.pattern_degree=1",))):
+        trainer = Trainer(
+            record, all_of(record, 60), paths_alone(groups, "steps=250", "batch=30", *degree), scene=scene
+        )
         trainer.run()
         predict = trainer.predictor()
         predicted = np.stack([predict.of_rows(record, np.arange(60, 80), r) for r in range(2)])

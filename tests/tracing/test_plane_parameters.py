@@ -144,11 +144,11 @@ def record_of(receivers, tx, observation, task):
     return Record("room", task, tx, receivers, observation, frequencies_hz=hz)
 
 
-def trainer_of(record, scene, parts, *settings):
+def trainer_of(record, scene, groups, *settings):
     """Paths alone, trained on all rows."""
     rows, ends = np.arange(len(record)), ("holdout_steps_fraction=0", "patience=0", f"batch={len(record)}")
     common = "traced.rays=4096", "optimiser.warm_up=10", *ends, *settings
-    config = with_settings(calibration_config(parts.split(","), record.task.settings_of_paths), common)
+    config = with_settings(calibration_config(groups.split(","), record.task.settings_of_paths), common)
     return Trainer(record, Split("all", 0, rows, rows[:0], rows[:0]), config, scene=scene)
 
 

@@ -29,7 +29,7 @@ Inside = Annotated[float, Field(gt=0, lt=1, description="more than 0 and less th
 Finite = Annotated[float, Field(description="a finite number")]
 NOT_NEGATIVE = Field(ge=0, description="0 or more")  # range of numbers for which a class of settings states no other
 
-FORMER_NAMES = {"max_depth": "depth", "max_reflections": "reflections"}
+FORMER_NAMES = {"max_depth": "depth", "max_reflections": "reflections", "parts": "groups"}
 """Names that settings had, which stored runs and scripts still state."""
 
 Settings = TypeVar("Settings")  # a frozen dataclass of plain values or of such dataclasses

@@ -67,7 +67,7 @@ class Correction:
 
     @property
     def kept(self) -> str:
-        """Parts that were changed, joined by "+"; "" for none."""
+        """Parameter groups that were changed, joined by "+"; "" for none."""
         return self.state.stage
 
     @property
@@ -83,12 +83,12 @@ def default_options(record: Record, n_train: int | float | None = None) -> Corre
 
 
 @threadpool_limits.wrap(1, "blas")  # type: ignore[untyped-decorator]
-def fit_edit(posterior: ScenePosterior, parts: Collection[str], edit: SceneEdit | None = None) -> State:
-    """Some parts of the options fitted to the rows of a posterior, whether they gain or not.
+def fit_edit(posterior: ScenePosterior, groups: Collection[str], edit: SceneEdit | None = None) -> State:
+    """Some parameter groups of the options fitted to the rows of a posterior, whether they gain or not.
 
     Given an ``edit`` that was found along other paths, such as those of the stated scene, the search goes on from it.
     """
-    search = Moves(posterior, "+".join(part for part in posterior.options.parts if part in parts))
+    search = Moves(posterior, "+".join(group for group in posterior.options.groups if group in groups))
     return search.continued(edit) if edit else search.best()
 
 
@@ -127,8 +127,8 @@ def checked(record: Record, split: Split, options: CorrectionOptions | None) -> 
         raise InputError(f"{record.name}: no receiver model observes {task.name} from paths")
     check_observations(record, split, complete=task.complete)
     options = options or default_options(record)
-    if task.has_offsets and GAIN not in options.parts:
-        options = replace(options, parts=(*options.parts, GAIN))
+    if task.has_offsets and GAIN not in options.groups:
+        options = replace(options, groups=(*options.groups, GAIN))
     # An image of each receiver and row has some hundred values: as many images as one receiver's rows tell as much.
     most = max(1, options.rows // (len(record.receivers) if task.image_size(record.observation.shape) else 1))
     # Seeds of other purposes differ by their second number, so that subsets are independent.
@@ -165,12 +165,12 @@ class TracedScene:
         entries = read_scene_folder(folder).materials.surfaces if (folder / MATERIALS_FILE).is_file() else {}
         self.kinds: dict[str, Kind] = {name: entry for name, entry in entries.items() if entry in KINDS}
         carrier_hz = scene_carrier(record, split.all_train)
-        completed = with_hidden_faces(scene) if HIDDEN in options.parts else nullcontext((scene, Boxes([], [])))
+        completed = with_hidden_faces(scene) if HIDDEN in options.groups else nullcontext((scene, Boxes([], [])))
         with completed as (place, boxes):
             opened, self._copy = (open_scene(place, carrier_hz, material=material) for _ in range(2))
         self._boxes, self._hidden = boxes, frozenset(face.name for face in boxes.hidden)
-        parts = tuple(part for part in options.parts if part != HIDDEN or self._hidden)
-        self.options = replace(options, parts=parts)
+        groups = tuple(group for group in options.groups if group != HIDDEN or self._hidden)
+        self.options = replace(options, groups=groups)
         check_materials(opened)
         self._prepared = Prepared(opened)
         self._prepared.check(record.tx_pos_m, record.receivers)
@@ -198,7 +198,7 @@ class TracedScene:
         posterior = self.posterior(record, rows, edit)
         if not any(field.exists.any() for field in posterior.misfit.traced_fields):
             raise InputError(f"{record.name}: no path reaches a receiver in {self._scene}; trace more interactions")
-        if not len(posterior.free("+".join(posterior.options.parts))):
+        if not len(posterior.free("+".join(posterior.options.groups))):
             text = f"no surface is met by {LEAST_PATHS} paths; give more training rows or interactions"
             raise InputError(f"{record.name}: {text}")
         return posterior

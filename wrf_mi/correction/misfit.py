@@ -146,7 +146,7 @@ class Misfit:
         values = {name: value for name, value in values.items() if options.changes(name)}
         self._shapes = {name: value.shape for name, value in values.items()}
         bounds = np.cumsum([0, *map(np.size, values.values())])
-        self.parts = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
+        self.slices = {name: slice(*bounds[i : i + 2]) for i, name in enumerate(values)}
         self.start = np.concatenate([*map(np.ravel, values.values())]).astype(float)
 
     @property
@@ -180,7 +180,7 @@ class Misfit:
         """Parameters of a vector [p] by name, for all planes and surfaces of the scene: others are as stated."""
         # Of planes and surfaces that have no entry, the stated values.
         stated_parameters = self.tables.slabs.parameters(QUANTITIES) | self.tables.planes.parameters()
-        parameters = {name: vector[part].reshape(self._shapes[name]) for name, part in self.parts.items()}
+        parameters = {name: vector[span].reshape(self._shapes[name]) for name, span in self.slices.items()}
         for name in stated_parameters.keys() & parameters.keys():
             every = stated_parameters[name].astype(float)
             every[self.slabs if name.startswith(PREFIX) else self.planes] = parameters[name]
@@ -190,10 +190,10 @@ class Misfit:
     def vector_of(self, parameters: Mapping[str, FloatArray]) -> FloatArray:
         """The vector [p] of parameters of the whole scene, as of `of_scene` of a misfit of other rows."""
         vector = np.zeros(len(self.start))
-        for name, part in self.parts.items():
+        for name, span in self.slices.items():
             numbers = self.slabs if name.startswith(PREFIX) else self.planes
             chosen = parameters[name] if name in self._instruments else parameters[name][numbers]
-            vector[part] = chosen.ravel()
+            vector[span] = chosen.ravel()
         return vector
 
     def _observations(self) -> tuple[FloatArray, FloatArray]:
@@ -220,7 +220,7 @@ class Misfit:
 
     def named(self, vector: FloatArray) -> dict[str, NDArray[np.float32]]:
         """Parameters of a vector [p] by name."""
-        shaped = ((name, vector[part].reshape(self._shapes[name])) for name, part in self.parts.items())
+        shaped = ((name, vector[span].reshape(self._shapes[name])) for name, span in self.slices.items())
         return {name: np.ascontiguousarray(values, np.float32) for name, values in shaped}
 
     def _device(self, vector: FloatArray) -> dict[str, Any]:
@@ -241,7 +241,7 @@ class Misfit:
         """Logarithm of the amplitude that each receiver's predictions lack, over its carriers, by name of its gain."""
         # Least squares of a phase start from equal mean magnitudes, else the smallest predictions would fit best.
         missing = dict[str, list[float]]()
-        if not any(port.traced_field.gain_name in self.parts for port in self.ports):
+        if not any(port.traced_field.gain_name in self.slices for port in self.ports):
             return {}
         predicted = self.residual(vector) + self.observed
         for port in self.ports:
@@ -342,8 +342,8 @@ class Misfit:
     @property
     def plane_entries(self) -> IntArray:
         """Entries of the vector that are the planes' shifts, then their tilts; none where planes are not parameters."""
-        parts = [self.parts[name] for name in (SHIFT, TILT) if name in self.parts]
-        return np.concatenate([np.zeros(0, np.int64), *(np.arange(part.start, part.stop) for part in parts)])
+        spans = [self.slices[name] for name in (SHIFT, TILT) if name in self.slices]
+        return np.concatenate([np.zeros(0, np.int64), *(np.arange(span.start, span.stop) for span in spans)])
 
     def counts(self) -> tuple[IntArray, IntArray]:
         """Number of paths that each of `planes` reflects, and that meet each of `slabs`, over all receivers."""

@@ -113,7 +113,7 @@ def shift_choices(posterior: ScenePosterior, sd_m: float) -> list[SurfaceChoice]
     most = int(FARTHEST * sd_m / step_m)
     shifts = step_m * np.arange(-most, most + 1)
     values = {f"{1e3 * shift:+.0f} mm": np.array([shift, np.nan, np.nan]) for shift in shifts}
-    shift, tilt = (misfit.parts[name].start for name in (SHIFT, TILT))
+    shift, tilt = (misfit.slices[name].start for name in (SHIFT, TILT))
     places = [np.array([shift + plane, tilt + 2 * plane, tilt + 2 * plane + 1]) for plane in posterior.planes]
     names = [f"plane {number}" for number in misfit.planes[posterior.planes]]
     pairs = zip(names, places, strict=True)
@@ -150,16 +150,18 @@ def gains(before: float, after: float, bonus: float = 0.0) -> bool:
 
 
 class Moves:
-    """Search for the most probable choices of a stage, whose parts are joined by "+"."""
+    """Search for the most probable choices of a stage, whose parameter groups are joined by "+"."""
 
     def __init__(self, posterior: ScenePosterior, stage: str) -> None:
         self.posterior, self.stage, self.title = posterior, stage, f"{stage.replace('+', ', ')}: choices"
-        parts, options = stage.split("+"), posterior.options
+        parameter_groups, options = stage.split("+"), posterior.options
         shifts, materials = list[SurfaceChoice](), list[SurfaceChoice]()
-        if SHIFT in posterior.misfit.parts and (PLANES in parts or FRAME in parts):
-            sd_m = float(np.hypot(options.shift_sd_m * (PLANES in parts), FRAME_SD[0] * (FRAME in parts)))
+        if SHIFT in posterior.misfit.slices and (PLANES in parameter_groups or FRAME in parameter_groups):
+            sd_m = float(
+                np.hypot(options.shift_sd_m * (PLANES in parameter_groups), FRAME_SD[0] * (FRAME in parameter_groups))
+            )
             shifts = shift_choices(posterior, sd_m)
-        if MATERIALS in parts:
+        if MATERIALS in parameter_groups:
             materials = material_choices(posterior, posterior.slabs)
         self.choices = joint_choices(materials, shifts, posterior)
         self.joint = [choice for choice in self.choices if choice.joint]

@@ -18,7 +18,7 @@ from ..tracing.paths.traced_field import TracedOptions
 
 FRAME, HIDDEN, PHASES = "frame", "hidden", "phases"
 MATERIALS, PLANES, GAIN, PATTERNS = "materials", "planes", "gain", "patterns"
-PARTS = (MATERIALS, PLANES, FRAME, HIDDEN, GAIN, "pose", PATTERNS, PHASES)  # what a correction may change
+GROUPS = (MATERIALS, PLANES, FRAME, HIDDEN, GAIN, "pose", PATTERNS, PHASES)  # parameter groups of a correction
 DEVIATIONS = {
     "permittivity": 0.7,  # of the logarithm of permittivity - 1
     "conductivity": 1.4,  # of logarithms, too
@@ -45,8 +45,8 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
     """Options of a correction.
 
     Attributes:
-        parts: parts that may change, of `PARTS`; with ``phases`` materials are fitted to channels whose paths have
-            uncertain phases where no change of planes is kept (`wrf_mi.correction.uncertain_phases`).
+        groups: parameter groups that may change, of `GROUPS`; with ``phases`` materials are fitted to channels whose
+            paths have uncertain phases where no change of planes is kept (`wrf_mi.correction.uncertain_phases`).
         rows: most training rows that are compared, of images over all receivers; of more, a random subset, seeded by
             the split.
         faint: the weakest paths of a transmitter are dropped while their amplitudes add up to less than this share.
@@ -55,7 +55,7 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
         shift_sd_m: standard deviation of a plane's position before the correction, metres.
     """
 
-    parts: tuple[str, ...] = (MATERIALS, PLANES, FRAME, HIDDEN)
+    groups: tuple[str, ...] = (MATERIALS, PLANES, FRAME, HIDDEN)
     depth: Interactions = field(default=3, kw_only=True)
     rows: Count = 600
     faint: ShareBelow1 = 1e-3
@@ -64,27 +64,27 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
     shift_sd_m: Positive = 0.02
 
     def __post_init__(self) -> None:
-        """Check ranges and parts; `InputError` for a number out of range, no part or an unknown one."""
+        """Check ranges and groups; `InputError` for a number out of range, no group or an unknown one."""
         super().__post_init__()
-        if unknown := [part for part in self.parts if part not in PARTS]:
-            raise InputError(f"correct: {unknown[0]!r} is not a part; choose of {', '.join(PARTS)}")
-        if HIDDEN in self.parts and MATERIALS not in self.parts:
+        if unknown := [group for group in self.groups if group not in GROUPS]:
+            raise InputError(f"correct: {unknown[0]!r} is not a parameter group; choose of {', '.join(GROUPS)}")
+        if HIDDEN in self.groups and MATERIALS not in self.groups:
             raise InputError(f"correct: {HIDDEN} needs {MATERIALS}, by which a face is there or not")
         needed = {"shift_sd_m": (PLANES, FRAME), "pattern_degree": (PATTERNS,)}
-        for name, parts in needed.items():
+        for name, groups in needed.items():
             value = getattr(self, name)
-            if value != getattr(CorrectionOptions, name) and not {*parts} & {*self.parts}:
-                text = f"{name}={value:g}: of {' and '.join(parts)}, which {','.join(self.parts)} leaves"
+            if value != getattr(CorrectionOptions, name) and not {*groups} & {*self.groups}:
+                text = f"{name}={value:g}: of {' and '.join(groups)}, which {','.join(self.groups)} leaves"
                 raise InputError(f"correct: {text}; omit it")
-        if PHASES in self.parts and (MATERIALS not in self.parts or {PLANES, FRAME}.isdisjoint(self.parts)):
+        if PHASES in self.groups and (MATERIALS not in self.groups or {PLANES, FRAME}.isdisjoint(self.groups)):
             raise InputError(f"correct: {PHASES} needs {MATERIALS}, and {PLANES} or {FRAME}, whose errors phases have")
-        if not self.parts:
-            raise InputError(f"correct: nothing to change; choose of {', '.join(PARTS)}")
+        if not self.groups:
+            raise InputError(f"correct: nothing to change; choose of {', '.join(GROUPS)}")
 
     @property
     def traced(self) -> TracedOptions:
         """Options of the traced component: reflections, transmissions, a material of each surface, planes that move."""
-        degree = self.pattern_degree if PATTERNS in self.parts else 0
+        degree = self.pattern_degree if PATTERNS in self.groups else 0
         return TracedOptions(
             self.options, degree, materials="surface", planes=True, faint=self.faint, constants=QUANTITIES
         )
@@ -92,18 +92,18 @@ class CorrectionOptions(SpecularOptions, CheckedSettings):
     def changes(self, name: str) -> bool:
         """Whether a parameter of `wrf_mi.tracing.paths.traced_field.TracedField` is changed."""
         if name.startswith(PREFIX):
-            return MATERIALS in self.parts
+            return MATERIALS in self.groups
         if name in (SHIFT, TILT):
-            return PLANES in self.parts or FRAME in self.parts
+            return PLANES in self.groups or FRAME in self.groups
         last = name.rpartition(".")[2]
         kinds = {"gain": GAIN, "position": "pose", "turn": "pose", "pattern": PATTERNS}
-        return (name == TX_PATTERN and PATTERNS in self.parts) or kinds.get(last) in self.parts
+        return (name == TX_PATTERN and PATTERNS in self.groups) or kinds.get(last) in self.groups
 
     def deviation(self, name: str) -> float:
         """Standard deviation of the entries of a parameter before the correction; of planes without the frame's."""
         of_planes = {SHIFT: self.shift_sd_m, TILT: TILT_SD_RAD}
         if name in of_planes:
-            return of_planes[name] * (1 if PLANES in self.parts else HELD)
+            return of_planes[name] * (1 if PLANES in self.groups else HELD)
         return DEVIATIONS["pattern" if name == TX_PATTERN else name.rpartition(".")[2]]
 
 

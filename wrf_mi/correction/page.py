@@ -79,11 +79,11 @@ def _facts(correction: Correction) -> dict[str, Any]:
     parameters = {
         name: {
             "value": values[name].ravel().tolist(),
-            "sd": correction.deviation[part].tolist(),
-            "sd_before": sd_before[part].tolist(),
-            "changed": changed[part].tolist(),
+            "sd": correction.deviation[span].tolist(),
+            "sd_before": sd_before[span].tolist(),
+            "changed": changed[span].tolist(),
         }
-        for name, part in misfit.parts.items()
+        for name, span in misfit.slices.items()
     }
     scores = {
         _stage(stage): {"mean": float(np.nanmean(score)), "median": float(np.nanmedian(score))}
@@ -112,9 +112,9 @@ def _stage(stage: str) -> str:
 def _planes(correction: Correction) -> list[dict[str, Any]]:
     """Each plane that paths meet: objects, paths, movement and its standard deviation."""
     misfit, surfaces = correction.misfit, correction.misfit.traced_fields[0].surfaces
-    if SHIFT not in misfit.parts:
+    if SHIFT not in misfit.slices:
         return []
-    shift, tilt = (misfit.parts[name] for name in (SHIFT, TILT))
+    shift, tilt = (misfit.slices[name] for name in (SHIFT, TILT))
     moved_mm, sd_mm = 1e3 * correction.vector[shift], 1e3 * correction.deviation[shift]
     turned, turned_sd = (1e3 * values[tilt].reshape(-1, 2) for values in (correction.vector, correction.deviation))
     # A quantity is measured where its standard deviation fell by half: the data then tell more than the prior.
@@ -146,7 +146,7 @@ def _materials(correction: Correction) -> list[dict[str, Any]]:
     before, after = (np.column_stack([part.table, part.exponent]).tolist() for part in (slabs, fitted))
     changed, absent = state.free, state.absent()
     names = [name_of(SURFACE, quantity) for quantity in QUANTITIES[: 3 + misfit.several_carriers]]
-    starts = np.array([misfit.parts[name].start for name in names if name in misfit.parts], int)
+    starts = np.array([misfit.slices[name].start for name in names if name in misfit.slices], int)
     materials = []
     for index, (name, paths) in enumerate(zip(slabs.names, misfit.counts()[1], strict=True)):
         sd: list[float] | None = None

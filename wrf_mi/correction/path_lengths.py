@@ -19,7 +19,7 @@ def lengths_and_slopes(misfit: Misfit, mirrors: IntArray, vector: FloatArray) ->
     """Lengths [n] of paths that planes ``mirrors`` [n, depth] reflect (-1: none), and slopes by planes [n, 3 q]."""
     surfaces, chosen, count = misfit.traced_fields[0].surfaces, misfit.planes, len(misfit.planes)
     axes, centre = surfaces.axes[chosen], surfaces.plane_centres_m[chosen]
-    shift, tilt = (vector[misfit.parts[name]] for name in (SHIFT, TILT))
+    shift, tilt = (vector[misfit.slices[name]] for name in (SHIFT, TILT))
     normal, offset = surfaces.moved_planes(shift, tilt.reshape(count, 2), chosen)
     sources = [np.stack([np.asarray(c) for c in field.chains.source_m], axis=-1) for field in misfit.traced_fields]
     first = np.cumsum([0, *map(len, sources[:-1])])

@@ -70,7 +70,7 @@ def _serves_observations(misfit: Misfit, carriers: int) -> bool:
         # Element signals of all paths, of arrays of one size.
         sizes = {len(port.model.elements_m) for port in misfit.ports}
         return 0 not in sizes and len(sizes) == 1 and max(sizes) * len(misfit.paths.row) <= MOST_WAVES
-    return sums == "powers" or (sums == "fields" and SHIFT in misfit.parts and carriers == 1)
+    return sums == "powers" or (sums == "fields" and SHIFT in misfit.slices and carriers == 1)
 
 
 def sums_of(misfit: Misfit) -> Sums | None:
@@ -86,10 +86,10 @@ class PathSum:
         self.misfit, self.at, self._start = misfit, np.array(vector, float), np.array(vector, float)
         self._paths, self._plane_places = misfit.paths, misfit.plane_entries
         self._coherent = sums_of(misfit) != "powers"
-        material = [np.arange(part.start, part.stop) for name, part in misfit.parts.items() if name.startswith(PREFIX)]
+        material = [np.arange(span.start, span.stop) for name, span in misfit.slices.items() if name.startswith(PREFIX)]
         self._material = np.array(material, np.int64).reshape(len(material), len(misfit.slabs))
         gains = [(port.traced_field.gain_name, port.places) for port in misfit.ports]
-        self._factors = [(misfit.parts[name], places) for name, places in gains if name in misfit.parts]
+        self._factors = [(misfit.slices[name], places) for name, places in gains if name in misfit.slices]
         # Receiver models with different observations of signals, and the number of that of each row.
         models, self._model_of = dict[Any, Any](), np.zeros(len(misfit.observed), np.int64)
         for port in misfit.ports:
@@ -122,7 +122,7 @@ class PathSum:
         carriers = len(misfit.ports) // len(misfit.receivers)
         # Receivers of one name share parameters: their sums would not be told apart.
         apart, moving = len(gains) * carriers >= len(misfit.ports), sums_of(misfit) != "powers"
-        follows = all(_follows(name, moving) for name in misfit.parts)
+        follows = all(_follows(name, moving) for name in misfit.slices)
         return apart and follows and _serves_observations(misfit, carriers)
 
     def residual(self, vector: FloatArray) -> FloatArray:
@@ -248,8 +248,8 @@ class PathSum:
         """Derivatives of the sums ``total`` by the gains of receivers."""
         # Of exp(x + j y) for fields, and of exp(2 x) for powers.
         slopes = (1, 1j) if self._coherent else (2, 0)
-        parts = [(part.start + k, rows, slope) for part, rows in self._factors for k, slope in enumerate(slopes)]
-        return {column: (rows, slope * total[rows]) for column, rows, slope in parts}
+        columns = [(span.start + k, rows, slope) for span, rows in self._factors for k, slope in enumerate(slopes)]
+        return {column: (rows, slope * total[rows]) for column, rows, slope in columns}
 
     def _plane_change(self, column: int, present: Complex) -> tuple[IntArray, Complex]:
         """Rows whose paths an entry of a plane changes, and derivatives of their sums, of waves ``present``."""
@@ -298,8 +298,8 @@ class PathSum:
     def _factor(self, vector: FloatArray) -> Complex:
         """Gains of the receivers relative to the first vector's, or their squared magnitudes for powers, [rows, 1]."""
         factor = np.ones((len(self.misfit.observed), 1), complex)
-        for part, places in self._factors:
-            amplitude, phase = (vector - self._start)[part]
+        for span, places in self._factors:
+            amplitude, phase = (vector - self._start)[span]
             factor[places] = np.exp(amplitude + 1j * phase if self._coherent else 2 * amplitude)
         return factor
 

@@ -47,7 +47,7 @@ class SceneEdit:
     Parameters and the means of their prior are by the names of `wrf_mi.tracing.paths.traced_field.TracedField`.
     """
 
-    stage: str  # parts that were changed, joined by "+"
+    stage: str  # parameter groups that were changed, joined by "+"
     parameters: Mapping[str, FloatArray]
     mean: Mapping[str, FloatArray]
     materials: Mapping[str, str]  # material of each surface that was chosen, by its name
@@ -67,7 +67,7 @@ class State:
     """Parameters of a stage, and the choices that led to them."""
 
     posterior: ScenePosterior  # what rows of measurements and prior knowledge tell of them
-    stage: str  # the stage, its parts joined by "+"; "" for the stated scene
+    stage: str  # the stage, its parameter groups joined by "+"; "" for the stated scene
     vector: FloatArray  # parameters [p]
     mean: FloatArray  # means of the parameters' prior [p]
     materials: Mapping[str, str]  # material of each surface that was chosen, by its name
@@ -195,14 +195,14 @@ class ScenePosterior:
         # move it anywhere within the prior.
         self.planes, self.slabs = map(_met_most, misfit.counts())
         self.prior_deviation = np.ones(len(misfit.start))
-        for name, part in misfit.parts.items():
-            self.prior_deviation[part] = options.deviation(name)
+        for name, span in misfit.slices.items():
+            self.prior_deviation[span] = options.deviation(name)
         # The start: faces that the scan lacks are absent, gains are those of the observations.
         self.stated = misfit.start.copy()
         for slab in self.supposed.values():
             self.stated[material_places(misfit, slab)] = ABSENT_VALUES
         for name, gain in misfit.missing_gains(self.stated).items():
-            self.stated[misfit.parts[name].start] += gain
+            self.stated[misfit.slices[name].start] += gain
 
     def vector_of(self, parameters: Mapping[str, FloatArray]) -> FloatArray:
         """The vector [p] of parameters of the whole scene; those of receivers without any are as at the start."""
@@ -215,15 +215,15 @@ class ScenePosterior:
 
     def free(self, stage: str) -> IntArray:
         """Entries of the vector that a stage changes: those of surfaces and planes that enough paths meet."""
-        parts, free = stage.split("+"), list[IntArray]()
-        for name, part in self.misfit.parts.items():
-            entries = np.arange(part.start, part.stop)
+        groups, free = stage.split("+"), list[IntArray]()
+        for name, span in self.misfit.slices.items():
+            entries = np.arange(span.start, span.stop)
             if name.startswith(PREFIX):
                 # One carrier tells nothing of how a conductivity depends on the frequency.
-                is_free = MATERIALS in parts and (self.misfit.several_carriers or not name.endswith(EXPONENT))
+                is_free = MATERIALS in groups and (self.misfit.several_carriers or not name.endswith(EXPONENT))
                 entries = entries[self.slabs]
             elif name in (SHIFT, TILT):
-                is_free = not {PLANES, FRAME}.isdisjoint(parts)
+                is_free = not {PLANES, FRAME}.isdisjoint(groups)
                 entries = entries.reshape(len(self.misfit.planes), -1)[self.planes].ravel()
             else:
                 is_free = bool(stage)
@@ -234,7 +234,7 @@ class ScenePosterior:
     @property
     def has_frame(self) -> bool:
         """Whether planes share a motion of the frame."""
-        return FRAME in self.options.parts and SHIFT in self.misfit.parts
+        return FRAME in self.options.groups and SHIFT in self.misfit.slices
 
     def prior(self, mean: FloatArray, free: IntArray) -> Prior:
         """Prior of some entries about ``mean`` [p]; planes share the motions of the frame."""
@@ -284,7 +284,7 @@ class ScenePosterior:
 
     def refined(self, trials: Misfit | PathSum, noise: Noise, places: IntArray, start: FloatArray) -> FloatArray:
         """Some least-squares steps of the entries of one choice; materials stay near those of ``start``."""
-        places = places[np.isin(places, self.free("+".join(self.options.parts)))]
+        places = places[np.isin(places, self.free("+".join(self.options.groups)))]
         # Materials have their prior about the alternative, planes about the stated scene.
         mean, planes = start.copy(), self.misfit.plane_entries
         mean[planes] = self.stated[planes]
@@ -296,7 +296,7 @@ class ScenePosterior:
 
 def material_places(misfit: Misfit, slab: int) -> IntArray:
     """Entries of the vector that the material of a slab has, in the order of `QUANTITIES`."""
-    return np.array([misfit.parts[name_of(SURFACE, quantity)].start + slab for quantity in QUANTITIES])
+    return np.array([misfit.slices[name_of(SURFACE, quantity)].start + slab for quantity in QUANTITIES])
 
 
 def rigid_motions(surfaces: Surfaces) -> FloatArray:

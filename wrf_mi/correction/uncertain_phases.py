@@ -178,12 +178,12 @@ class UncertainPhases:
 
     def free(self, state: State) -> IntArray:
         """Entries of materials that the state's stage changes."""
-        materials = [np.arange(part.start, part.stop) for name, part in self._materials.items()]
+        materials = [np.arange(span.start, span.stop) for name, span in self._materials.items()]
         return np.intersect1d(state.free, np.concatenate(materials))
 
     @property
     def _materials(self) -> Mapping[str, slice]:
-        return {name: part for name, part in self.misfit.parts.items() if name.startswith(PREFIX)}
+        return {name: span for name, span in self.misfit.slices.items() if name.startswith(PREFIX)}
 
     def deviation(self, state: State) -> FloatArray:
         """Standard deviations [p], 0 of entries other than `free`."""
@@ -247,8 +247,8 @@ class UncertainPhases:
     def _gain_changes(self, vector: FloatArray, gain: Complex, free: IntArray) -> list[tuple[IntArray, Complex]]:
         """Paths that each entry ``free`` changes, and derivatives of their gains."""
         changes = dict[int, tuple[IntArray, Complex]]()
-        for part in self._materials.values():
-            constants = np.arange(part.start, part.stop)
+        for span in self._materials.values():
+            constants = np.arange(span.start, span.stop)
             # Surfaces that no path meets together change at once.
             for group in self.misfit.apart:
                 together = group[np.isin(constants[group], free)]

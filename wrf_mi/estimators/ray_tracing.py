@@ -195,8 +195,8 @@ def _graph_problem(problem: Problem) -> Problem:
 
 
 def _changes_scene(problem: Problem) -> bool:
-    parts = set((problem.settings.calibration or "").split(","))
-    return bool({"planes", "materials"} & parts) and "surface" not in parts  # a scene's folder holds no Gaussians
+    groups = set((problem.settings.calibration or "").split(","))
+    return bool({"planes", "materials"} & groups) and "surface" not in groups  # a scene's folder holds no Gaussians
 
 
 def _stored_trace(path: Path, record: Record) -> TraceResult:

@@ -50,7 +50,7 @@ def correct_scene(
         scene: see `wrf_mi.tracing.open_scene`.
         record: measurements of any task, positions known.
         split: its training and validation rows are used, its test rows and receivers that it holds out are not.
-        options: parts that may change, and the prior knowledge of them; None: `wrf_mi.correction.default_options`.
+        options: parameter groups that may change, and their prior; None: `wrf_mi.correction.default_options`.
         material: radio material of a bare mesh.
         on_stage: called as the correction goes on.
 
@@ -121,13 +121,13 @@ class _SharedScene(SceneStage):
         """As of `SceneStage`; the scene as stated has the gains of the observations. Nothing is written."""
         record, rows = state.problem.record, with_near(state, split, change.near).all_train
         before: Edited | None = state.kept.get(self.name)
-        if not change.parts:
+        if not change.groups:
             self.trial = self._traced.fitted_posterior(record, rows)
             fitted = self.trial.start("")
         elif before:
-            fitted = fit_edit(self._traced.posterior(record, rows, before.edit), change.parts, before.edit)
+            fitted = fit_edit(self._traced.posterior(record, rows, before.edit), change.groups, before.edit)
         else:
-            fitted = fit_edit(self.trial, change.parts)
+            fitted = fit_edit(self.trial, change.groups)
         return replace(state, kept={**state.kept, self.name: Edited(state.problem, change.options, fitted.edit)})
 
 
@@ -207,11 +207,11 @@ def _by_uncertain_phases(
     trial: ScenePosterior, observations: _TracedObservations, best: _EditObservations
 ) -> _EditObservations:
     """What is kept where planes are not resolved: ``best``, or materials by uncertain phases."""
-    if PHASES not in trial.options.parts or not UncertainPhases.serves(trial.misfit):
+    if PHASES not in trial.options.groups or not UncertainPhases.serves(trial.misfit):
         return best
     fit = UncertainPhases(trial)
-    parts = [part for part in trial.options.parts if part not in (PLANES, FRAME)]
-    other = observations.of(fit.best("+".join(parts)).edit)
+    groups = [group for group in trial.options.groups if group not in (PLANES, FRAME)]
+    other = observations.of(fit.best("+".join(groups)).edit)
     observations.tried.append(other)
     # The engine judges by predictions. Predicted channels of wrong phases say nothing of materials: their likelihood
     # with uncertain phases decides.
@@ -228,7 +228,7 @@ def _by_uncertain_phases(
 
 def _with_mean_gain(vector: FloatArray, misfit: Misfit, heard: Collection[str]) -> FloatArray:
     """A vector with the mean gain of the receivers that were fitted at those that were not."""
-    gains = {receiver.name: misfit.parts.get(gain_name(receiver)) for receiver in misfit.record.receivers}
+    gains = {receiver.name: misfit.slices.get(gain_name(receiver)) for receiver in misfit.record.receivers}
     if None in gains.values():
         return vector
     mean, result = np.mean([vector[gains[name]] for name in heard], axis=0), vector.copy()

@@ -62,8 +62,8 @@ def config_of(problem: Problem, split: Split, few: bool) -> TrainConfig:
         if SURFACES not in wanted:
             config = with_settings(config, ["traced.surface=0"])
     else:
-        parts = ["gain", *(["materials"] if {CALIBRATION, CORRECTED} & {*wanted} else [])]
-        config = calibration_config([*parts, *(["surface"] if SURFACES in wanted else [])], task.settings_of_paths)
+        groups = ["gain", *(["materials"] if {CALIBRATION, CORRECTED} & {*wanted} else [])]
+        config = calibration_config([*groups, *(["surface"] if SURFACES in wanted else [])], task.settings_of_paths)
         config = with_settings(config, ["traced.materials=surface", *(["traced.alone=0"] if few else [])])
     settings = problem.settings
     of_hybrid = [f"seed={problem.seed}", f"deterministic={str(settings.deterministic).lower()}"]

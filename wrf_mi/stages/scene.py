@@ -33,7 +33,7 @@ from .stage import Option, Stage, State
 SCENE, EDIT = "scene", "edit.npz"
 STAGES = ("mean", "calibration", "correction", "surfaces", "field", "residual")  # stages in their order
 MEAN, CALIBRATION, CORRECTED, SURFACES, FIELD, RESIDUAL = STAGES
-OF_GEOMETRY = frozenset((PLANES, FRAME, HIDDEN))  # parts of a correction beyond materials and gains
+OF_GEOMETRY = frozenset((PLANES, FRAME, HIDDEN))  # parameter groups beyond materials and gains
 FAST = tuple(stage for stage in STAGES if stage != FIELD)  # without the stage whose training takes most of the time
 AS_STATED, CALIBRATED, MOVED, ANEW = "as stated", "calibrated", "corrected", "corrected, paths found anew"
 """Options of the scene: nothing, materials and gains (and faces that a scan lacks), planes, too, and further along the
@@ -99,7 +99,7 @@ class Edited:
 class Change(NamedTuple):
     """What an option of the stage changes."""
 
-    parts: Collection[str]  # parts that are fitted; none leave the scene as stated
+    groups: Collection[str]  # parameter groups that are fitted; none leave the scene as stated
     options: CorrectionOptions
     near: IntArray  # validation rows, which are fitted to, too: they do not judge (`in_regions`)
 
@@ -120,14 +120,14 @@ class SceneStage(Stage):
         how = self._options or _wanted_options(problem)
         if how is None or not (split.held_receivers or not too_few(problem.record, split)):
             return [Option(AS_STATED, lambda state, split, session: state)]
-        parts = [part for part in how.parts if part != PHASES]
-        still = [part for part in parts if part not in (PLANES, FRAME)]
-        changes = (Change(names, how, split.validation) for names in ((), still, parts))
+        groups = [group for group in how.groups if group != PHASES]
+        still = [group for group in groups if group not in (PLANES, FRAME)]
+        changes = (Change(names, how, split.validation) for names in ((), still, groups))
         stated, calibrated, moved = (partial(self._fit, change) for change in changes)
         options = [Option(AS_STATED, stated)]
-        if still == parts or MATERIALS in still:
+        if still == groups or MATERIALS in still:
             options.append(Option(CALIBRATED, calibrated, 1))
-        if still != parts:
+        if still != groups:
             # Other paths make good planes better. They do not mend those that fit training rows alone, and finding
             # them takes as long as all that was done before.
             options += [Option(MOVED, moved, 2), Option(ANEW, moved, 2, MOVED)]
@@ -142,8 +142,8 @@ class SceneStage(Stage):
         return in_regions(split, row)
 
     def _fit(self, change: Change, state: State, split: Split, session: Session) -> State:
-        """Some parts fitted, from an edit that the state may have."""
-        if not change.parts:
+        """Some parameter groups fitted, from an edit that the state may have."""
+        if not change.groups:
             return state
         before: Edited | None = state.kept.get(self.name)
         stated_problem, place = before.stated if before else state.problem, session.folder / SCENE
@@ -156,7 +156,7 @@ class SceneStage(Stage):
                 before.edit if before else None,
             )
             posterior = traced.fitted_posterior(traced.record, traced.split.all_train, edit)
-            fitted = fit_edit(posterior, change.parts, edit)
+            fitted = fit_edit(posterior, change.groups, edit)
             session.folder.mkdir(parents=True, exist_ok=True)
             write_scene(fitted, traced.kinds, place)
             write_arrays(path, to_arrays(fitted.edit))
@@ -196,8 +196,8 @@ def _wanted_options(problem: Problem) -> CorrectionOptions | None:
     wanted, how = {*problem.settings.wanted}, default_options(problem.record)
     if CORRECTED in wanted:
         return how
-    parts = tuple(part for part in how.parts if part not in OF_GEOMETRY)
-    return replace(how, parts=parts) if CALIBRATION in wanted else None
+    groups = tuple(group for group in how.groups if group not in OF_GEOMETRY)
+    return replace(how, groups=groups) if CALIBRATION in wanted else None
 
 
 def with_near(state: State, split: Split, near: IntArray) -> Split:
@@ -210,7 +210,7 @@ def with_near(state: State, split: Split, near: IntArray) -> Split:
 def scene_reports(options: Sequence[OptionReport], higher_is_better: bool) -> list[StageReport]:
     """Reports of the stages mean, calibration and correction by those of the scene's options, none if none was tried.
 
-    Materials and gains are the calibration, all further parts the correction.
+    Materials and gains are the calibration, all further parameters the correction.
     """
     tried = {report.option: report for report in options if report.stage == SceneStage.name and report.seconds}
     if not tried:

@@ -265,7 +265,7 @@ CALIBRATED: Mapping[str, tuple[str, ...]] = {
     "pose": ("traced.position=1e-3", "traced.turn=1e-3"),
     "surface": ("traced.surface=0.02",),
 }
-"""Trainable parts of the traced component by name; rates as ``--set`` takes them."""
+"""Parameter groups of the traced component that a calibration may train, by name; rates as ``--set`` takes them."""
 
 
 def default_config(task: str, with_scene: bool = False) -> TrainConfig:
@@ -274,20 +274,20 @@ def default_config(task: str, with_scene: bool = False) -> TrainConfig:
     return with_settings(TrainConfig(), kind.settings_with_scene if with_scene else kind.settings)
 
 
-def calibration_config(parts: Iterable[str], further: Iterable[str] = ()) -> TrainConfig:
-    """The settings of a fit of paths alone, of the parts of `CALIBRATED`.
+def calibration_config(groups: Iterable[str], further: Iterable[str] = ()) -> TrainConfig:
+    """The settings of a fit of paths alone, of parameter groups of `CALIBRATED`.
 
     ``further`` are those of the task (`wrf_mi.core.Task.settings_of_paths`).
 
     Raises:
-        InputError: no part, or an unknown one.
+        InputError: no group, or an unknown one.
     """
-    chosen = tuple(parts)
-    unknown = [part for part in chosen if part not in CALIBRATED]
+    chosen = tuple(groups)
+    unknown = [group for group in chosen if group not in CALIBRATED]
     if unknown or not chosen:
         raise InputError(f"calibration {','.join(unknown) or 'of nothing'}: choose of {', '.join(CALIBRATED)}")
-    # All parts are held first, as the settings of paths train some of them by default.
-    moved = [setting for part in chosen for setting in CALIBRATED[part]]
+    # All groups are held first, as the settings of paths train some of them by default.
+    moved = [setting for group in chosen for setting in CALIBRATED[group]]
     return with_settings(TrainConfig(), [f"model={PATHS_ALONE}", *PATHS, *further, *HELD, *moved])
 
 

@@ -100,9 +100,9 @@ def _add_correct(commands: Any) -> None:
     add("dataset", metavar="DATASET", help=DATASET)
     add("--scene", required=True, metavar="SCENE", help=SCENE)
     add("--out", required=True, metavar="SCENE2", help="scene folder to make")
-    parts = "what to fit to training rows, of materials,planes,frame,hidden,phases,gain,pose,patterns"
+    groups = "what to fit to training rows, of materials,planes,frame,hidden,phases,gain,pose,patterns"
     default = "materials,planes,frame,hidden; for signal strengths materials,gain"
-    add("--calibrate", metavar="LIST", help=f"{parts} (default: {default})")
+    add("--calibrate", metavar="LIST", help=f"{groups} (default: {default})")
     add("--depth", type=int, metavar="N", help="largest number of interactions per path (default: 3; strengths: 6)")
     add("--reflections", type=int, metavar="N", help="largest number of reflections (default: 3; strengths: 2)")
     add("--rays", metavar="N", help="number of rays from each receiver (default: 65536), or auto as for train")
@@ -121,7 +121,7 @@ def correct_command(a: Arguments) -> int:
         raise InputError(f"{a.out}: exists; remove it, choose another folder, or give --replace")
     named = {"depth": a.depth, "reflections": a.reflections, "rays": a.rays, "shift_sd_m": a.shift_sd}
     settings = [f"{name}={value}" for name, value in named.items() if value is not None]
-    settings += [] if a.calibrate is None else [f"parts=[{a.calibrate}]"]
+    settings += [] if a.calibrate is None else [f"groups=[{a.calibrate}]"]
     names = ("split", "n_train", "material", "deterministic", "replace")
     options: dict[str, Any] = {name: getattr(a, name) for name in names} | {"antennas": antenna_options(a)}
     options |= {"seed": a.seed or 0, "settings": [*settings, *a.set], "progress": sys.stderr.isatty()}
