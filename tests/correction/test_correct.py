@@ -402,6 +402,8 @@ def test_command_corrects_by_spectra(tmp_path, command):
 def test_the_former_name_of_groups_is_read():
     """Scripts state it."""
     assert with_settings(CorrectionOptions(), ["parts=[materials]"]).groups == ("materials",)
+    with pytest.raises(InputError, match="unknown setting parts"):  # of settings that never had it, as it was written
+        with_settings(TraceOptions(), ["parts=[materials]"])
 
 
 def test_unknown_groups_and_few_rows_are_refused(tmp_path):

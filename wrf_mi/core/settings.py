@@ -119,7 +119,7 @@ def _build(kind: Any, values: Any, source: str, prefix: str) -> Any:
     hints = typing.get_type_hints(kind)
     arguments = {}
     for key, value in values.items():
-        key = key if key in hints else FORMER_NAMES.get(key, key)
+        key = _present_name(key, hints)
         name = f"{prefix}{key}"
         if key in (fixed := getattr(kind, "FIXED", {})):
             if value != fixed[key]:
@@ -193,7 +193,9 @@ def stated_values(config: Any, settings: Iterable[str]) -> dict[str, str]:
 
 
 def _present_name(key: str, names: Iterable[str]) -> str:
-    return key if key in names else FORMER_NAMES.get(key, key)
+    # Other settings may never have had the former name: what is unknown is refused as it was written.
+    present = FORMER_NAMES.get(key, key)
+    return present if key not in names and present in names else key
 
 
 def with_settings(config: Settings, settings: Iterable[str]) -> Settings:
